@@ -1,0 +1,34 @@
+"""Errors a user can cause, told apart from our own bugs (which are `assert`s)."""
+
+from __future__ import annotations
+
+
+class LapgsError(Exception):
+    """Something went wrong that one clear line can explain; the command line prints that line and exits with 2.
+
+    The message says what was wrong, the value received, what was expected and what to do next.
+    """
+
+
+class UserInputError(LapgsError, ValueError):
+    """An argument, file or scene is not usable as given."""
+
+
+class SceneError(UserInputError):
+    """A scene folder, its sparse model or one of its images is not usable."""
+
+
+class FieldError(UserInputError):
+    """A Gaussian field or its PLY file is not usable."""
+
+
+class RunFolderError(UserInputError):
+    """A run folder cannot be read, written or resumed."""
+
+
+class TrainingDivergedError(LapgsError):
+    """Training produced NaN or inf; the last good archive is kept."""
+
+
+class MissingExtraError(LapgsError, ImportError):
+    """An optional dependency is not installed; the message names the extra that brings it."""

@@ -1,0 +1,144 @@
+"""What is trained when: the stages of a hierarchy. Pure Python, no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from lapgs_plugin.errors import UserInputError
+
+MIN_LEVEL_SIDE = 16
+"""Smallest side, in pixels, of a level that is trained: SSIM's window is 11 wide, and a tile 16."""
+
+DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
+    1: (Fraction(1),),
+    2: (Fraction(1, 3), Fraction(2, 3)),
+    3: (Fraction(1, 3), Fraction(1, 6), Fraction(1, 2)),
+    4: (Fraction(1, 3), Fraction(1, 6), Fraction(1, 6), Fraction(1, 3)),
+}
+"""Share of the iterations of each stage, coarsest first, as the paper splits them (its ablation on levels)."""
+
+
+def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
+    """Size (width, height) of a pyramid level: halved `level` times, odd sizes rounded up.
+
+    >>> level_size((1063, 533), 1)
+    (532, 267)
+    """
+    width, height = size
+    for _ in range(level):
+        width, height = (width + 1) // 2, (height + 1) // 2
+    return width, height
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the schedule: which level is trained, at what size, for how long.
+
+    Attributes:
+        level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
+        image_size: (width, height) in pixels of this level for an image of the plan's size.
+        iterations: optimizer steps of this stage, at least 1.
+        signed: True for a residual (raw SH value, zero background), False for the base.
+    """
+
+    level: int
+    image_size: tuple[int, int]
+    iterations: int
+    signed: bool
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """The stages in training order, coarsest first; contiguous and validated.
+
+    Raises:
+        UserInputError: the stages do not run from the coarsest level down to 0, or one is too small to train.
+    """
+
+    stages: tuple[Stage, ...]
+
+    def __post_init__(self) -> None:
+        levels = [stage.level for stage in self.stages]
+        if levels != list(range(len(levels) - 1, -1, -1)):
+            raise UserInputError(f"a plan's levels must run from the coarsest to 0 without gaps, got {levels}")
+        for stage in self.stages:
+            if stage.iterations < 1:
+                raise UserInputError(
+                    f"level {stage.level} would train for {stage.iterations} iterations, expected at least 1; "
+                    "raise --iterations or change --split"
+                )
+            if stage.signed != (stage.level != len(levels) - 1):
+                raise UserInputError("exactly the coarsest level is unsigned (the base); all others are residuals")
+            if stage.level > 0 and min(stage.image_size) < MIN_LEVEL_SIDE:
+                width, height = stage.image_size
+                raise UserInputError(
+                    f"level {stage.level} of {len(levels)} would be {width}x{height} pixels, expected at least "
+                    f"{MIN_LEVEL_SIDE} on each side; use fewer --levels or a larger --resolution"
+                )
+
+    @property
+    def levels(self) -> int:
+        return len(self.stages)
+
+    @property
+    def iterations(self) -> int:
+        return sum(stage.iterations for stage in self.stages)
+
+    def __iter__(self) -> Iterator[Stage]:
+        return iter(self.stages)
+
+    def __getitem__(self, level: int) -> Stage:
+        """The stage that trains `level`."""
+        return self.stages[self.levels - 1 - level]
+
+    @classmethod
+    def create(
+        cls, image_size: tuple[int, int], iterations: int, levels: int = 2, split: Sequence[Fraction] | None = None
+    ) -> StagePlan:
+        """A plan for `levels` levels whose stages share `iterations` as `split` says.
+
+        Args:
+            image_size: (width, height) of level 0; with views of several sizes, the smallest.
+            iterations: total optimizer steps, at least one a level.
+            levels: number of levels L, at least 1.
+            split: share of each stage, coarsest first, summing to 1; None takes `DEFAULT_SPLITS`, and for more than
+                four levels thirds at both ends with the middle shared evenly.
+        """
+        if levels < 1:
+            raise UserInputError(f"--levels {levels}: expected at least 1")
+        if iterations < levels:
+            raise UserInputError(f"--iterations {iterations}: expected at least one for each of the {levels} levels")
+        if split is None:
+            middle = (Fraction(1, 3 * max(levels - 2, 1)),) * (levels - 2)
+            split = DEFAULT_SPLITS.get(levels, (Fraction(1, 3), *middle, Fraction(1, 3)))
+        if len(split) != levels:
+            raise UserInputError(
+                f"--split has {len(split)} shares, expected {levels}, one for each of the --levels, coarsest first"
+            )
+        if any(share <= 0 for share in split) or sum(split) != 1:
+            raise UserInputError(
+                f"--split {','.join(map(str, split))}: expected positive shares that sum to 1, "
+                f"such as {','.join(map(str, DEFAULT_SPLITS[2]))}"
+            )
+        ends = [round(iterations * sum(split[: i + 1], Fraction(0))) for i in range(levels)]
+        counts = [end - start for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        return cls(
+            tuple(
+                Stage(level, level_size(image_size, level), count, signed=level != levels - 1)
+                for level, count in zip(range(levels - 1, -1, -1), counts, strict=True)
+            )
+        )
+
+
+def parse_split(text: str) -> tuple[Fraction, ...]:
+    """Shares from "1/3,2/3" or "0.25,0.75".
+
+    Raises:
+        UserInputError: a share is not a number.
+    """
+    try:
+        return tuple(Fraction(part.strip()) for part in text.split(","))
+    except (ValueError, ZeroDivisionError) as error:
+        raise UserInputError(f"--split {text!r}: expected fractions separated by commas, such as 1/3,2/3") from error

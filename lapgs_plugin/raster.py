@@ -1,0 +1,55 @@
+"""The one interface of every rasterizer: the CPU reference, gsplat and each wrapped CUDA extension satisfy it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """What rendering one view returns.
+
+    Attributes:
+        image: (3, height, width) colour, background blended in, not clamped.
+        transmittance: (height, width) what is left of the background's weight in each pixel, in [0, 1].
+        radii: (n,) int32, three-sigma radius in pixels of each Gaussian's footprint; 0 where it was culled.
+        means2d: (n, 2) projected centres in pixels, x then y. When the field's parameters require gradients,
+            `means2d.grad` holds after `backward()` the gradient of the loss with respect to the screen position, in
+            loss per pixel: what densification thresholds. Zeros where culled.
+        absgrad2d: (n, 2) buffer that after `backward()` holds the sum over pixels of the absolute value of that
+            gradient (AbsGS), or None where the rasterizer does not offer it.
+    """
+
+    image: Tensor
+    transmittance: Tensor
+    radii: Tensor
+    means2d: Tensor
+    absgrad2d: Tensor | None = None
+
+
+class Rasterizer(Protocol):
+    """Renders a field from a camera."""
+
+    @property
+    def name(self) -> str:
+        """How logs, manifests and tables call it."""
+        ...
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`, differentiably with respect to its parameters.
+
+        Args:
+            field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
+            camera: size, intrinsics and pose.
+            background: (3,) colour behind everything; zero for residual fields.
+            sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
+        """
+        ...
