@@ -1,0 +1,1 @@
+"""Scenes: cameras, images and points, from COLMAP or Blender layouts or made up."""

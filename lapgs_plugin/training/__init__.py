@@ -1,0 +1,1 @@
+"""The built-in trainer: a hierarchy without a checkout, on the CPU rasterizer."""
