@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -55,7 +55,7 @@ class GaussianField:
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> GaussianField:
         """The field with some or all tensors replaced."""
-        return replace(self, **parameters)
+        return GaussianField(**{**self.parameters, **parameters}, signed=self.signed)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> GaussianField:
         return self.with_parameters({k: v.to(device=device, dtype=dtype) for k, v in self.parameters.items()})

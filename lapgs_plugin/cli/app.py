@@ -1,0 +1,25 @@
+"""The typer application: every command registered in one place, errors turned into one line and exit code 2."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from lapgs_plugin.errors import LapgsError
+
+app = typer.Typer(
+    name="lapgs",
+    help="Train 3D Gaussian Splatting as a Laplacian frequency hierarchy.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def run() -> None:
+    """Run the command line; a `LapgsError` becomes one line on stderr and exit code 2."""
+    try:
+        app()
+    except LapgsError as error:
+        print(f"lapgs: {error}", file=sys.stderr)
+        sys.exit(2)
