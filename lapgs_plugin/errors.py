@@ -32,3 +32,7 @@ class TrainingDivergedError(LapgsError):
 
 class MissingExtraError(LapgsError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+class PatchError(UserInputError):
+    """A checkout's sources cannot be patched or reverted as asked; none of its files was changed."""

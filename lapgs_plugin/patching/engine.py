@@ -1,0 +1,262 @@
+"""Plans what a patch changes: pure functions from the files of an extension to what they would become.
+
+The text that a set of edits leads to depends only on the file without any edits and on which sets are in: applying starts
+by taking out what is there, so it is idempotent and also renews the edits of an older version; reverting only takes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from lapgs_plugin.errors import PatchError
+from lapgs_plugin.patching.blocks import find_blocks, insertion, replacement, stray_marker, without_blocks
+from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
+from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize
+
+ALL_SETS = "all"
+"""Stands for every set that an extension takes."""
+
+_SKIPPED_FOLDERS = frozenset({"build", "dist", "third_party", "node_modules"})
+
+
+@dataclass(frozen=True)
+class Target:
+    """An extension whose sources were found in a checkout."""
+
+    recipe: Recipe
+    folder: Path
+
+
+@dataclass(frozen=True)
+class FileChange:
+    """What one file holds, and what it would hold."""
+
+    path: Path
+    before: bytes
+    after: bytes
+
+
+class State(Enum):
+    """Where a set of edits stands in an extension's sources."""
+
+    APPLIED = "applied"
+    NOT_APPLIED = "not applied"
+    INCOMPLETE = "incomplete or of another version: apply again"
+    IMPOSSIBLE = "cannot be applied"
+
+
+@dataclass(frozen=True)
+class SetStatus:
+    """The state of one set, and what stands in its way if anything does."""
+
+    set: str
+    state: State
+    problems: tuple[str, ...] = ()
+
+
+def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tuple[Target, ...]:
+    """The known extensions in a checkout: the folder itself, or those up to two folders below it.
+
+    Args:
+        checkout: a backbone's repository, or the folder of one extension.
+        recipes: what to look for; None for all that come with the plugin.
+
+    Raises:
+        PatchError: `checkout` is not a folder or holds no extension that is known.
+    """
+    if not checkout.is_dir():
+        raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
+    recipes = load_recipes() if recipes is None else recipes
+    folders = [checkout, *sorted(_subfolders(checkout))]
+    targets = tuple(Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder))
+    if not targets:
+        known = ", ".join(recipe.name for recipe in recipes)
+        raise PatchError(
+            f"{checkout}: no rasterizer that is known in this folder (known: {known}); are its submodules checked out? "
+            "patches/README.md says how to add one"
+        )
+    return targets
+
+
+def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
+    """What putting in these sets changes, those that are in already brought up to date with them.
+
+    Raises:
+        PatchError: an edit does not fit the sources; the message names the place and what was expected.
+    """
+    changes, problems = _try_apply(target, sets)
+    _refuse(target, problems)
+    return changes
+
+
+def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
+    """What taking out these sets changes.
+
+    Raises:
+        PatchError: somebody changed a block since it was put in.
+    """
+    sources = _read(target)
+    sets = _expand(target.recipe, sets)
+    _refuse(target, [problem for file, source in sources.items() for problem in _damage(file, source, sets)])
+    after = {file: without_blocks(source, sets) for file, source in sources.items()}
+    return _changes(target, sources, after)
+
+
+def status(target: Target) -> tuple[SetStatus, ...]:
+    """Where each set of edits stands in the sources."""
+    present = _present_sets(_read(target).values())
+    found = []
+    for name in target.recipe.sets:
+        changes, problems = _try_apply(target, [name])
+        if problems:
+            state = State.IMPOSSIBLE
+        elif name not in present:
+            state = State.NOT_APPLIED
+        else:
+            current = all(_blocks(change.before, name) == _blocks(change.after, name) for change in changes)
+            state = State.APPLIED if current else State.INCOMPLETE
+        found.append(SetStatus(name, state, tuple(problems)))
+    return tuple(found)
+
+
+def pristine(data: bytes) -> bytes:
+    """A file's content with all edits of all sets taken out."""
+    source = data.decode("latin-1")
+    return without_blocks(source, {block.set for block in find_blocks(source)}).encode("latin-1")
+
+
+def _subfolders(checkout: Path) -> Iterable[Path]:
+    for pattern in ("*", "*/*"):
+        for path in checkout.glob(pattern):
+            parts = path.relative_to(checkout).parts
+            if path.is_dir() and not any(part.startswith(".") or part in _SKIPPED_FOLDERS for part in parts):
+                yield path
+
+
+def _expand(recipe: Recipe, sets: Collection[str]) -> frozenset[str]:
+    return frozenset(recipe.sets) if ALL_SETS in sets else frozenset(sets)
+
+
+def _read(target: Target) -> dict[str, str]:
+    """The sources that the recipe looks at, by file; files that do not exist are left out."""
+    paths = {file: target.folder / file for file in target.recipe.files}
+    return {file: path.read_bytes().decode("latin-1") for file, path in paths.items() if path.is_file()}
+
+
+def _present_sets(sources: Iterable[str]) -> frozenset[str]:
+    return frozenset(block.set for source in sources for block in find_blocks(source))
+
+
+def _blocks(data: bytes, set_name: str) -> list[bytes]:
+    return [data[block.start : block.end] for block in find_blocks(data.decode("latin-1")) if block.set == set_name]
+
+
+def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange, ...], list[str]]:
+    recipe, sources = target.recipe, _read(target)
+    wanted = _expand(recipe, sets) | _present_sets(sources.values())
+    problems = [f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})]
+    after = {}
+    for file in recipe.files:
+        edits = [edit for edit in recipe.edits if edit.anchor.file == file and edit.set in wanted]
+        checks = [check for check in recipe.checks if check.anchor.file == file and check.set in wanted]
+        if file not in sources:
+            problems += [f"{file}: expected this file"] if edits or checks else []
+            continue
+        source = sources[file]
+        problems += _damage(file, source, wanted)
+        after[file], mismatches = _edited(without_blocks(source, wanted), edits, checks)
+        problems += mismatches
+    return _changes(target, sources, after) if not problems else (), problems
+
+
+def _changes(target: Target, before: dict[str, str], after: dict[str, str]) -> tuple[FileChange, ...]:
+    return tuple(
+        FileChange(target.folder / file, before[file].encode("latin-1"), text.encode("latin-1"))
+        for file, text in after.items()
+        if text != before[file]
+    )
+
+
+def _refuse(target: Target, problems: Sequence[str]) -> None:
+    if problems:
+        more = f" (and {len(problems) - 1} more, see `lapgs patch status`)" if len(problems) > 1 else ""
+        raise PatchError(f"{target.folder} ({target.recipe.title}): {problems[0]}{more}; nothing was changed")
+
+
+def _damage(file: str, source: str, sets: Collection[str]) -> list[str]:
+    problems = [
+        f"{file}:{_line(source, block.start)}: the block {block.set}/{block.name} is not as lapgs wrote it; move your "
+        "change out of it, or take the file back from git"
+        for block in find_blocks(source)
+        if block.set in sets and not block.intact
+    ]
+    stray = stray_marker(source)
+    if stray is not None:
+        problems.append(f"{file}:{_line(source, stray)}: half a lapgs block; take the file back from git")
+    return problems
+
+
+def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tuple[str, list[str]]:
+    """The source with the edits put in, and what does not fit; the text is of use only if everything does."""
+    tokens = tokenize(source)
+    problems = []
+    for check in checks:
+        _, problem = _locate(source, tokens, check.anchor, check.times)
+        if problem is not None:
+            problems.append(f"{problem}: {check.because}")
+    pieces: list[tuple[int, int, str]] = []  # start, end, text in place of source[start:end]
+    for edit in edits:
+        place, problem = _locate(source, tokens, edit.anchor, 1)
+        if place is None or problem is not None:
+            problems.append(f"{problem} (edit {edit.set}/{edit.name})")
+            continue
+        start, end = tokens[place.start].start, tokens[place.stop - 1].end
+        if edit.replaces:
+            pieces.append((start, end, replacement(source, start, end, edit.set, edit.name, edit.put)))
+        else:
+            at, text = insertion(source, start, edit.set, edit.name, edit.put)
+            pieces.append((at, at, text))
+    return (source, problems) if problems else (_assembled(source, pieces), [])
+
+
+def _assembled(source: str, pieces: list[tuple[int, int, str]]) -> str:
+    """The source with each piece in its place; pieces at the same place keep their order."""
+    out, position = [], 0
+    for start, end, text in sorted(pieces, key=lambda piece: piece[:2]):
+        assert start >= position, "two edits of a recipe overlap"
+        out += [source[position:start], text]
+        position = end
+    result = "".join([*out, source[position:]])
+    assert without_blocks(result, _present_sets([result])) == without_blocks(source, _present_sets([result]))
+    return result
+
+
+def _locate(source: str, tokens: list[Token], anchor: Anchor, times: int) -> tuple[range | None, str | None]:
+    """Where the anchor's tokens stand (the first time), and what is wrong if that is not `times` times."""
+    span = range(len(tokens))
+    line = 1
+    if anchor.function is not None:
+        found = definitions(tokens, anchor.function)
+        if len(found) != 1:
+            return None, f"{anchor.file}: expected one definition of {anchor.function}, found {len(found)}"
+        span = found[0]
+        line = _line(source, tokens[span.start].start)
+    places = occurrences(tokens, anchor.find, span)
+    if len(places) != times:
+        scope = f"in {anchor.function} " if anchor.function else ""
+        return None, (
+            f"{anchor.file}:{line}: expected `{anchor.find}` {_times(times)} {scope}but found it {_times(len(places))}; "
+            "this is not the code that the edit was written for"
+        )
+    return (places[0] if places else None), None
+
+
+def _times(count: int) -> str:
+    return {0: "nowhere", 1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def _line(source: str, at: int) -> int:
+    return source.count("\n", 0, at) + 1

@@ -1,0 +1,190 @@
+"""What is known of each CUDA extension: how to recognise it and which edits it takes, read from `patches/*.toml`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.errors import PatchError
+from lapgs_plugin.patching.tokens import occurrences, tokenize
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_REQUIRED = {"name", "title", "present"}
+_OPTIONAL = {"extends", "absent", "reinstall", "edit", "check"}
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A place in the sources of an extension.
+
+    Attributes:
+        file: path below the extension's folder, with forward slashes.
+        find: the tokens that stand there; formatting and comments do not matter. Empty: the file exists.
+        function: the function whose definition is searched; None for the whole file.
+    """
+
+    file: str
+    find: str
+    function: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.file}, {self.function}" if self.function else self.file
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One small change: `put` goes in front of the anchor's tokens, which stand exactly once, or in their place.
+
+    Attributes:
+        set: the set of edits that it belongs to, such as "signed-color".
+        name: unique in its set.
+    """
+
+    set: str
+    name: str
+    anchor: Anchor
+    put: str
+    replaces: bool
+
+
+@dataclass(frozen=True)
+class Check:
+    """Tokens that must stand exactly `times` times for the set's edits to be right: nothing is changed there.
+
+    Attributes:
+        because: what would go wrong otherwise; ends the message when the check fails.
+    """
+
+    set: str
+    anchor: Anchor
+    times: int
+    because: str
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that is known of one extension.
+
+    Attributes:
+        name: the stem of its file in `patches/`.
+        title: how messages call it.
+        present, absent: what its folder must and must not contain to be recognised.
+        reinstall: the command that builds and installs it again; `{folder}` stands for its folder.
+        edits, checks: in the order of the file, inherited ones first.
+    """
+
+    name: str
+    title: str
+    present: tuple[Anchor, ...]
+    absent: tuple[Anchor, ...]
+    reinstall: str
+    edits: tuple[Edit, ...]
+    checks: tuple[Check, ...]
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """The sets of edits that this extension takes."""
+        return tuple(dict.fromkeys(edit.set for edit in self.edits))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that its edits and checks look at."""
+        return tuple(dict.fromkeys(item.anchor.file for item in (*self.edits, *self.checks)))
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether `folder` holds the sources of this extension."""
+        return all(_stands(anchor, folder) for anchor in self.present) and not any(
+            _stands(anchor, folder) for anchor in self.absent
+        )
+
+
+def patches_folder() -> Path:
+    """Where the TOML files are: inside the package when it is installed, at the top of the repository otherwise."""
+    installed = Path(__file__).parents[1] / "patches"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "patches"
+
+
+def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
+    """All recipes in `folder`, by name.
+
+    Args:
+        folder: where the TOML files are; None for those that come with the plugin.
+
+    Raises:
+        PatchError: a file is not a recipe.
+    """
+    paths = sorted((folder or patches_folder()).glob("*.toml"))
+    tables = {path.stem: _read(path) for path in paths}
+    return tuple(_recipe(name, tables) for name in tables)
+
+
+def _stands(anchor: Anchor, folder: Path) -> bool:
+    path = folder / anchor.file
+    if not path.is_file():
+        return False
+    tokens = tokenize(path.read_bytes().decode("latin-1")) if anchor.find else []
+    return not anchor.find or bool(occurrences(tokens, anchor.find, range(len(tokens))))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise PatchError(f"{path}: not readable as TOML: {error}") from error
+    missing, unknown = _REQUIRED - table.keys(), table.keys() - _REQUIRED - _OPTIONAL
+    if missing or unknown or table["name"] != path.stem:
+        raise PatchError(
+            f"{path}: expected the keys {sorted(_REQUIRED)} and any of {sorted(_OPTIONAL)}, and a name equal to the "
+            f"file's, got {sorted(table)}"
+        )
+    return table
+
+
+def _recipe(name: str, tables: dict[str, dict[str, Any]]) -> Recipe:
+    table = tables[name]
+    parent = table.get("extends")
+    if parent is not None and parent not in tables:
+        raise PatchError(f"patches/{name}.toml: extends {parent!r}, expected one of {sorted(tables)}")
+    base = _recipe(parent, tables) if parent is not None else Recipe(name, "", (), (), "", (), ())
+    try:
+        return replace(
+            base,
+            name=name,
+            title=table["title"],
+            present=tuple(_place(item) for item in table["present"]),
+            absent=tuple(_place(item) for item in table.get("absent", ())),
+            reinstall=table.get("reinstall", base.reinstall),
+            edits=base.edits + tuple(_edit(item) for item in table.get("edit", ())),
+            checks=base.checks + tuple(check for item in table.get("check", ()) for check in _checks(item)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise PatchError(f"patches/{name}.toml: {error}; patches/README.md says what an entry holds") from error
+
+
+def _place(item: dict[str, str]) -> Anchor:
+    return Anchor(item["file"], item.get("find", ""))
+
+
+def _edit(item: dict[str, Any]) -> Edit:
+    anchor = Anchor(item["file"], item["find"], item.get("function"))
+    kinds = item.keys() - {"set", "name", "file", "find", "function"}
+    if kinds not in ({"before"}, {"replace"}):
+        raise ValueError(f"edit {item['name']!r}: expected either `before` or `replace`, got {sorted(kinds)}")
+    (kind,) = kinds
+    put = item[kind].strip("\n")
+    if not put.isascii():
+        raise ValueError(f"edit {item['name']!r}: expected ASCII, the same in every encoding a source may have")
+    return Edit(item["set"], item["name"], anchor, put, replaces=kind == "replace")
+
+
+def _checks(item: dict[str, Any]) -> list[Check]:
+    return [
+        Check(item["set"], Anchor(place["file"], item["find"], place.get("function")), item["times"], item["because"])
+        for place in item["places"]
+    ]

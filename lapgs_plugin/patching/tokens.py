@@ -1,0 +1,98 @@
+"""Just enough of C++ and CUDA to find a place in a source file by its tokens, whatever its formatting.
+
+Text is handled as latin-1, one character a byte, so that every position is a byte position and nothing in a file, valid
+UTF-8 or not, is ever altered by decoding it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+_LEXER = re.compile(
+    r"""
+      (?P<space>\s+)
+    | (?P<hidden>\\\r?\n | //(?:\\\r?\n|[^\n])* | /\*.*?(?:\*/|\Z))  # spliced lines and comments
+    | (?:u8|[uUL])?R"(?P<fence>[^()\\\s]{0,16})\(.*?\)(?P=fence)"
+    | (?:u8|[uUL])?"(?:\\.|[^"\\\n])*"
+    | (?:u8|[uUL])?'(?:\\.|[^'\\\n])*'
+    | \.?\d(?:[eEpP][+-]|'(?=\w)|[\w.])*
+    | [A-Za-z_]\w*
+    | .
+    """,
+    re.VERBOSE | re.DOTALL | re.ASCII,
+)
+_AFTER_PARAMETERS = frozenset({"const", "noexcept", "override", "final"})
+_CLOSING = {"(": ")", "{": "}"}
+
+
+class Token(NamedTuple):
+    """A token and where it stands; punctuation comes one character at a time, so `>>` and `> >` are the same."""
+
+    text: str
+    start: int
+    end: int
+    in_directive: bool
+
+
+def tokenize(source: str) -> list[Token]:
+    """The tokens of a source file, without white space, comments and line splices."""
+    tokens: list[Token] = []
+    at_line_start, in_directive = True, False
+    for match in _LEXER.finditer(source):
+        if match["hidden"] is not None:
+            continue
+        if match["space"] is not None:
+            if "\n" in match[0]:
+                at_line_start, in_directive = True, False
+            continue
+        in_directive = in_directive or (at_line_start and match[0] == "#")
+        at_line_start = False
+        tokens.append(Token(match[0], match.start(), match.end(), in_directive))
+    return tokens
+
+
+def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[range]:
+    """Where the tokens of `pattern` stand in a row inside `span`, as ranges of token indices.
+
+    Bodies of macros do not count, since no line can be put into them; a pattern that starts with `#` finds directives.
+    """
+    wanted = [token.text for token in tokenize(pattern)]
+    directives = wanted[:1] == ["#"]
+    found = []
+    for start in range(span.start, span.stop - len(wanted) + 1):
+        place = range(start, start + len(wanted))
+        if all(
+            tokens[i].text == text and (directives or not tokens[i].in_directive)
+            for i, text in zip(place, wanted, strict=True)
+        ):
+            found.append(place)
+    return found
+
+
+def definitions(tokens: Sequence[Token], name: str) -> list[range]:
+    """Where functions called `name` (qualified as it is written there) are defined, from their name to the last brace."""
+    found = []
+    for place in occurrences(tokens, name, range(len(tokens))):
+        if place.start > 0 and tokens[place.start - 1].text == ":":
+            continue  # a function of that name in some other class or namespace
+        end = _matching(tokens, place.stop, "(")
+        while end is not None and end < len(tokens) and tokens[end].text in _AFTER_PARAMETERS:
+            end += 1
+        end = None if end is None else _matching(tokens, end, "{")
+        if end is not None:
+            found.append(range(place.start, end))
+    return found
+
+
+def _matching(tokens: Sequence[Token], start: int, opening: str) -> int | None:
+    """The index behind the bracket that closes the one at `start`, or None if there is none."""
+    if start >= len(tokens) or tokens[start].text != opening:
+        return None
+    depth = 0
+    for i in range(start, len(tokens)):
+        depth += (tokens[i].text == opening) - (tokens[i].text == _CLOSING[opening])
+        if depth == 0:
+            return i + 1
+    return None
