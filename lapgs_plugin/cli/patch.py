@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from lapgs_plugin.patching import FileChange, Target
 
 app = typer.Typer(
-    help="Patch a backbone's rasterizer: signed colour, and what a current CUDA needs to build it.", no_args_is_help=True
+    help="Patch a backbone's rasterizer: signed colour, and what a current CUDA needs to build it.",
+    no_args_is_help=True,
 )
 
 Checkout = Annotated[
@@ -23,7 +24,7 @@ SetName = Annotated[
     str,
     typer.Option(
         "--set",
-        help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to 13), "
+        help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to 13) "
         "or all of them.",
     ),
 ]

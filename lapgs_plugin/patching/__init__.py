@@ -1,7 +1,8 @@
 """The engine behind `lapgs patch`: small anchored edits put into an extension's sources, and taken out again.
 
-`recipe` reads what is known of each extension from `patches/*.toml`; `tokens` finds places by tokens instead of lines;
-`blocks` is how an edit looks in a file; `engine` plans what changes; `files` looks before it writes and writes all or none.
+`recipe` reads what is known of each extension from `patches/*.toml`, `tokens` finds places by tokens instead of lines,
+`blocks` is how an edit looks in a file, `engine` plans what changes, `files` looks before it writes and then writes all
+files or none.
 Nothing here runs unless it is called: training never patches anything.
 """
 

@@ -78,29 +78,34 @@ def without_blocks(source: str, sets: Collection[str]) -> str:
     return "".join([*kept, source[position:]])
 
 
-def insertion(source: str, at: int, set_name: str, name: str, text: str) -> tuple[int, str]:
-    """The block that puts `text` in front of position `at`, and where it goes: there or at the start of its line."""
+def insertion(source: str, at: int, label: str, text: str) -> tuple[int, str]:
+    """The block that puts `text` in front of `at`, and where it goes: there, or at the start of the line.
+
+    Args:
+        label: SET/NAME of the edit.
+        text: one or more lines joined by "\\n".
+    """
     line_start = source.rfind("\n", 0, at) + 1
     newline = _newline(source, at)
     if not _INDENTATION.match(source, line_start, at):
-        return at, _inline(set_name, name, text.replace("\n", newline), newline)
+        return at, _inline(label, text.replace("\n", newline), newline)
     indent = source[line_start:at]
     body = "".join((indent + line if line else "") + newline for line in text.split("\n"))
-    head = f"{indent}// >>> lapgs {set_name}/{name} {_checksum(body)}{newline}"
+    head = f"{indent}// >>> lapgs {label} {_checksum(body)}{newline}"
     return line_start, f"{head}{body}{indent}// <<< lapgs{newline}"
 
 
-def replacement(source: str, start: int, end: int, set_name: str, name: str, text: str) -> str:
+def replacement(source: str, start: int, end: int, label: str, text: str) -> str:
     """The block that stands for `source[start:end]`."""
     newline = _newline(source, start)
-    return _inline(set_name, name, text.replace("\n", newline), newline, source[start:end])
+    return _inline(label, text.replace("\n", newline), newline, source[start:end])
 
 
-def _inline(set_name: str, name: str, text: str, newline: str, original: str = "") -> str:
+def _inline(label: str, text: str, newline: str, original: str = "") -> str:
     if newline in text or "//" in text or text.startswith("#"):
         text = newline + text + newline  # directives need a line of their own, a comment must not reach the marker
     was = f" was: {_escape(original)}" if original else ""
-    return f"/*>>> lapgs {set_name}/{name} {_checksum(text, original)}{was}*/{text}/*<<< lapgs*/"
+    return f"/*>>> lapgs {label} {_checksum(text, original)}{was}*/{text}/*<<< lapgs*/"
 
 
 def _newline(source: str, at: int) -> str:

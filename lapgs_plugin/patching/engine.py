@@ -1,7 +1,7 @@
 """Plans what a patch changes: pure functions from the files of an extension to what they would become.
 
-The text that a set of edits leads to depends only on the file without any edits and on which sets are in: applying starts
-by taking out what is there, so it is idempotent and also renews the edits of an older version; reverting only takes out.
+What a file becomes depends only on the file without any edits and on which sets are in: applying starts by taking out
+what is there, so it is idempotent and also renews the edits of an older version. Reverting only takes out.
 """
 
 from __future__ import annotations
@@ -157,7 +157,9 @@ def _blocks(data: bytes, set_name: str) -> list[bytes]:
 def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange, ...], list[str]]:
     recipe, sources = target.recipe, _read(target)
     wanted = _expand(recipe, sets) | _present_sets(sources.values())
-    problems = [f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})]
+    problems = [
+        f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})
+    ]
     after = {}
     for file in recipe.files:
         edits = [edit for edit in recipe.edits if edit.anchor.file == file and edit.set in wanted]
@@ -166,9 +168,10 @@ def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange,
             problems += [f"{file}: expected this file"] if edits or checks else []
             continue
         source = sources[file]
-        problems += _damage(file, source, wanted)
-        after[file], mismatches = _edited(without_blocks(source, wanted), edits, checks)
-        problems += mismatches
+        damage = _damage(file, source, wanted)
+        text, mismatches = (source, []) if damage else _edited(without_blocks(source, wanted), edits, checks)
+        problems += [*damage, *mismatches]
+        after[file] = text
     return _changes(target, sources, after) if not problems else (), problems
 
 
@@ -211,13 +214,13 @@ def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tupl
     for edit in edits:
         place, problem = _locate(source, tokens, edit.anchor, 1)
         if place is None or problem is not None:
-            problems.append(f"{problem} (edit {edit.set}/{edit.name})")
+            problems.append(f"{problem} (edit {edit.label})")
             continue
         start, end = tokens[place.start].start, tokens[place.stop - 1].end
         if edit.replaces:
-            pieces.append((start, end, replacement(source, start, end, edit.set, edit.name, edit.put)))
+            pieces.append((start, end, replacement(source, start, end, edit.label, edit.put)))
         else:
-            at, text = insertion(source, start, edit.set, edit.name, edit.put)
+            at, text = insertion(source, start, edit.label, edit.put)
             pieces.append((at, at, text))
     return (source, problems) if problems else (_assembled(source, pieces), [])
 
@@ -248,8 +251,8 @@ def _locate(source: str, tokens: list[Token], anchor: Anchor, times: int) -> tup
     if len(places) != times:
         scope = f"in {anchor.function} " if anchor.function else ""
         return None, (
-            f"{anchor.file}:{line}: expected `{anchor.find}` {_times(times)} {scope}but found it {_times(len(places))}; "
-            "this is not the code that the edit was written for"
+            f"{anchor.file}:{line}: expected `{anchor.find}` {_times(times)} {scope}but found it "
+            f"{_times(len(places))}; this is not the code that the edit was written for"
         )
     return (places[0] if places else None), None
 

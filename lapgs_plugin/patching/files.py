@@ -46,7 +46,7 @@ def write_all(changes: Sequence[FileChange]) -> None:
             staged.append((change, _beside(change.path, change.after)))
         for change, temporary in staged:
             replaced.append(change)
-            os.replace(temporary, change.path.resolve())
+            temporary.replace(change.path.resolve())
     except BaseException as error:
         lost = [change.path for change in replaced if not _put_back(change)]
         for _, temporary in staged:
@@ -83,7 +83,7 @@ def _put_back(change: FileChange) -> bool:
     """Restore the content from before; True if the file has it."""
     try:
         if change.path.read_bytes() != change.before:
-            os.replace(_beside(change.path, change.before), change.path.resolve())
+            _beside(change.path, change.before).replace(change.path.resolve())
     except OSError:
         return False
     return True

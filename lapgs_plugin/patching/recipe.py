@@ -52,6 +52,11 @@ class Edit:
     put: str
     replaces: bool
 
+    @property
+    def label(self) -> str:
+        """How messages and the blocks in a file call it."""
+        return f"{self.set}/{self.name}"
+
 
 @dataclass(frozen=True)
 class Check:
@@ -95,7 +100,8 @@ class Recipe:
     @property
     def files(self) -> tuple[str, ...]:
         """The files that its edits and checks look at."""
-        return tuple(dict.fromkeys(item.anchor.file for item in (*self.edits, *self.checks)))
+        anchors = [edit.anchor for edit in self.edits] + [check.anchor for check in self.checks]
+        return tuple(dict.fromkeys(anchor.file for anchor in anchors))
 
     def recognises(self, folder: Path) -> bool:
         """Whether `folder` holds the sources of this extension."""

@@ -60,19 +60,14 @@ def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[rang
     """
     wanted = [token.text for token in tokenize(pattern)]
     directives = wanted[:1] == ["#"]
-    found = []
-    for start in range(span.start, span.stop - len(wanted) + 1):
-        place = range(start, start + len(wanted))
-        if all(
-            tokens[i].text == text and (directives or not tokens[i].in_directive)
-            for i, text in zip(place, wanted, strict=True)
-        ):
-            found.append(place)
-    return found
+    texts = [token.text for token in tokens]
+    candidates = (i for i in range(span.start, span.stop - len(wanted) + 1) if texts[i] == wanted[0])
+    places = (range(i, i + len(wanted)) for i in candidates if texts[i : i + len(wanted)] == wanted)
+    return [place for place in places if directives or not any(tokens[i].in_directive for i in place)]
 
 
 def definitions(tokens: Sequence[Token], name: str) -> list[range]:
-    """Where functions called `name` (qualified as it is written there) are defined, from their name to the last brace."""
+    """Where functions called `name` (qualified as it is written there) are defined: from the name to the last brace."""
     found = []
     for place in occurrences(tokens, name, range(len(tokens))):
         if place.start > 0 and tokens[place.start - 1].text == ":":
@@ -92,7 +87,8 @@ def _matching(tokens: Sequence[Token], start: int, opening: str) -> int | None:
         return None
     depth = 0
     for i in range(start, len(tokens)):
-        depth += (tokens[i].text == opening) - (tokens[i].text == _CLOSING[opening])
+        if not tokens[i].in_directive:  # a macro's brackets need not balance
+            depth += (tokens[i].text == opening) - (tokens[i].text == _CLOSING[opening])
         if depth == 0:
             return i + 1
     return None

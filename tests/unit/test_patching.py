@@ -1,0 +1,790 @@
+"""The patch engine on source trees of our own writing, and the recipes that come with the plugin.
+
+The programs below are lists of tokens, written with a space between any two; a test lays them out as it likes (line
+endings, indentation, comments, spliced lines) and knows by index where an edit belongs, without asking our tokeniser.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.patch import app
+from lapgs_plugin.errors import PatchError
+from lapgs_plugin.patching import (
+    ALL_SETS,
+    Anchor,
+    Check,
+    Edit,
+    Recipe,
+    State,
+    Target,
+    find_targets,
+    load_recipes,
+    plan_apply,
+    plan_revert,
+    read_only,
+    status,
+    uncommitted,
+    write_all,
+)
+from lapgs_plugin.signed_color import SIGNED_COLOR_BIT, signed_degree
+
+# An anchor is written between [name and name], so that its index among the tokens is known.
+PROGRAMS = {
+    "kernels/shade.cu": """
+#include "shade.h"
+[wide #include <vector> wide]
+struct Colour { float r ; float g ; } ;
+float shade ( int deg ) ;
+float darker ( int deg ) { if ( deg > 0 ) { return 1'0.5e-1f ; } result += 0.5f ; return shade ( deg ) ; }
+float shade ( int i , [calls int deg calls] , bool * flags ) {
+float result = base [ i ] ;
+[strip if ( deg > 0 ) strip] { result = result - 1.5f * ( deg - 2 ) ; }
+[raw result += 0.5f ; raw]
+flags [ i ] = result < 0 ;
+return [max space :: top ( result , 0.0f ) max] ;
+}
+void launch ( ) { shade < 3 > << < 1 , 2 >> > ( 7 ) ; }
+void Box :: shade ( ) { if ( deg > 0 ) { } }
+""",
+    "kernels/host.h": """
+#pragma once
+#define SHADE ( deg ) if ( deg > 0 ) { result += 0.5f ; }
+[guard namespace kernels guard] { class Guard { int a ; } ; }
+""",
+}
+DEG = "if (deg > 0)"
+EDITS = {
+    "strip": Edit("signed", "strip", Anchor("kernels/shade.cu", DEG, "shade"), "int flag = deg;\ndeg &= 7;", False),
+    "raw": Edit("signed", "raw", Anchor("kernels/shade.cu", "result += 0.5f;", "shade"), "if (flag) return 1;", False),
+    "max": Edit("build", "max", Anchor("kernels/shade.cu", "space::top(result, 0.0f)", "shade"), "most(result)", True),
+    "wide": Edit("build", "wide", Anchor("kernels/shade.cu", "#include <vector>"), "#include <cstdint>", False),
+    "guard": Edit(
+        "build", "guard", Anchor("kernels/host.h", "namespace kernels"), "/* why */\nint b;\n#if 1\n#endif", False
+    ),
+}
+CHECK = Check("signed", Anchor("kernels/shade.cu", "int deg", "shade"), 1, "the degree is taken by value")
+RECIPE = Recipe(
+    name="shade",
+    title="a small shader",
+    present=(Anchor("kernels/shade.cu", ""),),
+    absent=(),
+    reinstall="make {folder}",
+    edits=tuple(EDITS.values()),
+    checks=(CHECK,),
+)
+
+
+@dataclass
+class Program:
+    """The tokens of one file, each directive one token, and where its anchors begin and end."""
+
+    tokens: list[str]
+    anchors: dict[str, range]
+
+    @classmethod
+    def parse(cls, text: str) -> Program:
+        tokens: list[str] = []
+        starts: dict[str, int] = {}
+        anchors: dict[str, range] = {}
+        for line in text.strip().split("\n"):
+            words = line.split(" ")
+            names = [word[1:] for word in words if re.fullmatch(r"\[\w{3,}", word)]
+            directive = any(word.startswith("#") for word in words)
+            for word in words:
+                if word.startswith("[") and word[1:] in names:
+                    starts[word[1:]] = len(tokens)
+                    if directive:
+                        tokens.append(" ".join(w for w in words if w.strip("[]") not in names))
+                elif word.endswith("]") and word[:-1] in starts:
+                    anchors[word[:-1]] = range(starts[word[:-1]], len(tokens))
+                elif directive and not names:
+                    tokens.append(line)
+                    break
+                elif not directive:
+                    tokens.append(word)
+        return cls(tokens, anchors)
+
+
+BOM = "\xef\xbb\xbf"
+PARSED = {file: Program.parse(text) for file, text in PROGRAMS.items()}
+TRIVIA = (
+    " ",
+    "\n",
+    "\n\t",
+    "\r\n",
+    "\r\n    ",
+    "\t",
+    " /* x; { */ ",
+    " // y } \n",
+    " // z\r\n\t",
+    " \\\n ",
+    "\n\n /*\n*/",
+    "\r ",
+)
+
+
+def lay_out(tokens: list[str], trivia: Iterator[str]) -> bytes:
+    """The program as a file, with the next piece of trivia between any two tokens; directives get their own lines."""
+    out = []
+    for token in tokens:
+        gap = next(trivia)
+        if token.startswith("#"):
+            out += ["" if not out or out[-1].endswith("\n") else "\n", token, "\r\n" if "\r" in gap else "\n"]
+        else:
+            out += [token, gap]
+    return "".join(out).encode("latin-1")
+
+
+def plain() -> Iterator[str]:
+    while True:
+        yield " "
+
+
+@st.composite
+def trees(draw: st.DrawFn, programs: dict[str, Program] = PARSED) -> dict[str, bytes]:
+    """The files of the small shader, laid out in any way, cut off without a final newline or not."""
+    tree = {}
+    for file, program in programs.items():
+        choices = draw(st.lists(st.integers(0, len(TRIVIA) - 1), min_size=8, max_size=8))
+        favourite = draw(st.sampled_from([" ", "\n", "\r\n"]))
+        gaps = (TRIVIA[choices[i % 8]] if (i * 7 + choices[0]) % 5 < 2 else favourite for i in range(10_000))
+        data = BOM.encode("latin-1") * draw(st.booleans()) + lay_out(program.tokens, gaps)
+        tree[file] = data.rstrip(b" \t\r\n\\") if draw(st.booleans()) else data + "// caf\xe9 \x00".encode("latin-1")
+    return tree
+
+
+def write_tree(root: Path, tree: dict[str, bytes]) -> Target:
+    shutil.rmtree(root, ignore_errors=True)
+    for file, data in tree.items():
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        (root / file).write_bytes(data)
+    return Target(RECIPE, root)
+
+
+def read_tree(root: Path) -> dict[str, bytes]:
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def apply(target: Target, *sets: str) -> dict[str, bytes]:
+    write_all(plan_apply(target, sets))
+    return read_tree(target.folder)
+
+
+def revert(target: Target, *sets: str) -> dict[str, bytes]:
+    write_all(plan_revert(target, sets))
+    return read_tree(target.folder)
+
+
+def bare(data: bytes) -> str:
+    """A file without comments, spliced lines and white space."""
+    text = re.sub(r"\\\r?\n", "", data.decode("latin-1"))
+    return re.sub(r"\s", "", re.sub(r"//[^\n]*|/\*.*?\*/", " ", text, flags=re.DOTALL))
+
+
+def expected(file: str, sets: set[str]) -> str:
+    """What is left of a patched file without comments and white space: each text put in by token index."""
+    program = PARSED[file]
+    tokens = list(program.tokens)
+    edits = [edit for edit in EDITS.values() if edit.anchor.file == file and edit.set in sets]
+    for edit in sorted(edits, key=lambda edit: program.anchors[edit.name].start, reverse=True):
+        place = program.anchors[edit.name]
+        tokens[place.start : place.stop if edit.replaces else place.start] = [edit.put]
+    return bare("\n".join(tokens).encode())
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("tree") / "shader"
+
+
+@settings(deadline=None, max_examples=60)
+@given(tree=trees())
+def test_apply_puts_every_text_where_it_belongs_and_revert_takes_it_out_to_the_byte(
+    root: Path, tree: dict[str, bytes]
+) -> None:
+    target = write_tree(root, tree)
+    once = apply(target, ALL_SETS)
+    assert {file: bare(data).removeprefix(BOM) for file, data in once.items()} == {
+        file: expected(file, {"signed", "build"}) for file in tree
+    }
+    assert apply(target, ALL_SETS) == once
+    assert revert(target, ALL_SETS) == tree
+
+
+@settings(deadline=None, max_examples=30)
+@given(tree=trees())
+def test_sets_come_and_go_independently(root: Path, tree: dict[str, bytes]) -> None:
+    target = write_tree(root, tree)
+    build = apply(target, "build")
+    both = apply(target, "signed")
+    assert both == apply(write_tree(root, tree), ALL_SETS)
+    assert revert(target, "signed") == build
+    assert revert(target, "build") == tree
+    apply(target, "signed")
+    assert apply(target, "build") == both
+
+
+@settings(deadline=None, max_examples=80)
+@given(data=st.data())
+def test_a_tree_without_any_one_anchor_is_refused_and_untouched(root: Path, data: st.DataObject) -> None:
+    file, name = data.draw(st.sampled_from([(file, name) for file, p in PARSED.items() for name in p.anchors]))
+    tokens, place = PARSED[file].tokens, PARSED[file].anchors[name]
+    lost = data.draw(st.sampled_from(place))
+    broken = data.draw(trees({**PARSED, file: Program(tokens[:lost] + tokens[lost + 1 :], {})}))
+    target = write_tree(root, broken)
+    with pytest.raises(PatchError, match=rf"{file}:\d+: expected `.*` once .*but found it nowhere"):
+        plan_apply(target, [ALL_SETS])
+    assert read_tree(root) == broken
+    impossible = {found.set for found in status(target) if found.state is State.IMPOSSIBLE}
+    assert impossible == {EDITS[name].set if name in EDITS else CHECK.set}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_anchor_that_stands_twice_is_refused(root: Path, name: str) -> None:
+    file = EDITS[name].anchor.file
+    program = PARSED[file]
+    place = program.anchors[name]
+    tokens = [*program.tokens[: place.stop], ";", *program.tokens[place.start :]]
+    target = write_tree(root, {other: lay_out(p.tokens, plain()) for other, p in PARSED.items()})
+    (root / file).write_bytes(lay_out(tokens, plain()))
+    with pytest.raises(PatchError, match="but found it twice"):
+        plan_apply(target, [ALL_SETS])
+
+
+@pytest.fixture
+def tree() -> dict[str, bytes]:
+    return {file: lay_out(program.tokens, iter(["\n"] * 1000)) for file, program in PARSED.items()}
+
+
+@pytest.fixture
+def target(tmp_path: Path, tree: dict[str, bytes]) -> Target:
+    return write_tree(tmp_path / "shader", tree)
+
+
+def test_a_message_names_the_place_what_was_expected_and_that_nothing_happened(target: Target) -> None:
+    path = target.folder / "kernels/shade.cu"
+    path.write_bytes(path.read_bytes().replace(b"0.5f\n;\nflags", b"0.25f\n;\nflags"))
+    line = path.read_bytes()[: path.read_bytes().index(b"shade\n(\nint\ni")].count(b"\n") + 1
+    with pytest.raises(PatchError) as caught:
+        plan_apply(target, ["signed"])
+    message = str(caught.value)
+    assert f"kernels/shade.cu:{line}: expected `result += 0.5f;` once in shade but found it nowhere" in message
+    assert "signed/raw" in message
+    assert message.endswith("nothing was changed")
+    assert "\n" not in message
+
+
+def test_a_function_defined_twice_or_never_is_refused(target: Target) -> None:
+    path = target.folder / "kernels/shade.cu"
+    source = path.read_bytes()
+    path.write_bytes(source + b"float shade(int a) { return a; }")
+    with pytest.raises(PatchError, match="expected one definition of shade, found 2"):
+        plan_apply(target, ["signed"])
+    path.write_bytes(source.replace(b"shade\n(\nint\ni", b"tone\n(\nint\ni"))
+    with pytest.raises(PatchError, match="expected one definition of shade, found 0"):
+        plan_apply(target, ["signed"])
+    path.unlink()
+    with pytest.raises(PatchError, match=r"kernels/shade\.cu: expected this file"):
+        plan_apply(target, ["signed"])
+
+
+def test_what_looks_like_code_in_strings_comments_and_macros_is_not_code(target: Target) -> None:
+    path = target.folder / "kernels/shade.cu"
+    decoys = (
+        b'const char* a = "if (deg > 0) { \\" // "; const char* b = R"x(if (deg > 0) )" })x";\n'
+        b"char c = '\"', d = '{';\n"
+        b"/* if (deg > 0) { */ // result += 0.5f; } \\\n if (deg > 0) {\n"
+        b"#define LONG if (deg > 0) { \\\n result += 0.5f; /* { \n */ result += 0.5f;\n"
+    )
+    path.write_bytes(path.read_bytes().replace(b"flags\n[", decoys + b"flags\n["))
+    before = path.read_bytes()
+    after = apply(target, ALL_SETS)["kernels/shade.cu"]
+    assert decoys in after
+    assert after.count(b">>> lapgs") == 4
+    assert revert(target, ALL_SETS)["kernels/shade.cu"] == before
+
+
+def test_a_replaced_text_with_comments_and_backslashes_comes_back(target: Target) -> None:
+    path = target.folder / "kernels/shade.cu"
+    odd = b"space /* a */ :: \\\r\n top(result, // *\\/ \\* \n /*\\*/ 0.0f)"
+    path.write_bytes(path.read_bytes().replace(b"space\n::\ntop\n(\nresult\n,\n0.0f\n)", odd))
+    before = path.read_bytes()
+    assert odd in before
+    assert b"most(result)" in apply(target, ALL_SETS)["kernels/shade.cu"]
+    assert revert(target, ALL_SETS)["kernels/shade.cu"] == before
+
+
+def test_blocks_have_the_indentation_and_line_ending_of_their_place(target: Target) -> None:
+    path = target.folder / "kernels/host.h"
+    path.write_bytes(b"#pragma once\r\n\t  namespace kernels { }\r\nint last;\n")
+    text = apply(target, "build")["kernels/host.h"]
+    lines = text.split(b"\r\n")
+    assert re.fullmatch(rb"\t  // >>> lapgs build/guard [0-9a-f]{8}", lines[1])
+    assert lines[2:7] == [b"\t  /* why */", b"\t  int b;", b"\t  #if 1", b"\t  #endif", b"\t  // <<< lapgs"]
+
+
+def test_changes_of_the_user_outside_the_blocks_stay(target: Target, tree: dict[str, bytes]) -> None:
+    apply(target, ALL_SETS)
+    path = target.folder / "kernels/shade.cu"
+    path.write_bytes(b"// mine\n" + path.read_bytes().replace(b"darker", b"dimmer"))
+    assert revert(target, ALL_SETS) == {
+        **tree,
+        "kernels/shade.cu": b"// mine\n" + tree["kernels/shade.cu"].replace(b"darker", b"dimmer"),
+    }
+
+
+def test_a_block_changed_by_hand_is_refused_both_ways(target: Target) -> None:
+    apply(target, ALL_SETS)
+    path = target.folder / "kernels/shade.cu"
+    path.write_bytes(path.read_bytes().replace(b"deg &= 7;", b"deg &= 15;"))
+    line = path.read_bytes()[: path.read_bytes().index(b"// >>> lapgs signed/strip")].count(b"\n") + 1
+    for plan in (plan_apply, plan_revert):
+        with pytest.raises(PatchError, match=rf"shade\.cu:{line}: the block signed/strip is not as lapgs wrote it"):
+            plan(target, [ALL_SETS])
+    assert {found.set: found.state for found in status(target)}["signed"] is State.IMPOSSIBLE
+
+
+def test_a_block_that_was_only_reformatted_can_be_taken_out(target: Target) -> None:
+    apply(target, "signed")
+    path = target.folder / "kernels/shade.cu"
+    path.write_bytes(path.read_bytes().replace(b"int flag = deg;\ndeg &= 7;", b"  int flag  = deg;\n    deg &= 7;"))
+    assert b">>> lapgs" not in b"".join(revert(target, "signed").values())
+
+
+@pytest.mark.parametrize("marker", [b"// <<< lapgs\n", b"/*<<< lapgs*/"])
+def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
+    apply(target, ALL_SETS)
+    path = target.folder / "kernels/shade.cu"
+    head, tail = path.read_bytes().rsplit(marker, 1)
+    path.write_bytes(head + tail)
+    for plan in (plan_apply, plan_revert):
+        with pytest.raises(PatchError, match="half a lapgs block"):
+            plan(target, [ALL_SETS])
+
+
+def test_states(target: Target) -> None:
+    def states() -> dict[str, State]:
+        return {found.set: found.state for found in status(target)}
+
+    assert states() == {"signed": State.NOT_APPLIED, "build": State.NOT_APPLIED}
+    apply(target, "build")
+    assert states() == {"signed": State.NOT_APPLIED, "build": State.APPLIED}
+    before = (target.folder / "kernels/host.h").read_bytes()
+    revert(target, "build")
+    (target.folder / "kernels/host.h").write_bytes(before)
+    assert states() == {"signed": State.NOT_APPLIED, "build": State.INCOMPLETE}
+    apply(target, "signed")
+    assert states() == {"signed": State.APPLIED, "build": State.APPLIED}
+
+
+def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, bytes]) -> None:
+    older = Recipe(**{**vars(RECIPE), "edits": (Edit("signed", "old", EDITS["raw"].anchor, "return 2;", False),)})
+    write_all(plan_apply(Target(older, target.folder), ["signed"]))
+    assert {found.set: found.state for found in status(target)}["signed"] is State.INCOMPLETE
+    renewed = apply(target, "signed")
+    assert renewed == apply(write_tree(target.folder, tree), "signed")
+    newer = Recipe(**{**vars(RECIPE), "edits": (EDITS["guard"],)})
+    with pytest.raises(PatchError, match="signed is not among its sets of edits"):
+        plan_apply(Target(newer, target.folder), ["build"])
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("failing_call", [1, 2])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_write_that_fails_leaves_every_file_as_it_was(
+    target: Target, tree: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, failing_call: int, error: BaseException
+) -> None:
+    calls = 0
+    replace = Path.replace
+
+    def fail_once(source: Path, destination: Path) -> Path:
+        nonlocal calls
+        calls += 1
+        if calls == failing_call:
+            raise error
+        return replace(source, destination)
+
+    changes = plan_apply(target, [ALL_SETS])
+    assert len(changes) == 2
+    monkeypatch.setattr(Path, "replace", fail_once)
+    with pytest.raises(PatchError if isinstance(error, OSError) else KeyboardInterrupt):
+        write_all(changes)
+    assert read_tree(target.folder) == tree
+
+
+def test_a_file_changed_meanwhile_is_not_overwritten(target: Target, tree: dict[str, bytes]) -> None:
+    changes = plan_apply(target, [ALL_SETS])
+    (target.folder / "kernels/host.h").write_bytes(b"new")
+    with pytest.raises(PatchError, match="changed by another program"):
+        write_all(changes)
+    assert read_tree(target.folder) == {**tree, "kernels/host.h": b"new"}
+
+
+def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
+    path = target.folder / "kernels/shade.cu"
+    moved = tmp_path / "elsewhere.cu"
+    path.rename(moved)
+    moved.chmod(0o755)
+    path.symlink_to(moved)
+    apply(target, ALL_SETS)
+    assert path.is_symlink()
+    assert b">>> lapgs" in moved.read_bytes()
+    assert stat.S_IMODE(moved.stat().st_mode) == 0o755
+
+
+def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> None:
+    changes = plan_apply(target, [ALL_SETS])
+    assert read_only(changes) == []
+    folder, file = target.folder / "kernels", target.folder / "kernels/host.h"
+    file.chmod(0o444)
+    folder.chmod(0o555)
+    try:
+        assert read_only(changes) == [folder, file]
+    finally:
+        folder.chmod(0o755)
+
+
+def git(folder: Path, *arguments: str) -> None:
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "protocol.file.allow=always")
+    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("autocrlf", ["false", "true"])
+def test_uncommitted_changes_are_those_that_are_not_ours(target: Target, tmp_path: Path, autocrlf: str) -> None:
+    git(target.folder, "init")
+    git(target.folder, "add", ".")
+    git(target.folder, "commit", "-m", "all")
+    outer = tmp_path / "outer"
+    outer.mkdir()
+    git(outer, "init")
+    git(outer, "-c", f"core.autocrlf={autocrlf}", "submodule", "add", str(target.folder), "submodules/shader")
+    inner = Target(RECIPE, outer / "submodules/shader")
+    git(inner.folder, "config", "core.autocrlf", autocrlf)
+    files = [inner.folder / file for file in PROGRAMS]
+    if autocrlf == "true":
+        for path in files:
+            path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"))
+    assert uncommitted(files) == []
+    apply(inner, "build")
+    assert uncommitted(files) == []
+    files[1].write_bytes(files[1].read_bytes() + b"// mine\n")
+    assert uncommitted(files) == [files[1]]
+    git(inner.folder, "add", ".")
+    assert uncommitted(files) == [files[1]]
+
+
+def test_without_git_nothing_is_uncommitted(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [target.folder / file for file in PROGRAMS]
+    assert uncommitted(files) == []
+    monkeypatch.setenv("PATH", "")
+    assert uncommitted(files) == []
+
+
+# --- the recipes that come with the plugin, on a rasterizer of our own writing ----------------------------------------
+
+RASTERIZER = {
+    "diff_gaussian_rasterization/__init__.py": "",
+    "rasterize_points.cu": """
+int RasterizeGaussiansCUDA(const int degree) { return CudaRasterizer::Rasterizer::forward(degree); }
+int RasterizeGaussiansBackwardCUDA(const int degree) { return CudaRasterizer::Rasterizer::backward(degree); }
+""",
+    "cuda_rasterizer/forward.cu": """
+Colour computeColorFromSH(int idx, int deg, const Colour* sh, bool* clamped)
+{
+	Colour result = sh[0] * 0.25f;
+	if (deg > 0)
+		for (int i = 1; i < (deg + 1) * (deg + 1); ++i)
+			result += sh[i] * (0.5f + i);
+	result += 0.5f;
+	clamped[3 * idx + 0] = result.x < 0;
+	clamped[3 * idx + 1] = result.y < 0;
+	clamped[3 * idx + 2] = result.z < 0;
+	return largest(result, 0.0f);
+}
+void preprocessCUDA(int D) { colour = computeColorFromSH(0, D, coefficients, flags); }
+namespace FORWARD { void preprocess(int D); }
+void FORWARD::preprocess(int D) { preprocessCUDA(D); }
+""",
+    "cuda_rasterizer/backward.h": "// declarations",
+    "cuda_rasterizer/backward.cu": """
+namespace backward_pass {
+void computeColorFromSH(int idx, int deg, const bool* clamped, Colour* gradient)
+{
+	for (int i = 0; i < 16; ++i)
+		gradient[i] = Colour();
+	Colour d(!clamped[3 * idx], !clamped[3 * idx + 1], !clamped[3 * idx + 2]);
+	gradient[0] = d * 0.25f;
+	if (deg > 0)
+		for (int i = 1; i < (deg + 1) * (deg + 1); ++i)
+			gradient[i] = d * (0.5f + i);
+}
+void preprocessCUDA(int D) { computeColorFromSH(0, D, flags, gradients); }
+}
+namespace BACKWARD { void preprocess(int D); }
+void BACKWARD::preprocess(int D) { backward_pass::preprocessCUDA(D); }
+""",
+    "cuda_rasterizer/rasterizer_impl.h": "#include <iostream>\n",
+    "cuda_rasterizer/rasterizer_impl.cu": """
+#include "backward.h"
+struct GeometryState {};
+int CudaRasterizer::Rasterizer::forward(int D)
+{
+	const float focal_y = 1.0f;
+	FORWARD::preprocess(D);
+	return focal_y > 0;
+}
+int CudaRasterizer::Rasterizer::backward(int D)
+{
+	GeometryState geomState = GeometryState();
+	BACKWARD::preprocess(D);
+	return sizeof(geomState) > 0;
+}
+""",
+}
+MAIN = """
+#include <cstdio>
+#include <cstdlib>
+#include "cuda_rasterizer/rasterizer_impl.h"
+struct Colour
+{
+	float x, y, z;
+	Colour(float a = 0, float b = 0, float c = 0) : x(a), y(b), z(c) {}
+	Colour operator*(float s) const { return Colour(x * s, y * s, z * s); }
+	void operator+=(const Colour& o) { x += o.x; y += o.y; z += o.z; }
+	void operator+=(float s) { *this += Colour(s, s, s); }
+};
+Colour largest(Colour a, float b) { return Colour(a.x > b ? a.x : b, a.y > b ? a.y : b, a.z > b ? a.z : b); }
+Colour colour, coefficients[16], gradients[16];
+bool flags[3] = { true, true, true };
+namespace CudaRasterizer { struct Rasterizer { static int forward(int D); static int backward(int D); }; }
+#include "cuda_rasterizer/forward.cu"
+#include "cuda_rasterizer/backward.cu"
+#include "cuda_rasterizer/rasterizer_impl.cu"
+#include "rasterize_points.cu"
+int main(int, char** argv)
+{
+	for (int i = 0; i < 16; ++i)
+		coefficients[i] = Colour(i % 3 - 1.1f, 0.3f * i - 2, 0.1f * i);
+	RasterizeGaussiansCUDA(atoi(argv[1]));
+	std::printf("%.9g %.9g %.9g %d %d %d", colour.x, colour.y, colour.z, flags[0], flags[1], flags[2]);
+	RasterizeGaussiansBackwardCUDA(atoi(argv[1]));
+	for (int i = 0; i < 16; ++i)
+		std::printf(" %g %g %g", gradients[i].x, gradients[i].y, gradients[i].z);
+}
+"""
+
+
+@pytest.fixture
+def rasterizer(tmp_path: Path) -> Path:
+    """A checkout with one rasterizer that has what the recipes look for, in functions that do next to nothing."""
+    folder = tmp_path / "checkout" / "submodules" / "diff-gaussian-rasterization"
+    for file, text in RASTERIZER.items():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(text)
+    return folder
+
+
+def test_every_recipe_has_a_way_to_reinstall_and_edits_with_different_names() -> None:
+    recipes = load_recipes()
+    assert {recipe.name for recipe in recipes} >= {
+        "fastgs",
+        "taming",
+        "taming-rasterizer",
+        "graphdeco",
+        "graphdeco-accel",
+    }
+    for recipe in recipes:
+        names = [(edit.set, edit.name) for edit in recipe.edits]
+        assert len(names) == len(set(names))
+        assert "{folder}" in recipe.reinstall
+        assert "build-cuda13" in recipe.sets
+
+
+def test_the_flag_is_the_sign_bit_of_a_c_int() -> None:
+    for degree in range(4):
+        as_int = ctypes.c_int(signed_degree(degree))
+        assert as_int.value == signed_degree(degree) < 0
+        assert as_int.value & 0x7FFFFFFF == degree
+    assert signed_degree(0) == SIGNED_COLOR_BIT
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+def test_patched_code_is_signed_when_asked_and_otherwise_what_it_was(rasterizer: Path, tmp_path: Path) -> None:
+    (rasterizer / "main.cpp").write_text(MAIN)
+
+    def build(name: str) -> Callable[[int], list[float]]:
+        program = tmp_path / name
+        flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-o", str(program)]
+        subprocess.run(["c++", *flags, "main.cpp"], cwd=rasterizer, check=True)
+        return lambda degree: [
+            float(word) for word in subprocess.check_output([str(program), str(degree)], text=True).split()
+        ]
+
+    before = build("before")
+    write_all(plan_apply(find_targets(rasterizer)[0], [ALL_SETS]))
+    after = build("after")
+    clamped_somewhere = False
+    for degree in range(4):
+        clamped, signed = after(degree), after(signed_degree(degree))
+        assert clamped == before(degree)
+        weights = [0.25, *(0.5 + i for i in range(1, 16))]
+        coefficients = [(i % 3 - 1.1, 0.3 * i - 2, 0.1 * i) for i in range(16)]
+        used = range((degree + 1) ** 2)
+        raw = [sum(weights[i] * coefficients[i][channel] for i in used) for channel in range(3)]
+        assert signed[:3] == pytest.approx(raw, rel=1e-5, abs=1e-5)  # float32 sums of up to 16 terms: 3e-6 seen
+        assert signed[3:6] == [0, 0, 0]
+        assert clamped[:3] == pytest.approx([max(value + 0.5, 0) for value in raw], rel=1e-5, abs=1e-5)
+        assert signed[6:] == [weights[i] if i in used else 0 for i in range(16) for _ in range(3)]
+        clamped_somewhere = clamped_somewhere or any(clamped[3:6])
+        # A build that does not know the flag must not read coefficients that a field of degree 0 does not have.
+        assert before(signed_degree(degree)) == before(0)
+    assert clamped_somewhere
+
+
+def test_a_rasterizer_where_something_else_reads_the_degree_is_refused(rasterizer: Path) -> None:
+    path = rasterizer / "cuda_rasterizer/forward.cu"
+    path.write_text(path.read_text().replace("{ colour =", "{ if (D > 3) return; colour ="))
+    with pytest.raises(PatchError, match=r"preprocessCUDA but found it 3 times.*something else reads the degree"):
+        plan_apply(find_targets(rasterizer)[0], ["signed-color"])
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, depth: int) -> None:
+    checkout = [rasterizer, *rasterizer.parents][depth]
+    (found,) = find_targets(checkout)
+    assert (found.recipe.name, found.folder) == ("graphdeco", rasterizer)
+
+
+def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(PatchError, match=r"known: .*graphdeco.*are its submodules checked out\?"):
+        find_targets(tmp_path)
+    with pytest.raises(PatchError, match="no such folder"):
+        find_targets(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name = [", "not readable as TOML"),
+        ('name = "new"\ntitle = "New"', "expected the keys"),
+        ('name = "old"\ntitle = "New"\npresent = []', "a name equal to the file's"),
+        ('name = "new"\ntitle = "New"\npresent = []\nextends = "old"', "extends 'old', expected one of"),
+        ('name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"', "README"),
+        (
+            'name = "new"\ntitle = "New"\npresent = []\n'
+            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',
+            "either `before` or `replace`",
+        ),
+    ],
+)
+def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "new.toml").write_text(text)
+    with pytest.raises(PatchError, match=r"new\.toml") as caught:
+        load_recipes(tmp_path)
+    assert message in str(caught.value)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def lapgs_patch(*arguments: str | Path) -> str:
+    """What `lapgs patch ...` prints; errors are raised."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
+    checkout = rasterizer.parents[1]
+    pristine = read_tree(checkout)
+    assert re.search(r"signed-color +not applied\n +build-cuda13 +not applied", lapgs_patch("status", checkout))
+    diff = lapgs_patch("diff", checkout, "--set", "build-cuda13")
+    assert re.findall(r"^[+-].*", diff, re.MULTILINE)[:3:2] == [
+        "--- a/submodules/diff-gaussian-rasterization/cuda_rasterizer/rasterizer_impl.h",
+        "+// >>> lapgs build-cuda13/cstdint " + diff.split("build-cuda13/cstdint ")[1][:8],
+    ]
+    assert read_tree(checkout) == pristine
+    output = lapgs_patch("apply", checkout)
+    assert output.endswith(f"install again what changed:\n  pip install --no-build-isolation {rasterizer}\n")
+    assert re.search(r"signed-color +applied\n +build-cuda13 +applied", lapgs_patch("status", checkout))
+    assert "nothing to do" in lapgs_patch("apply", checkout)
+    assert "nothing to apply" in lapgs_patch("diff", checkout)
+    lapgs_patch("revert", checkout, "--set", "signed-color")
+    assert re.search(r"signed-color +not applied\n +build-cuda13 +applied", lapgs_patch("status", checkout))
+    lapgs_patch("revert", checkout)
+    assert read_tree(checkout) == pristine
+    assert "nothing to take out" in lapgs_patch("revert", checkout)
+
+
+def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:
+    with pytest.raises(PatchError, match=r"--set signed: expected one of build-cuda13, signed-color, all"):
+        lapgs_patch("apply", rasterizer, "--set", "signed")
+    git(rasterizer, "init")
+    git(rasterizer, "add", ".")
+    git(rasterizer, "commit", "-m", "all")
+    path = rasterizer / "cuda_rasterizer/forward.cu"
+    path.write_text("// mine\n" + path.read_text())
+    before = read_tree(rasterizer / "cuda_rasterizer")
+    with pytest.raises(PatchError, match=rf"not committed in {re.escape(str(path))}; commit them"):
+        lapgs_patch("apply", rasterizer)
+    assert f"not committed: {path}" in lapgs_patch("status", rasterizer)
+    path.chmod(0o444)
+    for command in ("apply", "apply --allow-dirty"):
+        with pytest.raises(PatchError, match=rf"read-only: {re.escape(str(path))}"):
+            lapgs_patch(*command.split(), rasterizer)
+    assert f"read-only: {path}" in lapgs_patch("status", rasterizer)
+    assert read_tree(rasterizer / "cuda_rasterizer") == before
+    path.chmod(0o644)
+    lapgs_patch("apply", "--allow-dirty", rasterizer)
+    lapgs_patch("revert", rasterizer)
+    assert read_tree(rasterizer / "cuda_rasterizer") == before
+
+
+def test_nothing_is_imported_for_the_help() -> None:
+    program = "import sys, lapgs_plugin.cli.patch, lapgs_plugin.patching; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+# --- the real sources -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.upstream
+def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
+    """Every extension in the checkouts below $LAPGS_UPSTREAM, as it is and with its line endings turned to CRLF."""
+    folder = os.environ.get("LAPGS_UPSTREAM")
+    if not folder:
+        pytest.skip("needs checkouts of the backbones: set LAPGS_UPSTREAM to a folder that holds them")
+    found = [target for checkout in sorted(Path(folder).iterdir()) for target in find_targets(checkout)]
+    assert found
+    for number, upstream in enumerate(found):
+        for ending in (None, b"\r\n"):
+            copy = tmp_path / f"{number}-{'as-is' if ending is None else 'crlf'}"
+            shutil.copytree(upstream.folder, copy, ignore=shutil.ignore_patterns("third_party", ".git"))
+            for path in copy.rglob("*.[ch]*"):
+                if ending is not None:
+                    path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", ending))
+            before = read_tree(copy)
+            (target,) = find_targets(copy)
+            assert target.recipe.name == upstream.recipe.name
+            after = apply(target, ALL_SETS)
+            assert {found.state for found in status(target)} == {State.APPLIED}
+            assert sum(data.count(b">>> lapgs") for data in after.values()) == len(target.recipe.edits)
+            assert apply(target, ALL_SETS) == after
+            assert revert(target, ALL_SETS) == before
