@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -166,11 +167,16 @@ def _recipe(name: str, tables: dict[str, dict[str, Any]]) -> Recipe:
             present=tuple(_place(item) for item in table["present"]),
             absent=tuple(_place(item) for item in table.get("absent", ())),
             reinstall=table.get("reinstall", base.reinstall),
-            edits=base.edits + tuple(_edit(item) for item in table.get("edit", ())),
+            edits=_inherited(base.edits, [_edit(item) for item in table.get("edit", ())]),
             checks=base.checks + tuple(check for item in table.get("check", ()) for check in _checks(item)),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise PatchError(f"patches/{name}.toml: {error}; patches/README.md says what an entry holds") from error
+
+
+def _inherited(base: Sequence[Edit], own: Sequence[Edit]) -> tuple[Edit, ...]:
+    """The edits of both; one of its own stands in the stead of an inherited one with the same label."""
+    return tuple({edit.label: edit for edit in (*base, *own)}.values())
 
 
 def _place(item: dict[str, str]) -> Anchor:
@@ -178,7 +184,7 @@ def _place(item: dict[str, str]) -> Anchor:
 
 
 def _edit(item: dict[str, Any]) -> Edit:
-    anchor = Anchor(item["file"], item["find"], item.get("function"))
+    anchor = _anchor(item["file"], item["find"], item.get("function"))
     kinds = item.keys() - {"set", "name", "file", "find", "function"}
     if kinds not in ({"before"}, {"replace"}):
         raise ValueError(f"edit {item['name']!r}: expected either `before` or `replace`, got {sorted(kinds)}")
@@ -189,8 +195,14 @@ def _edit(item: dict[str, Any]) -> Edit:
     return Edit(item["set"], item["name"], anchor, put, replaces=kind == "replace")
 
 
+def _anchor(file: str, find: str, function: str | None) -> Anchor:
+    if not tokenize(find):
+        raise ValueError(f"{file}: find = {find!r} has nothing to find")
+    return Anchor(file, find, function)
+
+
 def _checks(item: dict[str, Any]) -> list[Check]:
     return [
-        Check(item["set"], Anchor(place["file"], item["find"], place.get("function")), item["times"], item["because"])
+        Check(item["set"], _anchor(place["file"], item["find"], place.get("function")), item["times"], item["because"])
         for place in item["places"]
     ]

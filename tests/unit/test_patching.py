@@ -692,6 +692,11 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',
             "either `before` or `replace`",
         ),
+        (
+            'name = "new"\ntitle = "New"\npresent = []\n'
+            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = " "\nbefore = "e"',
+            "has nothing to find",
+        ),
     ],
 )
 def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -699,6 +704,18 @@ def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: st
     with pytest.raises(PatchError, match=r"new\.toml") as caught:
         load_recipes(tmp_path)
     assert message in str(caught.value)
+
+
+def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> None:
+    edit = '[[edit]]\nset = "a"\nname = "{}"\nfile = "c"\nfind = "d"\nbefore = "{}"\n'
+    head = 'name = "{}"\ntitle = "T"\npresent = [{{ file = "{}" }}]\n'
+    base = head.format("base", "x") + 'reinstall = "make {folder}"\n' + edit.format("one", 1) + edit.format("two", 2)
+    child = head.format("child", "y") + 'extends = "base"\n' + edit.format("one", 3) + edit.format("three", 4)
+    (tmp_path / "base.toml").write_text(base)
+    (tmp_path / "child.toml").write_text(child)
+    found = load_recipes(tmp_path)[1]
+    assert [(e.name, e.put) for e in found.edits] == [("one", "3"), ("two", "2"), ("three", "4")]
+    assert (found.present, found.reinstall) == ((Anchor("y", ""),), "make {folder}")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
