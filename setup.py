@@ -1,4 +1,4 @@
-"""The one thing that pyproject.toml cannot say: `patches/` stands at the top of the repository, and inside the package."""
+"""The one thing pyproject.toml cannot say: `patches/`, at the top of the repository, is installed inside the package."""
 
 from setuptools import find_packages, setup
 

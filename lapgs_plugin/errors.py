@@ -35,4 +35,4 @@ class MissingExtraError(LapgsError, ImportError):
 
 
 class PatchError(UserInputError):
-    """A checkout's sources cannot be patched or reverted as asked; none of its files was changed."""
+    """A checkout's sources cannot be patched or reverted as asked."""
