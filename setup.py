@@ -1,4 +1,4 @@
-"""The one thing pyproject.toml cannot say: `patches/`, at the top of the repository, is installed inside the package."""
+"""What pyproject.toml cannot say: `patches/`, at the top of the repository, is installed inside the package."""
 
 from setuptools import find_packages, setup
 
