@@ -140,7 +140,8 @@ class OracleRasterizer:
             ],
             dim=1,
         )  # (v, 9)
-        color, transmittance = _blend_tiles(splats, seen.ids, tile_lists(seen, camera), absgrad2d)
+        lists = tile_lists(seen.depths, seen.rectangles, camera)
+        color, transmittance = _blend_tiles(splats, seen.ids, lists, absgrad2d)
         height, width = camera.height, camera.width
         color, transmittance = color[:, :height, :width], transmittance[:height, :width]
         image = color + transmittance * background[:, None, None]  # (3, h, w)
@@ -261,11 +262,16 @@ def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
     return corners.nan_to_num(0, math.inf, -math.inf).clamp(min=0).minimum(grid.repeat(2)).to(torch.int64)
 
 
-def tile_lists(projection: Projection, camera: Camera) -> TileLists:
-    """Every (tile, Gaussian) pair, sorted by tile, then depth, then index."""
+def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
+    """Every (tile, Gaussian) pair, sorted by tile, then depth, then index.
+
+    Args:
+        depths: (v,) camera-space z.
+        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` gives them.
+    """
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    order = torch.sort(projection.depths.detach(), stable=True).indices  # (v,) front to back
-    x0, y0, x1, y1 = projection.rectangles[order].unbind(-1)  # (v,) each
+    order = torch.sort(depths.detach(), stable=True).indices  # (v,) front to back
+    x0, y0, x1, y1 = rectangles[order].unbind(-1)  # (v,) each
     areas = (x1 - x0) * (y1 - y0)  # (v,)
     which = torch.repeat_interleave(areas)  # (i,) position in `order`
     within = torch.arange(len(which), device=order.device) - (areas.cumsum(0) - areas)[which]  # (i,) 0 ... area - 1
