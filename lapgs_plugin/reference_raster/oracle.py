@@ -54,13 +54,13 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True)
 class Projection:
-    """The v Gaussians that reach the image, in the order of their index.
+    """v Gaussians on the image plane, in the order of their index.
 
     Attributes:
         ids: (v,) their index in the field.
         depths: (v,) camera-space z.
         means2d: (v, 2) centres in pixel coordinates (the first pixel is at 0).
-        covariances2d: (v, 3) entries xx, xy, yy in px^2, with the 0.3 px^2 added.
+        determinants: (v,) of the 2D covariances with the 0.3 px^2 added, in px^4.
         conics: (v, 3) entries xx, xy, yy of the inverse covariance.
         radii: (v,) three-sigma radii in whole pixels, in the field's float type.
         rectangles: (v, 4) int64 tiles touched: x0, y0 (first), x1, y1 (one past the last).
@@ -69,14 +69,10 @@ class Projection:
     ids: Tensor
     depths: Tensor
     means2d: Tensor
-    covariances2d: Tensor
+    determinants: Tensor
     conics: Tensor
     radii: Tensor
     rectangles: Tensor
-
-    def select(self, keep: Tensor) -> Projection:
-        """The Gaussians where the (v,) mask is True."""
-        return Projection(**{name: value[keep] for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -155,30 +151,37 @@ def project(field: GaussianField, camera: Camera) -> Projection:
         field: n Gaussians.
         camera: with its pose on the field's device and in its precision.
     """
+    # Found without gradients first: a Gaussian divided by a depth or determinant of zero must not enter the graph,
+    # where its zero gradient times infinity would be NaN.
+    with torch.no_grad():
+        everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device))
+        first, last = everyone.rectangles[:, :2], everyone.rectangles[:, 2:]  # (n, 2) each
+        seen = (everyone.depths > NEAR_DEPTH) & (everyone.determinants != 0) & (first < last).all(dim=1)  # (n,)
+    return _project_all(field, camera, everyone.ids[seen])
+
+
+def _project_all(field: GaussianField, camera: Camera, ids: Tensor) -> Projection:
+    """EWA projection of the Gaussians `ids`, whether they reach the image or not."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
-    points = field.means @ rotation.T + translation  # (n, 3) in camera coordinates
-    # Everything below divides by the depth, so Gaussians behind the camera must not even enter the graph: 0 * inf.
-    front = (points.detach()[:, 2] > NEAR_DEPTH).nonzero()[:, 0]  # (f,)
-    points = points[front]  # (f, 3)
-    x, y, depth = points.unbind(-1)  # (f,) each
+    points = field.means[ids] @ rotation.T + translation  # (v, 3) in camera coordinates
+    x, y, depths = points.unbind(-1)  # (v,) each
     means2d = torch.stack(
-        [camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1
-    )  # (f, 2)
+        [camera.fx * x / depths + camera.cx - 0.5, camera.fy * y / depths + camera.cy - 0.5], dim=-1
+    )  # (v, 2)
 
-    covariances3d = world_covariances(field.quaternions[front], field.log_scales[front])  # (f, 3, 3)
-    to_screen = projection_jacobians(points, camera) @ rotation  # (f, 2, 3)
-    covariances2d = to_screen @ covariances3d @ to_screen.mT  # (f, 2, 2)
-    xx = covariances2d[:, 0, 0] + PIXEL_VARIANCE  # (f,)
-    xy = covariances2d[:, 0, 1]  # (f,)
-    yy = covariances2d[:, 1, 1] + PIXEL_VARIANCE  # (f,)
-    determinant = xx * yy - xy * xy  # (f,)
-    conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]  # (f, 3)
+    covariances3d = world_covariances(field.quaternions[ids], field.log_scales[ids])  # (v, 3, 3)
+    to_screen = projection_jacobians(points, camera) @ rotation  # (v, 2, 3)
+    covariances2d = to_screen @ covariances3d @ to_screen.mT  # (v, 2, 2)
+    xx = covariances2d[:, 0, 0] + PIXEL_VARIANCE  # (v,)
+    xy = covariances2d[:, 0, 1]  # (v,)
+    yy = covariances2d[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    determinants = xx * yy - xy * xy  # (v,)
+    conics = torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]  # (v, 3)
 
-    radii = footprint_radii(xx.detach(), yy.detach(), determinant.detach())  # (f,)
-    rectangles = tile_rectangles(means2d.detach(), radii, camera)  # (f, 4)
-    touched = (rectangles[:, 2:] - rectangles[:, :2]).prod(dim=1) > 0  # (f,)
-    projection = Projection(front, depth, means2d, torch.stack([xx, xy, yy], dim=-1), conics, radii, rectangles)
-    return projection.select(touched & (determinant.detach() != 0))
+    with torch.no_grad():
+        radii = footprint_radii(xx, yy, determinants)  # (v,)
+        rectangles = tile_rectangles(means2d, radii, camera)  # (v, 4)
+    return Projection(ids, depths, means2d, determinants, conics, radii, rectangles)
 
 
 def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
