@@ -48,6 +48,7 @@ class SceneReference:
         eval: whether every eighth view was held out.
         background: RGB in [0, 1] behind the base field.
         kind: "colmap" or "transforms".
+        images: name of the image folder in a COLMAP scene.
     """
 
     path: str
@@ -55,6 +56,7 @@ class SceneReference:
     eval: bool
     background: tuple[float, float, float]
     kind: str
+    images: str = "images"
 
 
 @dataclass(frozen=True)
