@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.plan import Stage
+
+if TYPE_CHECKING:
+    from lapgs_plugin.archive import Manifest
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
+
+IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
+"""Settings that the manifest has fields of its own for."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,6 @@ class Densification:
     every: int | None = None
     reset_every: int | None = None
     grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
-    max_gaussians: int | None = None
 
 
 @dataclass(frozen=True)
@@ -70,20 +75,27 @@ class TrainSettings:
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
+    def for_manifest(self) -> dict[str, Any]:
+        """The settings as keyword arguments of `Manifest`: those it names itself, and the rest under "settings"."""
+        values = asdict(self)
+        return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
+
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> TrainSettings:
-        """Settings from a manifest, as `dataclasses.asdict` wrote them.
+    def from_manifest(cls, manifest: Manifest) -> TrainSettings:
+        """The settings a run was started with.
 
         Raises:
-            UserInputError: a key this version does not know.
+            RunFolderError: they hold a key this version does not know or lack one.
         """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise UserInputError(f"settings of another version: unknown {', '.join(unknown)}")
-        values = dict(values)
+        values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
+        if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
+            raise RunFolderError(
+                f"the run was not started by `lapgs train` of this version (settings differ in {', '.join(difference)}); "
+                f"continue it with {manifest.created_by}"
+            )
         values["learning_rates"] = LearningRates(**values["learning_rates"])
         values["densification"] = Densification(**values["densification"])
-        values["split"] = tuple(values["split"]) if values["split"] is not None else None
+        values["split"] = None if values["split"] is None else tuple(values["split"])
         return cls(**values)
 
 
