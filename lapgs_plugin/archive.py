@@ -207,12 +207,12 @@ class RunArchive:
         """
         assert not manifest.records, "a new run has no finished level"
         folder = Path(path).absolute()
-        _require_room(folder, overwrite)
+        cls.require_room(folder, overwrite)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         archive = cls(folder, manifest, FolderLock.acquire(folder))
         try:
-            _require_room(folder, overwrite)  # another process may have started one before the lock was ours
+            cls.require_room(folder, overwrite)  # another process may have started one before the lock was ours
             # The manifest goes first: should this be interrupted, the folder is an empty run and not a broken one.
             archive._write_json(MANIFEST, asdict(manifest))
             with one_line_errors(folder):
@@ -221,6 +221,30 @@ class RunArchive:
             archive.close()
             raise
         return archive
+
+    @staticmethod
+    def require_room(path: Path | str, overwrite: bool = False) -> None:
+        """Check, before anything expensive is done, that `create` would accept the folder. Writes nothing.
+
+        Raises:
+            RunFolderError: as `create`, except for what only writing shows.
+        """
+        folder = Path(path).absolute()
+        if folder.exists() and not folder.is_dir():
+            raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
+        if _is_run(folder):
+            if not overwrite:
+                raise RunFolderError(
+                    f"{folder} already holds a run; continue it with --resume or replace it with --overwrite"
+                )
+            return
+        entries = list(folder.iterdir()) if folder.exists() else []
+        # A run that was killed before its first manifest leaves these two.
+        strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+        if strangers:
+            raise RunFolderError(
+                f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
+            )
 
     @classmethod
     def open(cls, path: Path | str, *, resume: bool = False) -> RunArchive:
@@ -453,25 +477,6 @@ def _read_manifest(folder: Path) -> Manifest:
         return Manifest.from_json(values)
     except (UserInputError, TypeError) as error:
         raise RunFolderError(f"{path} is damaged: {error}; restore it or train again with --overwrite") from error
-
-
-def _require_room(folder: Path, overwrite: bool) -> None:
-    """Refuse a folder that a new run may not use."""
-    if folder.exists() and not folder.is_dir():
-        raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
-    if _is_run(folder):
-        if not overwrite:
-            raise RunFolderError(
-                f"{folder} already holds a run; continue it with --resume or replace it with --overwrite"
-            )
-        return
-    entries = list(folder.iterdir()) if folder.exists() else []
-    # A run that was killed before its first manifest leaves these two.
-    strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
-    if strangers:
-        raise RunFolderError(
-            f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
-        )
 
 
 def _is_run(folder: Path) -> bool:
