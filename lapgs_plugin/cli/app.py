@@ -1,4 +1,4 @@
-"""The typer application: every command registered in one place, errors turned into one line and exit code 2."""
+"""The typer application: every command registered in one place, errors turned into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ app = typer.Typer(
 
 
 def run() -> None:
-    """Run the command line; a `LapgsError` becomes one line on stderr and exit code 2."""
+    """Run the command line; a `LapgsError` becomes one line on stderr and its exit code."""
     try:
         app()
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(error.exit_code)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageHook
@@ -33,10 +33,6 @@ from lapgs_plugin.training.views import level_views
 
 LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
-
-
-class TrainingStopped(RunFolderError):
-    """The run was asked to stop; a checkpoint is in the run folder."""
 
 
 def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
@@ -89,7 +85,7 @@ class Trainer:
             resume: continue from the run folder's checkpoint, or after its last finished level.
 
         Raises:
-            TrainingStopped: the user asked to stop; everything needed to resume is on disk.
+            TrainingStoppedError: the user asked to stop; everything needed to resume is on disk.
             TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
         """
         checkpoint = self.archive.load_checkpoint() if resume else None
@@ -220,7 +216,7 @@ class Trainer:
         if stop.requested or iteration % self.checkpoint_every == 0:
             self._save_checkpoint(run)
         if stop.requested:
-            raise TrainingStopped(
+            raise TrainingStoppedError(
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
                 f"a checkpoint is in {self.archive.path()}, the same command with --resume continues"
             )
