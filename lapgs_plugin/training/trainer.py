@@ -22,7 +22,7 @@ from lapgs_plugin.plan import Stage, StagePlan, level_size, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.supervision import Supervision
+from lapgs_plugin.supervision import Supervision, parse_supervision
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.model import TrainableField
@@ -72,7 +72,7 @@ class Trainer:
     def __post_init__(self) -> None:
         self.plan = make_plan(self.scene, self.settings)
         self._pyramid = Pyramid(self.settings.grid)
-        self._supervision = Supervision(self.settings.supervision)
+        self._supervision = parse_supervision(self.settings.supervision)
         self._overhead: dict[str, float] = {}
         self._train_cache: PredictionCache | None = None
         self._test_cache: PredictionCache | None = None
