@@ -1,4 +1,4 @@
-"""Images in and out through OpenImageIO, and their resizing.
+"""Images in and out, and their resizing. OpenImageIO reads; Pillow encodes what has 8 bits.
 
 Pixel values are used as the file codes them, scaled to [0, 1] for integer formats: photos stay gamma-encoded, as in
 every 3DGS codebase, and EXR stays linear and unbounded. Pixels keep the order in which the file stores them: an EXIF
@@ -7,18 +7,23 @@ orientation is ignored, because COLMAP ignores it when it makes the cameras.
 
 from __future__ import annotations
 
+import io
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 
 JPEG_QUALITY = 95
+PNG_LEVEL = 4
+"""2.5 times as fast as zlib's default of 6, for files 4 % larger (fox, 1062x1894)."""
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 
 
@@ -111,34 +116,48 @@ def write_image(path: Path, image: Tensor) -> None:
             f"{path}: cannot write {suffix or 'a file without extension'}, expected .png, .jpg or .exr"
         )
     pixels = image.detach().to("cpu", torch.float32).permute(1, 2, 0)  # (h, w, 3)
-    if suffix != ".exr":
-        pixels = (pixels.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _encode(unfinished, pixels.contiguous().numpy())
+        if suffix == ".exr":
+            _write_exr(unfinished, pixels.contiguous().numpy())
+        else:
+            levels = (pixels.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
+            unfinished.write_bytes(_encode_8_bits(levels.contiguous().numpy(), suffix))
         unfinished.replace(path)
     except OSError as error:
         raise LapgsError(
             f"{path}: the image cannot be written ({_one_line(str(error))}); check free space and permissions"
         ) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
-def _encode(path: Path, pixels: NDArray[np.float32] | NDArray[np.uint8]) -> None:
-    """Write (h, w, 3) pixels in the format of the file's extension; OSError with the encoder's reason."""
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8 if pixels.dtype == np.uint8 else oiio.FLOAT)
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        spec.attribute("Compression", f"jpeg:{JPEG_QUALITY}")
-        spec.attribute("jpeg:subsampling", "4:4:4")
+def _encode_8_bits(levels: NDArray[np.uint8], suffix: str) -> bytes:
+    """A PNG or JPEG file of (h, w, 3) pixels.
+
+    Encoded in memory by Pillow: on a full disk OpenImageIO's JPEG writer ends the process and its PNG writer reports
+    success.
+    """
+    encoded = io.BytesIO()
+    if suffix == ".png":
+        Image.fromarray(levels).save(encoded, "PNG", compress_level=PNG_LEVEL)
+    else:
+        Image.fromarray(levels).save(encoded, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4")
+    return encoded.getvalue()
+
+
+def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
+    """Write (h, w, 3) pixels as they are; OSError with the writer's reason."""
     target = oiio.ImageOutput.create(str(path))
     if target is None:
         raise OSError(oiio.geterror())
-    written = target.open(str(path), spec) and target.write_image(pixels)
+    height, width, channels = pixels.shape
+    written = target.open(str(path), oiio.ImageSpec(width, height, channels, oiio.FLOAT)) and target.write_image(pixels)
+    complaint = target.geterror()
     if not (target.close() and written):
-        raise OSError(target.geterror() or oiio.geterror())
+        raise OSError(complaint or target.geterror())
 
 
 def _open(path: Path) -> oiio.ImageInput:
