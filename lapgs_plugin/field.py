@@ -231,6 +231,7 @@ def _as_columns(tensor: Tensor) -> Tensor:
 def _stack_columns(vertices: PlyElement, names: tuple[str, ...]) -> Tensor:
     """Properties as one tensor, (n, len(names)) float32."""
     stacked: NDArray[Any] = np.empty((vertices.count, len(names)), dtype=np.float32)
-    for column, name in enumerate(names):
-        stacked[:, column] = vertices[name]
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which require_finite reports
+        for column, name in enumerate(names):
+            stacked[:, column] = vertices[name]
     return torch.from_numpy(stacked)
