@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError
 
 app = typer.Typer(
@@ -13,7 +14,10 @@ app = typer.Typer(
     help="Train 3D Gaussian Splatting as a Laplacian frequency hierarchy.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    add_completion=False,
 )
+
+app.command("train")(train)
 
 
 def run() -> None:

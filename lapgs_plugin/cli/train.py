@@ -153,7 +153,15 @@ def train(  # noqa: PLR0917 - a command line has as many parameters as options
     else:
         archive, loaded = _create(out, reference, settings, rasterizer, overwrite)
     with archive:
-        _run(archive, loaded, console, threads, test_every, checkpoint_every, resume)
+        _run(
+            archive,
+            loaded,
+            console,
+            threads=threads,
+            test_every=test_every,
+            checkpoint_every=checkpoint_every,
+            resume=resume,
+        )
     console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
 
 
@@ -220,7 +228,7 @@ def _resume(out: Path, wanted: dict[str, Any], given: set[str]) -> RunArchive:
             if wanted[name] != started_with[name]:
                 option = "--eval" if name == "hold_out" else "--" + name.replace("_", "-")
                 raise UserInputError(
-                    f"{option}: the run in {out} was started with {started_with[name]}, now {wanted[name]} is asked for; "
+                    f"{option} asks for {wanted[name]}, but the run in {out} was started with {started_with[name]}; "
                     "leave the option out to continue it, or start again with --overwrite"
                 )
     except BaseException:
@@ -247,7 +255,6 @@ def _create(
     """Read the scene, check that it can be trained as asked, and only then make the run folder."""
     from lapgs_plugin.archive import Manifest, RunArchive
     from lapgs_plugin.reference_raster import make_rasterizer
-    from lapgs_plugin.supervision import parse_supervision
     from lapgs_plugin.training.trainer import make_plan
 
     RunArchive.require_room(out, overwrite)
@@ -266,6 +273,7 @@ def _run(
     archive: RunArchive,
     scene: Scene,
     console: Console,
+    *,
     threads: int | None,
     test_every: int | None,
     checkpoint_every: int,

@@ -90,8 +90,8 @@ class TrainSettings:
         values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
-                f"the run was not started by `lapgs train` of this version (settings differ in {', '.join(difference)}); "
-                f"continue it with {manifest.created_by}"
+                f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
+                f"match); continue it with {manifest.created_by}"
             )
         values["learning_rates"] = LearningRates(**values["learning_rates"])
         values["densification"] = Densification(**values["densification"])

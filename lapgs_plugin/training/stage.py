@@ -103,7 +103,7 @@ class StageRun:
         image = self.hooks.compose(context, result.image)
         loss = self.hooks.loss(context, image)
         self._note_loss(loss.item(), iteration)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it without annotations
         self.hooks.after_backward(context)
         self.model.step(self.schedule.means_learning_rate(iteration) * self.extent, (degree + 1) ** 2)
         self._densify(context, result, view)
@@ -131,7 +131,7 @@ class StageRun:
     def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(
             f"training diverged at level {self.stage.level}, iteration {iteration}: {what}; expected finite values; "
-            "finished levels and the last checkpoint are kept, continue with --resume or start again with other settings"
+            "finished levels and the last checkpoint are kept, start again with other settings"
         )
 
     def state(self) -> dict[str, Any]:

@@ -15,12 +15,12 @@ from torch import Tensor
 from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.inheritance import field_from_points, inherit
-from lapgs_plugin.plan import Stage, StagePlan, level_size, parse_split
+from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision
 from lapgs_plugin.training.densification import Densifier
@@ -147,8 +147,8 @@ class Trainer:
             if self.settings.inherit == "full":
                 if moments is None:
                     raise RunFolderError(
-                        f"{self.archive.path()}: full inheritance needs the optimizer state of level {stage.level + 1}, "
-                        "which only its checkpoint held; start again with --overwrite or use --inherit xyz"
+                        f"{self.archive.path()}: --inherit full needs the optimizer state of level {stage.level + 1}, "
+                        "which only the checkpoint held, and that is gone; start again with --overwrite"
                     )
                 model.adopt_moments(moments, kept)
             return model
@@ -189,14 +189,15 @@ class Trainer:
             self._test_cache = self._predictions(stage, self.scene.test, "test")
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> PredictionCache:
-        cache = PredictionCache(
-            where=self.settings.cache, precision=self.settings.cache_precision, folder=self.archive.path(CACHE, name)
-        )
-        for view in views:
-            camera = view.camera
-            width, height = level_size((camera.width, camera.height), stage.level)
-            composed = self._renderer().render(camera, level=stage.level + 1).composed[stage.level + 1]
-            cache.put(view.name, self._pyramid.up(composed, (height, width)))
+        """Up(I_hat^(l+1)) of each view, for the stage of level l."""
+        settings, coarser = self.settings, stage.level + 1
+        cache = PredictionCache(settings.cache, settings.cache_precision, self.archive.path(CACHE, name))
+        if views:
+            renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer)
+            for view in views:
+                camera = level_camera(view.camera, stage.level)
+                composed = renderer.render(view.camera, level=coarser).composed[coarser]
+                cache.put(view.name, self._pyramid.up(composed, (camera.height, camera.width)))
         return cache
 
     def _close_caches(self) -> None:
@@ -244,15 +245,11 @@ class Trainer:
         with self._timed("evaluation"):
             values = []
             for view in self.scene.test:
-                size = (view.camera.width, view.camera.height)
-                camera = view.camera.resized(*level_size(size, run.stage.level))
+                camera = level_camera(view.camera, run.stage.level)
                 image = self.rasterizer(run.model.field, camera, background=run.background).image
                 if self._test_cache is not None:
                     image = image + self._test_cache.get(view.name)
-                for level in range(run.stage.level - 1, -1, -1):
-                    width, height = level_size(size, level)
-                    image = self._pyramid.up(image, (height, width))
-                values.append(psnr(image, view.image))
+                values.append(psnr(to_full_size(image, view.camera, run.stage.level, self._pyramid), view.image))
             return math.fsum(values) / len(values)
 
     def _save_checkpoint(self, run: StageRun) -> None:
@@ -272,9 +269,6 @@ class Trainer:
             image_size=run.stage.image_size,
         )
         self.archive.finish_level(record, field)
-
-    def _renderer(self) -> HierarchyRenderer:
-        return HierarchyRenderer.from_archive(self.archive, self.rasterizer)
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:

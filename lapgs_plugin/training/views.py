@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.rendering.compose import level_camera
 from lapgs_plugin.scenes.scene import View
 
 
@@ -41,8 +41,7 @@ def level_views(
     """
     made = []
     for view in views:
-        size = (view.camera.width, view.camera.height)
-        camera = view.camera.resized(*level_size(size, level))
+        camera = level_camera(view.camera, level)
         coarse = None
         if with_coarse and level < levels - 1:
             images = pyramid.gaussian(view.image, level + 2)
