@@ -627,8 +627,11 @@ class PredictionCache:
         path = known.path if known and known.path else self._folder / f"{len(self._images):06d}.bin"
         with one_line_errors(path):
             self._folder.mkdir(parents=True, exist_ok=True)
-            with path.open("wb") as stream:
-                stream.write(stored.data)
+            try:
+                path.write_bytes(stored.data)
+            except OSError:
+                path.unlink(missing_ok=True)  # half an image would only keep a full disk full
+                raise
         return path
 
     def _load(self, image: _CachedImage) -> NDArray[np.float32]:
