@@ -15,7 +15,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _HERE = Path(__file__).parent
-_COMPILER_STAMP = hashlib.sha256(b"".join((_HERE / name).read_bytes() for name in ("_jit.py", "lanes.py"))).hexdigest()
+_COMPILER_STAMP = hashlib.sha256(b"".join((_HERE / name).read_bytes() for name in ("_jit.py", "lanes.py", "layout.py"))).hexdigest()
 
 
 def jit(function: _F) -> _F:
@@ -23,7 +23,7 @@ def jit(function: _F) -> _F:
 
     The GIL is released while it runs. Division by zero gives inf or nan as in NumPy. The machine code is cached on disk,
     beside the module or, where that folder is read-only, in the user's cache folder, or not at all where neither can be
-    written. It is kept until the module's own file, this one or `lanes` changes, so a kernel lives in the same module
+    written. It is kept until the module's own file, `lanes` or `layout` changes, so a kernel lives in the same module
     as the helpers it calls.
     """
     compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
@@ -42,7 +42,7 @@ def inline(function: _F) -> _F:
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]  # Numba leaves its classes without annotations
-    """Numba's cache, which looks at the file of the function alone, made to notice a change of `lanes` too."""
+    """Numba's cache, which looks at the file of the function alone, made to notice a change of what all kernels share too."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)

@@ -10,9 +10,10 @@ fast-math flag is set anywhere, so equal expressions give equal bits in differen
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Callable
-from typing import Any, NoReturn, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NoReturn, Protocol
 
 import numpy as np
 from llvmlite import ir
@@ -102,6 +103,31 @@ def absolute(a: Lanes) -> Lanes:
     _compiled_only()
 
 
+def sqrt(a: Lanes) -> Lanes:
+    """Square root."""
+    _compiled_only()
+
+
+def floor(a: Lanes) -> Lanes:
+    """Largest whole number not above a."""
+    _compiled_only()
+
+
+def ceil(a: Lanes) -> Lanes:
+    """Smallest whole number not below a."""
+    _compiled_only()
+
+
+def log2(a: Lanes) -> Lanes:
+    """Logarithm to base 2, lane by lane from the C library: not for inner loops."""
+    _compiled_only()
+
+
+def exp(a: Lanes) -> Lanes:
+    """e^a as accurate as `exp2`; outside of +-87 (float32) or +-708 (float64), and for NaN, that of the upper bound."""
+    _compiled_only()
+
+
 def select(mask: Mask, a: Lanes | float, b: Lanes | float) -> Lanes:
     """a where the mask is set, b elsewhere; one of the two is a vector."""
     _compiled_only()
@@ -127,6 +153,31 @@ def store_sums(array: Floats, start: int, *values: Lanes) -> None:
 
     16 elements are written: those beyond the number of vectors become zero.
     """
+    _compiled_only()
+
+
+def load_columns(array: Floats, start: int, columns: Literal[2, 3, 4]) -> tuple[Lanes, ...]:
+    """The columns of 16 rows that follow each other: vector c holds array[start + c + columns * lane]."""
+    _compiled_only()
+
+
+def store_columns(array: Floats, start: int, *values: Lanes) -> None:
+    """The inverse of `load_columns`: one vector for each of 2 to 4 columns."""
+    _compiled_only()
+
+
+def load_rows(array: Floats, start: int, stride: int) -> tuple[Lanes, ...]:
+    """A 16x16 matrix, transposed: vector c holds array[start + c + stride * lane]."""
+    _compiled_only()
+
+
+def store_rows(array: Floats, start: int, stride: int, *values: Lanes) -> None:
+    """The inverse of `load_rows` for up to 16 vectors. 16 elements a row are written: the others become zero."""
+    _compiled_only()
+
+
+def store_whole(array: NDArray[np.int32], start: int, value: Lanes) -> None:
+    """array[start : start + 16] = value, which holds whole numbers."""
     _compiled_only()
 
 
@@ -250,6 +301,10 @@ _register(operator.lt, 2, _compare("<"), _MASK)
 _register(fma, 3, lambda builder, vector, a, b, c: _call(builder, "fmuladd", vector, a, b, c))
 _register(minimum, 2, lambda builder, vector, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 _register(maximum, 2, lambda builder, vector, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+_register(sqrt, 1, lambda builder, vector, a: _call(builder, "sqrt", vector, a))
+_register(floor, 1, lambda builder, vector, a: _call(builder, "floor", vector, a))
+_register(ceil, 1, lambda builder, vector, a: _call(builder, "ceil", vector, a))
+_register(log2, 1, lambda builder, vector, a: _call(builder, "log2", vector, a))
 _register(absolute, 1, lambda builder, vector, a: _call(builder, "fabs", vector, a))
 
 # Minimax polynomials of 2^r on [-1/2, 1/2] in the relative error: 7.5e-8 and 3e-18 before rounding.
@@ -277,15 +332,23 @@ _EXP2_FLOAT64 = (
 )
 
 
-def _emit_exp2(builder: Any, vector: ir.VectorType, a: Any) -> Any:
-    single = isinstance(vector.element, ir.FloatType)
-    mantissa_bits, coefficients = (23, _EXP2_FLOAT32) if single else (52, _EXP2_FLOAT64)
-    integers = ir.VectorType(ir.IntType(32 if single else 64), WIDTH)
-    # Adding 1.5 * 2^mantissa rounds to a whole number and leaves it in the low bits of the sum. Conversion to an
-    # integer would do too, but is undefined for what does not fit, and far outside of a Gaussian nothing fits.
-    rounder = _constant(vector, 1.5 * 2.0**mantissa_bits)
-    shifted = builder.fadd(a, rounder)
-    fraction = builder.fsub(a, builder.fsub(shifted, rounder))
+def _is_single(vector: ir.VectorType) -> bool:
+    return isinstance(vector.element, ir.FloatType)
+
+
+def _rounder(vector: ir.VectorType) -> ir.Constant:
+    """1.5 * 2^mantissa bits. Adding it rounds to a whole number and leaves that in the low bits of the sum.
+
+    Conversion to an integer would do too, but is undefined for what does not fit, and far outside of a Gaussian
+    nothing fits.
+    """
+    return _constant(vector, 1.5 * 2.0 ** (23 if _is_single(vector) else 52))
+
+
+def _scaled_power(builder: Any, vector: ir.VectorType, fraction: Any, shifted: Any) -> Any:
+    """2^fraction, for a fraction in [-1/2, 1/2], times 2 to the whole number in the low bits of `shifted`."""
+    mantissa_bits, coefficients = (23, _EXP2_FLOAT32) if _is_single(vector) else (52, _EXP2_FLOAT64)
+    integers = ir.VectorType(ir.IntType(32 if _is_single(vector) else 64), WIDTH)
     value = _constant(vector, coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         value = _call(builder, "fmuladd", vector, value, fraction, _constant(vector, coefficient))
@@ -293,7 +356,28 @@ def _emit_exp2(builder: Any, vector: ir.VectorType, a: Any) -> Any:
     return builder.bitcast(builder.add(builder.bitcast(value, integers), exponent), vector)
 
 
+def _emit_exp2(builder: Any, vector: ir.VectorType, a: Any) -> Any:
+    shifted = builder.fadd(a, _rounder(vector))
+    return _scaled_power(builder, vector, builder.fsub(a, builder.fsub(shifted, _rounder(vector))), shifted)
+
+
+def _emit_exp(builder: Any, vector: ir.VectorType, a: Any) -> Any:
+    limit = _constant(vector, 87.0 if _is_single(vector) else 708.0)
+    a = builder.select(builder.fcmp_ordered("<", a, limit), a, limit)
+    a = builder.select(builder.fcmp_ordered(">", a, builder.fneg(limit)), a, builder.fneg(limit))
+    per_e = _constant(vector, math.log2(math.e))
+    shifted = _call(builder, "fmuladd", vector, a, per_e, _rounder(vector))
+    whole = builder.fneg(builder.fsub(shifted, _rounder(vector)))
+    # ln 2 in two parts, the first with so few bits that its product with `whole` is exact.
+    high = 0.693359375 if _is_single(vector) else 0.6931471803691238
+    rest = _call(builder, "fmuladd", vector, whole, _constant(vector, high), a)
+    rest = _call(builder, "fmuladd", vector, whole, _constant(vector, _LN2_LOW[_is_single(vector)]), rest)
+    return _scaled_power(builder, vector, builder.fmul(rest, per_e), shifted)
+
+
+_LN2_LOW = {True: -2.1219444005469057e-4, False: 1.9082149292705877e-10}
 _register(exp2, 1, _emit_exp2)
+_register(exp, 1, _emit_exp)
 
 # ------------------------------------------------------------------------------------------------ masks
 
@@ -454,6 +538,135 @@ def _packed_halves(builder: Any, a: Any, b: Any, step: int) -> Any:
         return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order))
 
     return builder.fadd(shuffle(first), shuffle(second))
+
+
+@type_callable(load_columns)
+def _type_load_columns(context: Any) -> Any:
+    def typer(array: types.Type, start: types.Type, columns: types.Type) -> Any:
+        fits = _is_buffer(array) and isinstance(columns, types.IntegerLiteral)
+        return types.UniTuple(_LanesType(array.dtype), columns.literal_value) if fits else None
+
+    return typer
+
+
+@lower_builtin(load_columns, types.Array, types.Integer, types.IntegerLiteral)
+def _lower_load_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    columns = sig.args[2].literal_value
+    parts = _load_parts(context, builder, sig, args, range(0, columns * WIDTH, WIDTH))
+    picked = [_pick(builder, parts, range(c, columns * WIDTH, columns)) for c in range(columns)]
+    return context.make_tuple(builder, sig.return_type, picked)
+
+
+@infer_global(store_columns)
+class _StoreColumnsTyping(AbstractTemplate):  # type: ignore[misc]  # as above
+    def generic(self, args: tuple[types.Type, ...], kws: dict[str, Any]) -> Any:
+        array, _, *values = args
+        return signature(types.void, *args) if set(values) == {_LanesType(array.dtype)} else None
+
+
+@lower_builtin(store_columns, types.Array, types.Integer, types.VarArg(_LanesType))
+def _lower_store_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    values = args[2:]
+    columns = len(values)
+    for part in range(columns):
+        lanes = [(WIDTH * part + lane) % columns * WIDTH + (WIDTH * part + lane) // columns for lane in range(WIDTH)]
+        _store_part(context, builder, sig, args, part * WIDTH, _pick(builder, values, lanes))
+    return context.get_dummy_value()
+
+
+@type_callable(load_rows)
+def _type_load_rows(context: Any) -> Any:
+    return lambda array, start, stride: types.UniTuple(_LanesType(array.dtype), WIDTH) if _is_buffer(array) else None
+
+
+@lower_builtin(load_rows, types.Array, types.Integer, types.Integer)
+def _lower_load_rows(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    stride = context.cast(builder, args[2], sig.args[2], types.intp)
+    rows = _load_parts(context, builder, sig, args, [builder.mul(stride, stride.type(i)) for i in range(WIDTH)])
+    return context.make_tuple(builder, sig.return_type, _transposed(builder, rows))
+
+
+@infer_global(store_rows)
+class _StoreRowsTyping(AbstractTemplate):  # type: ignore[misc]  # as above
+    def generic(self, args: tuple[types.Type, ...], kws: dict[str, Any]) -> Any:
+        array, _, _, *values = args
+        fits = 0 < len(values) <= WIDTH and set(values) == {_LanesType(array.dtype)}
+        return signature(types.void, *args) if fits else None
+
+
+@lower_builtin(store_rows, types.Array, types.Integer, types.Integer, types.VarArg(_LanesType))
+def _lower_store_rows(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    stride = context.cast(builder, args[2], sig.args[2], types.intp)
+    zero = ir.Constant(args[3].type, None)
+    for i, row in enumerate(_transposed(builder, [*args[3:], *[zero] * (WIDTH - len(args) + 3)])):
+        _store_part(context, builder, sig, args, builder.mul(stride, stride.type(i)), row)
+    return context.get_dummy_value()
+
+
+def _load_parts(context: Any, builder: Any, sig: Any, args: Any, offsets: Iterable[Any]) -> list[Any]:
+    """The vectors at array[start + offset] for each offset; sig and args begin with array and start."""
+    index = context.cast(builder, args[1], sig.args[1], types.intp)
+    vector = ir.VectorType(context.get_value_type(sig.args[0].dtype), WIDTH)
+    parts = []
+    for offset in offsets:
+        place = builder.add(index, index.type(offset) if isinstance(offset, int) else offset)
+        pointer = builder.bitcast(_address(context, builder, sig.args[0], args[0], place), vector.as_pointer())
+        parts.append(builder.load(pointer, align=sig.args[0].dtype.bitwidth // 8))
+    return parts
+
+
+def _store_part(context: Any, builder: Any, sig: Any, args: Any, offset: Any, value: Any) -> None:
+    """array[start + offset : ... + 16] = value; sig and args begin with array and start."""
+    index = context.cast(builder, args[1], sig.args[1], types.intp)
+    place = builder.add(index, index.type(offset) if isinstance(offset, int) else offset)
+    pointer = builder.bitcast(_address(context, builder, sig.args[0], args[0], place), value.type.as_pointer())
+    builder.store(value, pointer, align=sig.args[0].dtype.bitwidth // 8)
+
+
+def _shuffle(builder: Any, a: Any, b: Any, order: Iterable[int]) -> Any:
+    """Lanes of a (0 to 15) and b (16 to 31) in any order."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), list(order)))
+
+
+def _pick(builder: Any, parts: Sequence[Any], lanes: Iterable[int]) -> Any:
+    """The given lanes of the vectors put end to end."""
+    lanes = list(lanes)
+    result = parts[0]
+    for part in range(1, len(parts)):
+        known = [lane if part == 1 else i for i, lane in enumerate(lanes)]
+        order = [
+            lane % WIDTH + WIDTH if lane // WIDTH == part else (known[i] if lane // WIDTH < part else 0)
+            for i, lane in enumerate(lanes)
+        ]
+        result = _shuffle(builder, result, parts[part], order)
+    return result
+
+
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """The transpose of 16 vectors of 16 lanes, in four rounds of exchanges between pairs of rows."""
+    step = 1
+    while step < WIDTH:
+        low = [lane if not lane & step else lane - step + WIDTH for lane in range(WIDTH)]
+        high = [lane + step if not lane & step else lane + WIDTH for lane in range(WIDTH)]
+        exchanged = list(rows)
+        for i in range(WIDTH):
+            if not i & step:
+                exchanged[i] = _shuffle(builder, rows[i], rows[i + step], low)
+                exchanged[i + step] = _shuffle(builder, rows[i], rows[i + step], high)
+        rows = exchanged
+        step *= 2
+    return rows
+
+
+@type_callable(store_whole)
+def _type_store_whole(context: Any) -> Any:
+    return lambda array, start, value: types.void if array.dtype == types.int32 else None
+
+
+@lower_builtin(store_whole, types.Array, types.Integer, _LanesType)
+def _lower_store_whole(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    _store_part(context, builder, sig, args, 0, builder.fptosi(args[2], ir.VectorType(ir.IntType(32), WIDTH)))
+    return context.get_dummy_value()
 
 
 # ------------------------------------------------------------------------------------------------ integers
