@@ -13,8 +13,8 @@ Three sigma cut an opaque Gaussian at alpha = o exp(-4.5), before 1/255, in the 
 misses. That cut is part of the image.
 
 Gradients are those of the CUDA code. They differ from textbook differentiation of the image in two places, each marked
-DEPARTURE below. Two guards of the CUDA code against division by zero (1e-7 added to w and to the squared determinant in
-the backward pass) are rounding-sized and left out.
+DEPARTURE below. Two guards of the CUDA code against division by zero are left out: 1e-7 added to w, and to the squared
+determinant in the backward pass, where it shortens the gradient of the smallest Gaussians by one part in 80,000.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ JACOBIAN_LIMIT = 1.3
 RADIUS_SIGMAS = 3.0
 """Radius of a footprint in standard deviations along its longer axis."""
 MIN_ROOT = 0.1
-"""Lower bound of half the squared difference of the covariance's eigenvalues under the root, in px^4."""
+"""Lower bound of the squared half difference of the 2D covariance's eigenvalues, in px^4."""
 MAX_RADIUS = 2**30
 """Radii saturate here, in px, so that they fit int32."""
 MAX_ALPHA = 0.99
@@ -94,7 +94,7 @@ class TileLists:
 class OracleRasterizer:
     """Reference rasterizer in plain PyTorch: any device, float32 or float64, as the field's tensors are.
 
-    Tiles are recomputed in the backward pass, so that memory holds the intermediates of one tile at a time.
+    Each tile is computed again in the backward pass, so that memory holds the intermediates of one tile at a time.
     """
 
     @property
@@ -248,7 +248,9 @@ def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
 
 
 def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
-    """Tiles touched by [centre - radius, centre + radius]: the last one only from its first whole pixel on.
+    """Tiles touched by [centre - radius, centre + radius].
+
+    As in the CUDA code a last tile is left out when centre + radius falls short of its second pixel.
 
     Args:
         means2d: (n, 2) centres in pixel coordinates.
@@ -299,30 +301,48 @@ def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tenso
     # One gather for all tiles: a gather for each would cost a gradient as large as the field for each.
     parts = torch.split(splats[lists.members], lists.counts)  # (k, 9) for each tile
     owners = torch.split(ids[lists.members], lists.counts)  # (k,) for each tile
-    offsets = torch.arange(TILE, dtype=splats.dtype, device=splats.device)  # (16,)
-    grid = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)  # (256, 2) x, y
-    blended = []
+    steps = torch.arange(TILE, dtype=splats.dtype, device=splats.device)  # (16,)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)  # (256, 2) x, y
+    tiles = []
     for index, (part, owner) in enumerate(zip(parts, owners, strict=True)):
         row, column = divmod(index, lists.columns)
         pixels = grid + grid.new_tensor([column * TILE, row * TILE])  # (256, 2)
-        blend = partial(_blend_tile, pixels=pixels, ids=owner, absgrad2d=absgrad2d)
-        blended.append(checkpoint(blend, part, use_reentrant=False, preserve_rng_state=False))
-    tiled = torch.stack(blended).reshape(lists.rows, lists.columns, TILE, TILE, 4)
+        blended = _decide(part, pixels)  # (256, k)
+        used = blended.any(dim=0).nonzero()[:, 0]  # (m,) the others would only cost memory for gradients of zero
+        blend = partial(_blend, pixels=pixels, blended=blended[:, used], ids=owner[used], absgrad2d=absgrad2d)
+        tiles.append(checkpoint(blend, part[used], use_reentrant=False, preserve_rng_state=False))
+    tiled = torch.stack(tiles).reshape(lists.rows, lists.columns, TILE, TILE, 4)
     image = tiled.permute(4, 0, 2, 1, 3).reshape(4, lists.rows * TILE, lists.columns * TILE)
     return image[:3], image[3]
 
 
-def _blend_tile(splats: Tensor, pixels: Tensor, ids: Tensor, absgrad2d: Tensor) -> Tensor:
-    """Blend k Gaussians front to back in p pixels.
+@torch.no_grad()
+def _decide(splats: Tensor, pixels: Tensor) -> Tensor:
+    """(p, k) True where a pixel blends a Gaussian: it is visible there, and reached before the pixel is finished.
 
     Args:
-        splats: (k, 9) centre (2), conic (3), opacity (1), colour (3).
+        splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
         pixels: (p, 2) pixel coordinates.
+    """
+    centres, conics, opacities, _ = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
+    alphas = _alphas(centres - pixels[:, None], conics, opacities[:, 0])  # (p, k)
+    visible = alphas >= MIN_ALPHA  # (p, k)
+    behind = torch.cumprod(1 - alphas * visible, dim=1)  # (p, k) the transmittance if nothing ended a pixel
+    return visible & (behind >= MIN_TRANSMITTANCE)
+
+
+def _blend(splats: Tensor, pixels: Tensor, blended: Tensor, ids: Tensor, absgrad2d: Tensor) -> Tensor:
+    """C = sum_i c_i alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), over the Gaussians each pixel blends.
+
+    Args:
+        splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
+        pixels: (p, 2) pixel coordinates.
+        blended: (p, k) which Gaussians each pixel blends.
         ids: (k,) rows of `absgrad2d`.
         absgrad2d: (n, 2) buffer filled during the backward pass.
 
     Returns:
-        (p, 4) colour over black and transmittance.
+        (p, 4) colour C and the transmittance that is left.
     """
     centres, conics, opacities, colors = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
     offsets = centres - pixels[:, None]  # (p, k, 2)
@@ -330,21 +350,28 @@ def _blend_tile(splats: Tensor, pixels: Tensor, ids: Tensor, absgrad2d: Tensor) 
         offsets.register_hook(  # type: ignore[no-untyped-call]  # torch leaves this method without types
             lambda gradient: _accumulate_absolute(gradient, ids, absgrad2d)
         )
+    alphas = _alphas(offsets, conics, opacities[:, 0]).masked_fill(~blended, 0)  # (p, k)
+    behind = torch.cumprod(1 - alphas, dim=1)  # (p, k)
+    transmittances = torch.cat([torch.ones_like(pixels[:, :1]), behind], dim=1)  # (p, k + 1)
+    color = (alphas * transmittances[:, :-1]) @ colors  # (p, 3)
+    return torch.cat([color, transmittances[:, -1:]], dim=1)
+
+
+def _alphas(offsets: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
+    """alpha = min(0.99, o exp(-q)) with q = d^T conic d / 2.
+
+    Args:
+        offsets: (p, k, 2) centre minus pixel.
+        conics: (k, 3) entries xx, xy, yy.
+        opacities: (k,).
+
+    Returns:
+        (p, k) alphas; 0 where q < 0, which a rounded conic that is not positive definite can bring about.
+    """
     dx, dy = offsets.unbind(-1)  # (p, k) each
     xx, xy, yy = conics.unbind(-1)  # (k,) each
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy  # (p, k) = -q
-    # A rounded conic need not be positive definite; where it makes a Gaussian grow outwards it is skipped.
-    density = torch.exp(power.masked_fill(power.detach() > 0, -math.inf))  # (p, k)
-    alpha = _cap(opacities[:, 0] * density)  # (p, k)
-    with torch.no_grad():
-        visible = alpha >= MIN_ALPHA  # (p, k)
-        running = torch.cumprod(1 - alpha * visible, dim=1)  # (p, k) transmittance behind each Gaussian if none stopped
-        blended = visible & (running >= MIN_TRANSMITTANCE)  # (p, k)
-    alpha = alpha.masked_fill(~blended, 0)  # (p, k)
-    behind = torch.cumprod(1 - alpha, dim=1)  # (p, k)
-    transmittance = torch.cat([torch.ones_like(pixels[:, :1]), behind], dim=1)  # (p, k + 1)
-    color = (alpha * transmittance[:, :-1]) @ colors  # (p, 3)
-    return torch.cat([color, transmittance[:, -1:]], dim=1)
+    return _cap(opacities * torch.exp(power.masked_fill(power.detach() > 0, -math.inf)))
 
 
 def _cap(alpha: Tensor) -> Tensor:
