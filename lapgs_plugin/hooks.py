@@ -239,28 +239,32 @@ def verify_hook(hook: object, source: str) -> None:
     for name in dir(hook):
         if name in HOOK_NAMES:
             _verify_arguments(hook, name, source)
-        elif not name.startswith("_") and (close := difflib.get_close_matches(name, HOOK_NAMES, n=1, cutoff=0.8)):
-            raise UserInputError(
-                f"hook {source}: {name} is not a method of StageHook; did you mean {close[0]}? "
-                "Rename it, or give it a leading underscore if it is meant for itself"
-            )
+        elif callable(getattr(hook, name)):
+            _verify_not_misspelt(name, source)
+
+
+def _verify_not_misspelt(name: str, source: str) -> None:
+    close = difflib.get_close_matches(name, HOOK_NAMES, n=1, cutoff=0.8)
+    if (close and not name.startswith("_")) or name.startswith(("on_", "before_", "after_")):
+        guess = f"did you mean {close[0]}?" if close else f"there are {', '.join(HOOK_NAMES)}."
+        raise UserInputError(
+            f"hook {source}: {name} is not a method of StageHook; {guess} "
+            "Rename it, or begin its name with an underscore if it is no hook"
+        )
 
 
 def _verify_arguments(hook: StageHook, name: str, source: str) -> None:
-    expected = [
-        parameter for parameter in inspect.signature(getattr(StageHook, name)).parameters if parameter != "self"
-    ]
+    _, *expected = inspect.signature(getattr(StageHook, name)).parameters
     method = getattr(hook, name)
     if not callable(method):
         raise UserInputError(f"hook {source}: {name} is {_describe(method)}, expected a method({', '.join(expected)})")
-    parameters = list(inspect.signature(method).parameters.values())
-    positional = all(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in parameters)
-    got = [p.name for p in parameters]
-    if got != expected or not positional:
-        wrong = next((a for a in got if a not in expected), None) or next((a for a in expected if a not in got), got[0])
+    parameters = inspect.signature(method).parameters
+    positional = all(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in parameters.values())
+    if list(parameters) != expected or not positional:
+        wrong = [a for a in parameters if a not in expected] + [a for a in expected if a not in parameters]
         raise UserInputError(
-            f"hook {source}: {name} has the arguments ({', '.join(map(str, parameters))}), expected "
-            f"({', '.join(expected)}); look at {wrong}"
+            f"hook {source}: {name} has the arguments ({', '.join(map(str, parameters.values()))}), expected "
+            f"({', '.join(expected)}); look at {(wrong or expected)[0]}"
         )
 
 
