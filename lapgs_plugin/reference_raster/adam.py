@@ -141,6 +141,7 @@ class FieldAdam(torch.optim.Optimizer):
         tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"])
         arrays = (tensor.detach().view(-1).numpy() for tensor in tensors)
         parallel(_adam_kernel, *arrays, columns, active, scale, rates)
+        torch.autograd.graph.increment_version(parameter)  # autograd does not see what a kernel wrote
 
 
 def _rows(parameter: Tensor, scale: Tensor | None, active_columns: int | None) -> tuple[int, int, Floats]:
