@@ -110,6 +110,18 @@ class HierarchyRenderer:
         """The finest level that can be rendered; 0 for a complete hierarchy."""
         return min(self.fields)
 
+    def require_level(self, level: int) -> None:
+        """Check that `level` can be rendered.
+
+        Raises:
+            UserInputError: it is not there.
+        """
+        if not self.finest <= level < self.levels:
+            raise UserInputError(
+                f"level {level} cannot be rendered, expected {self.finest} to {self.levels - 1}; "
+                "levels count from 0, the finest, and this run has no others"
+            )
+
     @torch.no_grad()
     def render(self, camera: Camera, level: int = 0) -> Composition:
         """Render a view from the coarsest level down to `level`.
@@ -121,11 +133,7 @@ class HierarchyRenderer:
         Raises:
             UserInputError: that level is not there.
         """
-        if not self.finest <= level < self.levels:
-            raise UserInputError(
-                f"level {level} cannot be rendered, expected {self.finest} to {self.levels - 1}; "
-                "levels count from 0, the finest"
-            )
+        self.require_level(level)
         rendered: dict[int, Tensor] = {}
         composed: dict[int, Tensor] = {}
         for each in range(self.levels - 1, level - 1, -1):
