@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as TimeLeftColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from lapgs_plugin.plan import Stage
 
@@ -53,17 +53,16 @@ class ProgressMonitor(Monitor):
     def __init__(self, console: Console, levels: int) -> None:
         self._levels = levels
         self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeLeftColumn(),
-            TextColumn("{task.fields[figures]}"),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            BarColumn(bar_width=None, table_column=Column(ratio=1)),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[figures]}", table_column=Column(no_wrap=True)),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True, table_column=Column(no_wrap=True)),
             console=console,
+            expand=True,
         )
         self._task: TaskID | None = None
+        self._psnr: float | None = None
 
     def __enter__(self) -> ProgressMonitor:
         self._progress.start()
@@ -77,20 +76,20 @@ class ProgressMonitor(Monitor):
     def stage_started(self, stage: Stage, first_iteration: int) -> None:
         width, height = stage.image_size
         name = "field" if self._levels == 1 else "residual" if stage.signed else "base"
+        self._psnr = None
         self._task = self._progress.add_task(
-            f"level {stage.level} {name} {width}x{height}",
+            f"{name} {width}x{height}",
             total=stage.iterations,
             completed=first_iteration - 1,
-            rate="",
             figures="",
         )
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         assert self._task is not None
-        figures = f"loss {tick.loss:.4f}  {tick.num_gaussians:,} Gaussians"
-        if tick.psnr is not None:
-            figures += f"  {tick.psnr:.2f} dB"
-        self._progress.update(self._task, completed=tick.iteration, rate=f"{tick.rate:.1f} it/s", figures=figures)
+        self._psnr = tick.psnr if tick.psnr is not None else self._psnr  # measured rarely: the last one stays in sight
+        held_out = "" if self._psnr is None else f" {self._psnr:.2f} dB"
+        figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
+        self._progress.update(self._task, completed=tick.iteration, figures=figures)
 
     def say(self, text: str) -> None:
         self._progress.console.print(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -205,6 +206,7 @@ class Trainer:
             if cache is not None:
                 cache.close()
         self._train_cache = self._test_cache = None
+        shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
 
     def _after_iteration(self, run: StageRun, stop: StopRequest) -> None:
         """Log, measure, save and stop, whatever is due; none of it counts as optimization time."""
