@@ -5,7 +5,6 @@ The formats are described at https://colmap.github.io/format.html; pycolmap read
 
 from __future__ import annotations
 
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +15,10 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.colmap_binary import check_whole
 from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out
 
 MODEL_FILES = ("cameras", "images", "points3D")
-
-SMALLEST_RECORDS = {"cameras": 24, "images": 73, "points3D": 51, "rigs": 0, "frames": 0}
-"""Bytes of the smallest possible record in each binary file, which follow a count of 8 bytes."""
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras when all their distortion parameters are zero; fisheye models never are."""
@@ -82,50 +79,13 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
             "expected cameras, images and points3D, all as .bin or all as .txt"
         )
     if suffix == "bin":
-        _check_counts(model)
+        check_whole(model)
     try:
-        reconstruction = pycolmap.Reconstruction(str(model))
+        return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
         raise SceneError(
             f"{model}: the sparse model cannot be read ({' '.join(str(error).split())}); copy or export it again"
         ) from error
-    if suffix == "bin":
-        _check_complete(model, reconstruction)
-    return reconstruction
-
-
-def _check_counts(model: Path) -> None:
-    """Refuse files too short for the number of records they announce: pycolmap would allocate and read nonsense."""
-    for name, record in SMALLEST_RECORDS.items():
-        file = model / f"{name}.bin"
-        if not file.is_file():
-            continue  # rigs and frames exist only in models written by COLMAP 3.12 and later
-        size = file.stat().st_size
-        with file.open("rb") as stream:
-            head = stream.read(8)
-        count = struct.unpack("<Q", head)[0] if len(head) == 8 else None
-        if count is None or size < 8 + count * record:
-            _raise_cut_short(file, size)
-
-
-def _check_complete(model: Path, reconstruction: pycolmap.Reconstruction) -> None:
-    """Refuse files that end inside a record: pycolmap fills the rest of it with whatever is in memory."""
-    camera_bytes = sum(24 + 8 * len(camera.params) for camera in reconstruction.cameras.values())
-    image_bytes = sum(
-        73 + len(image.name.encode()) + 24 * image.num_points2D() for image in reconstruction.images.values()
-    )
-    point_bytes = sum(51 + 8 * point.track.length() for point in reconstruction.points3D.values())
-    for name, expected in (("cameras", camera_bytes), ("images", image_bytes), ("points3D", point_bytes)):
-        file = model / f"{name}.bin"
-        size = file.stat().st_size
-        if size < 8 + expected:
-            _raise_cut_short(file, size)
-
-
-def _raise_cut_short(file: Path, size: int) -> None:
-    raise SceneError(
-        f"{file}: the file is cut short at {size} bytes, expected all the records it announces; copy it again"
-    )
 
 
 def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
