@@ -2,6 +2,7 @@
 
     RUN/manifest.json              everything needed to render the run again
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
+    RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
     RUN/metrics.json, RUN/renders/, RUN/report.html   what is made of it later
@@ -35,7 +36,7 @@ FORMAT_VERSION = 1
 
 MANIFEST, HISTORY, METRICS, CHECKPOINT = "manifest.json", "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, CACHE = "renders", "report.html", "cache"
-PLY = "point_cloud.ply"
+PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 
 
 @dataclass(frozen=True)
@@ -317,8 +318,16 @@ class RunArchive:
             raise RunFolderError(f"level {level} of {self._folder} is damaged: {error}") from error
         return replace(loaded, signed=record.signed)
 
-    def finish_level(self, record: LevelRecord, field: GaussianField) -> None:
+    def finish_level(
+        self, record: LevelRecord, field: GaussianField, optimizer_state: dict[str, Any] | None = None
+    ) -> None:
         """Keep the field of a trained level: its PLY first, then the manifest that lists it, and no checkpoint of it.
+
+        Args:
+            record: of the level `manifest.next_level`.
+            field: as trained.
+            optimizer_state: for full inheritance, what `optimizer_state` gives to the next level; kept until that one
+                is finished.
 
         Raises:
             FieldError: the field holds NaN or inf; nothing is written.
@@ -331,9 +340,26 @@ class RunArchive:
         with one_line_errors(path):
             path.parent.mkdir(exist_ok=True)
             field.save_ply(path)
+        if optimizer_state is not None:
+            self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         self._write_json(MANIFEST, asdict(manifest))
         self._manifest = manifest
-        self.path(CHECKPOINT).unlink(missing_ok=True)
+        with one_line_errors(self._folder):
+            self.path(CHECKPOINT).unlink(missing_ok=True)
+            self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
+
+    def optimizer_state(self, level: int) -> dict[str, Any]:
+        """The optimizer state that a finished level left for the next one, its tensors on the CPU.
+
+        Raises:
+            RunFolderError: there is none, or it cannot be read.
+        """
+        path = self.field_path(level).with_name(OPTIMIZER)
+        if not path.exists():
+            raise RunFolderError(
+                f"{path} does not exist, and --inherit full needs it; start again with --overwrite or inherit xyz"
+            )
+        return _read_tensors(path, "start again with --overwrite or inherit xyz")
 
     def append_history(self, entry: dict[str, Any]) -> None:
         """Add one entry to the history: JSON with finite numbers, having "level" and "iteration"."""
@@ -390,9 +416,7 @@ class RunArchive:
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint of the level in training: tensors, numbers, strings and containers of them."""
         self._require_lock()
-        path = self.path(CHECKPOINT)
-        with one_line_errors(path), atomic_write(path) as stream:
-            _torch_save({"level": self._manifest.next_level, "state": state}, stream)
+        self._write_tensors(self.path(CHECKPOINT), {"level": self._manifest.next_level, "state": state})
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The latest checkpoint of the next level to train, its tensors on the CPU; None when there is none.
@@ -403,13 +427,7 @@ class RunArchive:
         path = self.path(CHECKPOINT)
         if not path.exists():
             return None
-        try:
-            saved: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, OSError, ... by damage
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RunFolderError(
-                f"{path} cannot be read ({reason}); delete it to continue from the last finished level"
-            ) from error
+        saved = _read_tensors(path, "delete it to continue from the last finished level")
         # A run killed right after a level was finished leaves that level's checkpoint behind.
         return saved["state"] if saved["level"] == self._manifest.next_level else None
 
@@ -434,6 +452,10 @@ class RunArchive:
         with one_line_errors(self.path(name)), atomic_write(self.path(name)) as stream:
             stream.write(text.encode())
 
+    def _write_tensors(self, path: Path, state: dict[str, Any]) -> None:
+        with one_line_errors(path), atomic_write(path) as stream:
+            _torch_save(state, stream)
+
     def _require_lock(self) -> None:
         assert self._lock is not None, "open the run with resume=True to write to it"
 
@@ -446,6 +468,15 @@ def _torch_save(state: dict[str, Any], stream: BinaryIO) -> None:
         if isinstance(error.__context__, OSError):
             raise error.__context__ from error
         raise
+
+
+def _read_tensors(path: Path, advice: str) -> dict[str, Any]:
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, OSError, ... by damage
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
+    return state
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -497,6 +528,7 @@ def _remove_results(folder: Path) -> None:
         shutil.rmtree(folder / RENDERS)
     for level in folder.glob("level_*/"):
         (level / PLY).unlink(missing_ok=True)
+        (level / OPTIMIZER).unlink(missing_ok=True)
         if not any(level.iterdir()):
             level.rmdir()
 

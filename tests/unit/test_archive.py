@@ -144,7 +144,7 @@ def test_an_existing_run_is_refused_and_unharmed(tmp_path: Path) -> None:
 
 def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path, manifest()) as archive:
-        finish(archive, 1)
+        archive.finish_level(record(1), level_field(1), {"x": 1})
         archive.append_history({"level": 0, "iteration": 1})
         archive.save_checkpoint({"x": 1})
         archive.write_metrics({"psnr": 1.0})
@@ -512,6 +512,19 @@ def test_checkpoints_keep_tensors_and_belong_to_a_level(tmp_path: Path) -> None:
         (tmp_path / "checkpoint.pt").write_bytes(old[: len(old) // 2])
         with pytest.raises(RunFolderError, match=r"checkpoint\.pt cannot be read .*; delete it"):
             archive.load_checkpoint()
+
+
+def test_optimizer_state_waits_for_the_next_level(tmp_path: Path) -> None:
+    moments = {"means": {"step": torch.tensor(9.0), "exp_avg": torch.randn(6, 3)}}
+    with RunArchive.create(tmp_path, manifest(3)) as archive:
+        archive.finish_level(record(2, 3), level_field(2, 3), moments)
+    with RunArchive.open(tmp_path, resume=True) as archive:  # a kill in between loses nothing
+        assert torch.equal(archive.optimizer_state(2)["means"]["exp_avg"], moments["means"]["exp_avg"])
+        finish(archive, 1)
+        for level in (2, 1):
+            with pytest.raises(RunFolderError, match=r"optimizer\.pt does not exist, and --inherit full needs it"):
+                archive.optimizer_state(level)
+        assert_level_is_whole(archive, 2)
 
 
 def test_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
