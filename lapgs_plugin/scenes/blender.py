@@ -21,7 +21,7 @@ from plyfile import PlyData, PlyParseError
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.images import image_size
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out, in_name_order
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
@@ -64,28 +64,26 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
     """
     if (path / TRAIN_FILE).is_file():
         values = _read_json(path / TRAIN_FILE)
-        train = _read_frames(path, TRAIN_FILE, values, images)
-        held_out = (
-            _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images) if _has_test(path, evaluate) else []
-        )
-        if not evaluate:
-            train, held_out = train + held_out, []
-        parts = hold_out(train, False)[0], hold_out(held_out, False)[0]
+        train, test = _read_pair(path, values, images, evaluate)
         radius = OBJECT_RADIUS
     else:
         values = _read_json(path / SINGLE_FILE)
-        parts = hold_out(_read_frames(path, SINGLE_FILE, values, images), evaluate)
+        train, test = hold_out(_read_frames(path, SINGLE_FILE, values, images), evaluate)
         radius = CAPTURE_RADIUS
-    points, colors = _read_points(path, values) or _random_points([*parts[0], *parts[1]], radius)
-    return SceneSource("transforms", *parts, points, colors)
+    points, colors = _read_points(path, values) or _random_points([*train, *test], radius)
+    return SceneSource("transforms", train, test, points, colors)
 
 
-def _has_test(path: Path, evaluate: bool) -> bool:
+def _read_pair(
+    path: Path, train_values: Values, images: str, evaluate: bool
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    train = _read_frames(path, TRAIN_FILE, train_values, images)
+    test: list[Frame] = []
     if (path / TEST_FILE).is_file():
-        return True
-    if evaluate:
+        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images)
+    elif evaluate:
         raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
-    return False
+    return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
 
 
 def _read_json(file: Path) -> Values:

@@ -50,10 +50,14 @@ class SceneSource:
     colors: NDArray[np.float64]  # (n, 3)
 
 
+def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    return tuple(sorted(frames, key=lambda frame: frame.name))
+
+
 def hold_out(frames: Sequence[Frame], evaluate: bool) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """Training and held-out frames in name order; nothing is held out unless `evaluate`."""
-    ordered = sorted(frames, key=lambda frame: frame.name)
+    ordered = in_name_order(frames)
     if not evaluate:
-        return tuple(ordered), ()
+        return ordered, ()
     train = tuple(frame for index, frame in enumerate(ordered) if index % HOLD_OUT_EVERY != 0)
-    return train, tuple(ordered[::HOLD_OUT_EVERY])
+    return train, ordered[::HOLD_OUT_EVERY]

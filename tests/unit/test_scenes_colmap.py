@@ -9,6 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -77,8 +78,8 @@ def make_scene(path: Path, model: Model | None = None, size: tuple[int, int] = (
     return path
 
 
-def load(path: Path, **options: object) -> Scene:
-    return load_scene(path, progress=False, **options)  # type: ignore[arg-type]
+def load(path: Path, **options: Any) -> Scene:
+    return load_scene(path, progress=False, **options)
 
 
 def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -193,7 +193,8 @@ def damaged(path: Path, how: str) -> None:
     else:
         cv2.imwrite(str(path), (noise(60, 80, 3) * 255).astype(np.uint8))
     content = path.read_bytes()
-    path.write_bytes({"empty": b"", "half": content[: len(content) // 2], "text": b"not an image\n" * 40}[how])
+    spoilt = {"empty": b"", "half": content[: len(content) // 2], "text": b"not an image\n" * 40, "not": content}
+    path.write_bytes(spoilt[how])
 
 
 @pytest.mark.parametrize("how", ["empty", "half", "text"])
@@ -204,6 +205,22 @@ def test_damaged_file_is_named(tmp_path: Path, suffix: str, how: str) -> None:
     with pytest.raises(SceneError, match=f"broken{suffix}") as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".exr"])
+def test_cut_anywhere_is_refused_or_loses_nothing(tmp_path: Path, suffix: str) -> None:
+    """Some formats end in bytes that carry no pixels."""
+    path = tmp_path / f"a{suffix}"
+    damaged(path, "not")
+    content, whole = path.read_bytes(), read_image(path)
+    lengths = {*range(0, len(content), 1 + len(content) // 60), *range(len(content) - 12, len(content))}
+    for length in sorted(lengths):
+        path.write_bytes(content[:length])
+        try:
+            image = read_image(path)
+        except SceneError:
+            continue
+        assert torch.equal(image, whole), f"{length} of {len(content)} bytes were read as another image"
 
 
 def test_progressive_jpeg_cut_short(tmp_path: Path) -> None:
@@ -338,27 +355,30 @@ def test_unknown_type_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on file sizes to imitate a full disk with")
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr"])
-def test_full_disk_leaves_the_old_file(tmp_path: Path, suffix: str) -> None:
+def test_full_disk_leaves_the_old_files(tmp_path: Path) -> None:
     """A limit on file sizes makes writing fail as a full disk does."""
-    path = tmp_path / f"a{suffix}"
-    write_image(path, torch.zeros(3, 8, 8))
-    before = path.read_bytes()
+    paths = [tmp_path / name for name in ("a.exr", "a.jpg", "a.png")]
+    for path in paths:
+        write_image(path, torch.zeros(3, 8, 8))
+    before = [path.read_bytes() for path in paths]
     script = (
         "import resource, signal, sys, torch; from pathlib import Path\n"
         "from lapgs_plugin.errors import LapgsError; from lapgs_plugin.scenes.images import write_image\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "try: write_image(Path(sys.argv[1]), torch.rand(3, 200, 200))\n"
-        "except LapgsError as error: print(error)\n"
+        "for path in sys.argv[1:]:\n"
+        "    try: write_image(Path(path), torch.rand(3, 200, 200))\n"
+        "    except LapgsError as error: print(error)\n"
     )
     done = subprocess.run(  # a limit cannot be raised again, so it is set in another process
-        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script, *map(str, paths)], capture_output=True, text=True, check=True, timeout=60
     )
-    assert f"a{suffix}: the image cannot be written" in done.stdout
-    assert done.stdout.count("\n") == 1
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(paths)
+    for line, path in zip(lines, paths, strict=True):
+        assert f"{path.name}: the image cannot be written" in line
+    assert [path.read_bytes() for path in paths] == before
+    assert sorted(tmp_path.iterdir()) == paths
 
 
 def test_unwritable_folder_is_named(tmp_path: Path) -> None:
