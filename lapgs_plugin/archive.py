@@ -214,9 +214,11 @@ class RunArchive:
         archive = cls(folder, manifest, FolderLock.acquire(folder))
         try:
             cls.require_room(folder, overwrite)  # another process may have started one before the lock was ours
-            # The manifest goes first: should this be interrupted, the folder is an empty run and not a broken one.
-            archive._write_json(MANIFEST, asdict(manifest))
             with one_line_errors(folder):
+                # Should this be interrupted, the folder is first the old run without its checkpoint, which the new one
+                # must never continue from, then an empty run; at no time a manifest without its fields.
+                archive.path(CHECKPOINT).unlink(missing_ok=True)
+                archive._write_json(MANIFEST, asdict(manifest))
                 _remove_results(folder)
         except BaseException:
             archive.close()
@@ -522,7 +524,7 @@ def _is_run(folder: Path) -> bool:
 def _remove_results(folder: Path) -> None:
     """Remove what a former run left, and nothing that a run does not write."""
     _remove_scratch(folder)
-    for name in (HISTORY, METRICS, CHECKPOINT, REPORT):
+    for name in (HISTORY, METRICS, REPORT):
         (folder / name).unlink(missing_ok=True)
     if (folder / RENDERS).is_dir():
         shutil.rmtree(folder / RENDERS)
