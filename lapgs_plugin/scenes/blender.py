@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -105,13 +106,15 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
         image = _image_path(path, frame["file_path"], images)
         where = f"{where} ({frame['file_path']})"
         camera = _camera({**values, **frame}, image, where, _world_to_camera(frame.get("transform_matrix"), where))
-        name = image.relative_to(path).as_posix() if image.is_relative_to(path) else image.name
+        inside = os.path.normpath(path)
+        name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
         frames.append(Frame(name, image, camera))
     return frames
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:
-    image = path / file_path.replace("\\", "/")  # instant-ngp writes backslashes on Windows
+    # instant-ngp writes backslashes on Windows, and ".." where its photos lie beside the scene.
+    image = Path(os.path.normpath(path / file_path.replace("\\", "/")))
     if images != "images":
         image = path / images / image.name
     if image.is_file():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import torch
 from torch import Tensor
@@ -157,6 +157,9 @@ def _check_source(path: Path, source: SceneSource) -> None:
         double = next(name for name in names if names.count(name) > 1)
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
     for frame in frames:
+        if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
+            # Renders are written under these names.
+            raise SceneError(f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it")
         camera = frame.camera
         numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and torch.isfinite(camera.world_to_camera).all()):

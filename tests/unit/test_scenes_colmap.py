@@ -457,6 +457,15 @@ def test_same_name_twice(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.mark.parametrize("name", ["../beside.png", "/tmp/elsewhere.png"])
+def test_names_that_lead_out_of_the_scene(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "scene"
+    Model(names=["a.png", "b.png", name]).write(path / "sparse" / "0")
+    write_images(path / "images", {"a.png": (96, 64), "b.png": (96, 64)})
+    with pytest.raises(SceneError, match="is named by a path outside the scene"):
+        load(path)
+
+
 # A real scene
 
 

@@ -208,6 +208,13 @@ def test_ways_to_write_a_path(tmp_path: Path, name: str) -> None:
     assert load(path).train[0].name == "images/frame_000.png"
 
 
+def test_photos_beside_the_scene(tmp_path: Path) -> None:
+    path = capture(tmp_path / "scene")
+    write_images(tmp_path, ["photos/a.png"], (80, 60))
+    edit(path, {"file_path": "../photos/a.png"}, in_frame=0)
+    assert load(path).train[0].name == "a.png"
+
+
 # Points
 
 
