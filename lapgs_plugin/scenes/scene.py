@@ -159,7 +159,10 @@ def _check_source(path: Path, source: SceneSource) -> None:
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
             # Renders are written under these names.
-            raise SceneError(f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it")
+            raise SceneError(
+                f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it; "
+                "copy the photos there and reconstruct or export again"
+            )
         camera = frame.camera
         numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and torch.isfinite(camera.world_to_camera).all()):
