@@ -15,10 +15,10 @@ before the transmittance has surely fallen under its limit, for any Gaussian
     - it is in the pixel's tile or not depending on the bounds of centre, radius (rounded up) and depth (culled at 0.2),
     - the next Gaussian that contributes is not surely behind it. Exactly equal centres are not masked: their depths are
       computed from the same numbers, so they tie in any implementation and the index decides.
-A Gaussian is masked when its own radius, culling or rectangle is open, or a kink of its gradient: a colour channel at
-the clamp, or a centre at the limit where the Jacobian stops following it.
+Of a Gaussian the radius may be open, and its gradient where it has a kink: a colour channel at the clamp, or a centre
+at the limit where the Jacobian stops following it.
 
-Gradients mix pixels; compare those of a loss whose weights vanish on the masked pixels, for the Gaussians not masked.
+Gradients mix pixels; compare those of a loss whose weights vanish on the masked pixels, for Gaussians not at a kink.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.oracle import (
     JACOBIAN_LIMIT,
     MAX_ALPHA,
+    MAX_RADIUS,
     MIN_ALPHA,
     MIN_ROOT,
     MIN_TRANSMITTANCE,
@@ -57,11 +58,13 @@ class ThresholdMask:
 
     Attributes:
         pixels: (h, w) True where a decision within rounding changes the pixel.
-        gaussians: (n,) True where a Gaussian's own radius, culling or gradient kink is within rounding.
+        radii: (n,) True where a Gaussian's radius, or whether it is culled, is within rounding.
+        kinks: (n,) True where a Gaussian's gradient has a kink within rounding.
     """
 
     pixels: Tensor
-    gaussians: Tensor
+    radii: Tensor
+    kinks: Tensor
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class _Bounded:
         opacities, opacity_errors: (v,) the error is relative.
         surely: (v, 4) tiles the Gaussian touches however it is rounded: x0, y0, x1, y1; empty if it may be culled.
         possibly: (v, 4) tiles it touches with some rounding.
-        kinked: (v,) True where the Gaussian itself is masked.
+        open_radii, kinks: (v,) as in `ThresholdMask`.
     """
 
     ids: Tensor
@@ -93,7 +96,8 @@ class _Bounded:
     opacity_errors: Tensor
     surely: Tensor
     possibly: Tensor
-    kinked: Tensor
+    open_radii: Tensor
+    kinks: Tensor
 
 
 @torch.no_grad()
@@ -112,9 +116,9 @@ def threshold_mask(
         tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
     field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
     bounded = _project(field, camera, field.sh_degree if sh_degree is None else sh_degree, tolerance)
-    gaussians = torch.zeros(len(field), dtype=torch.bool, device=field.means.device)  # (n,)
-    gaussians[bounded.ids] = bounded.kinked
-    return ThresholdMask(_open_pixels(bounded, camera, tolerance), gaussians)
+    radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
+    radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
+    return ThresholdMask(_open_pixels(bounded, camera, tolerance), radii, kinks)
 
 
 def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float) -> _Bounded:
@@ -124,7 +128,6 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
     ids = (points[:, 2] > NEAR_DEPTH - errors[:, 2] - tolerance).nonzero()[:, 0]  # (v,)
     points, errors = points[ids], errors[ids]  # (v, 3)
     depths = points[:, 2]  # (v,)
-    may_be_culled = depths - NEAR_DEPTH <= errors[:, 2] + tolerance  # (v,)
     slopes = points[:, :2] / depths[:, None]  # (v, 2)
     slope_errors = (errors[:, :2] + slopes.abs() * errors[:, 2:]) / depths[:, None] + tolerance * slopes.abs()  # (v, 2)
     focal = points.new_tensor([camera.fx, camera.fy])  # (2,)
@@ -132,44 +135,20 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
     means2d = focal * slopes + principal  # (v, 2)
     mean_errors = focal * slope_errors + tolerance * (means2d.abs() + principal.abs())  # (v, 2)
 
-    jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
-    to_screen = jacobians @ rotation  # (v, 2, 3)
-    covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
-    xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
-    xy = covariances[:, 0, 1]  # (v,)
-    # Sigma' is a sum of terms as large as the longest axis seen from the side, whatever is left of them.
-    largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + PIXEL_VARIANCE
-    covariance_errors = largest_term * (tolerance + 4 * errors.norm(dim=1) / depths)  # (v,)
-    determinant = xx * yy - xy * xy  # (v,)
-    determinant_errors = tolerance * (xx * yy + xy * xy)  # (v,) of the subtraction alone
-    middle = (xx + yy) / 2  # (v,)
-    squared = (middle * middle - determinant).clamp(min=MIN_ROOT)  # (v,)
-    largest = middle + squared.sqrt()  # (v,)
-    smallest = determinant.abs() / largest  # (v,)
-    conic_errors = 2 * covariance_errors / smallest + determinant_errors / determinant.abs()  # (v,)
-
-    squared_errors = 4 * middle * covariance_errors + tolerance * middle * middle + determinant_errors  # (v,)
-    root_errors = (squared_errors / squared.sqrt()).minimum(squared_errors.sqrt())  # (v,)
-    extents = RADIUS_SIGMAS * largest.sqrt()  # (v,) radii before they are rounded up
-    extent_errors = RADIUS_SIGMAS * (covariance_errors + root_errors) / largest.sqrt() + tolerance * extents  # (v,)
-    small, large = torch.ceil(extents - extent_errors), torch.ceil(extents + extent_errors)  # (v,)
-    corners = [
-        tile_rectangles(means2d + side * mean_errors, radii, camera) for radii in (small, large) for side in (-1, 1)
-    ]  # four (v, 4)
-    stacked = torch.stack(corners)  # (4, v, 4)
-    earliest, latest = stacked.amin(0), stacked.amax(0)  # (v, 4)
-    possibly = torch.cat([earliest[:, :2], latest[:, 2:]], dim=1)  # (v, 4)
-    surely = torch.cat([latest[:, :2], earliest[:, 2:]], dim=1)  # (v, 4)
+    relative = tolerance + 4 * errors.norm(dim=1) / depths  # (v,) error of the Jacobian, twice in the covariance
+    shapes = _shapes(field, ids, points, camera, relative, tolerance)
+    may_be_culled = (depths - NEAR_DEPTH <= errors[:, 2] + tolerance) | shapes.degenerate  # (v,)
+    surely, possibly = _tiles(means2d, mean_errors, shapes, camera)  # (v, 4) each
     surely = surely * (~may_be_culled)[:, None]  # (v, 4)
+    touched, surely_touched = _area(possibly) > 0, _area(surely) > 0  # (v,) each
+    open_radii = touched & ((shapes.smallest_radii != shapes.largest_radii) | ~surely_touched)  # (v,)
 
-    logits = field.opacity_logits[ids]  # (v,)
     limits = points.new_tensor(camera.tan_half_fov) * JACOBIAN_LIMIT  # (2,)
     at_limit = ((slopes.abs() - limits).abs() <= slope_errors + tolerance * limits).any(1)  # (v,)
-    kinked = (
-        (small != large) | (surely != possibly).any(1) | at_limit | _at_clamp(field, camera, ids, degree, tolerance)
-    )
+    kinks = touched & (at_limit | _at_clamp(field, camera, ids, degree, tolerance))  # (v,)
     # A row of the rotation that only picks a coordinate makes the depth one exactly rounded sum: the same bits for all.
     axis_aligned = bool((rotation[2].abs() == 1).any())
+    logits = field.opacity_logits[ids]  # (v,)
     return _Bounded(
         ids=ids,
         means=field.means[ids],
@@ -177,14 +156,83 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
         depth_errors=torch.zeros_like(depths) if axis_aligned else errors[:, 2],
         means2d=means2d,
         mean_errors=mean_errors,
-        conics=torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None],
-        conic_errors=conic_errors,
+        conics=shapes.conics,
+        conic_errors=shapes.conic_errors,
         opacities=torch.sigmoid(logits),
         opacity_errors=tolerance * (1 + logits.abs()),
         surely=surely,
         possibly=possibly,
-        kinked=kinked,
+        open_radii=open_radii,
+        kinks=kinks,
     )
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """The v Gaussians' footprints.
+
+    Attributes:
+        conics: (v, 3) xx, xy, yy of the inverse covariance.
+        conic_errors: (v,) relative error of the quadratic form with this conic.
+        smallest_radii, largest_radii: (v,) whole pixels.
+        degenerate: (v,) True where the determinant may round to 0.
+    """
+
+    conics: Tensor
+    conic_errors: Tensor
+    smallest_radii: Tensor
+    largest_radii: Tensor
+    degenerate: Tensor
+
+
+def _shapes(
+    field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float
+) -> _Shapes:
+    """Footprints of the Gaussians `ids` at (v, 3) camera-space `points`; `relative` (v,) is the Jacobians' error."""
+    jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
+    to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
+    covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
+    xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    xy = covariances[:, 0, 1]  # (v,)
+    # Sigma' is a sum of terms as large as the longest axis seen from the side, whatever is left of them.
+    largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + PIXEL_VARIANCE
+    errors = largest_term * relative  # (v,) of each entry of the covariance
+    determinants = xx * yy - xy * xy  # (v,)
+    determinant_errors = tolerance * (xx * yy + xy * xy)  # (v,) of the subtraction alone
+
+    middle = (xx + yy) / 2  # (v,)
+    squared = (middle * middle - determinants).clamp(min=MIN_ROOT)  # (v,)
+    squared_errors = 4 * middle * errors + tolerance * middle * middle + determinant_errors  # (v,)
+    root_errors = (squared_errors / squared.sqrt()).minimum(squared_errors.sqrt())  # (v,)
+    largest = middle + squared.sqrt()  # (v,) eigenvalue
+    smallest = determinants.abs() / largest  # (v,) eigenvalue
+    radii = RADIUS_SIGMAS * largest.sqrt()  # (v,) before they are rounded up
+    radius_errors = RADIUS_SIGMAS * (errors + root_errors) / largest.sqrt() + tolerance * radii  # (v,)
+    return _Shapes(
+        conics=torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None],
+        conic_errors=2 * errors / smallest + determinant_errors / determinants.abs(),
+        smallest_radii=torch.ceil(radii - radius_errors).clamp(max=MAX_RADIUS),
+        largest_radii=torch.ceil(radii + radius_errors).clamp(max=MAX_RADIUS),
+        degenerate=determinants.abs() <= determinant_errors + 4 * middle * errors,
+    )
+
+
+def _tiles(means2d: Tensor, errors: Tensor, shapes: _Shapes, camera: Camera) -> tuple[Tensor, Tensor]:
+    """(v, 4) tiles that each Gaussian touches whatever the (v, 2) errors of its centre are, and those it may touch."""
+    extremes = torch.stack(
+        [
+            tile_rectangles(means2d + side * errors, radii, camera)
+            for radii in (shapes.smallest_radii, shapes.largest_radii)
+            for side in (-1, 1)
+        ]
+    )  # (4, v, 4)
+    low, high = extremes.amin(0), extremes.amax(0)  # (v, 4)
+    return torch.cat([high[:, :2], low[:, 2:]], dim=1), torch.cat([low[:, :2], high[:, 2:]], dim=1)
+
+
+def _area(rectangles: Tensor) -> Tensor:
+    """(v,) number of tiles of (v, 4) rectangles."""
+    return (rectangles[:, 2:] - rectangles[:, :2]).clamp(min=0).prod(dim=1)
 
 
 def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, tolerance: float) -> Tensor:
@@ -196,10 +244,9 @@ def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, to
     sh = field.sh[ids, : basis.shape[1]]  # (v, k, 3)
     values = (basis * sh).sum(1) + 0.5  # (v, 3)
     # The direction is a difference of positions, so its relative error grows as the Gaussian nears the camera.
-    spread = 1 + (field.means[ids].abs() + camera.position.abs()).sum(1, keepdim=True) / offsets.norm(
-        dim=1, keepdim=True
-    )
-    errors = tolerance * (0.5 + (1 + degree * spread) * sh.abs().sum(1))  # (v, 3)
+    positions = (field.means[ids].abs() + camera.position.abs()).sum(1)  # (v,)
+    steepness = 1 + degree * (1 + positions / offsets.norm(dim=1))  # (v,)
+    errors = tolerance * (0.5 + steepness[:, None] * sh.abs().sum(1))  # (v, 3)
     return torch.any(values.abs() <= errors, dim=1)
 
 

@@ -224,22 +224,23 @@ def near_plane() -> Case:
     camera = make_camera(40, 30)
     depths = [-2.0, -0.2, 0.0, 0.1, 0.2 - 1e-9, 0.2, 0.2 + 1e-9, 0.21, 0.5, 1.0]
     means = _camera_space([[0.02 * i - 0.1, 0.01 * i, z] for i, z in enumerate(depths)])
-    return Case("near_plane", make_field(means, scales=0.02, opacities=0.3, sh_degree=1), camera, COLORED)
+    scales = torch.tensor([0.01, 0.02, 0.03])
+    return Case("near_plane", make_field(means, scales=scales, opacities=0.3, sh_degree=1), camera, COLORED)
 
 
 def outside_frustum() -> Case:
     """Centres beyond 1.3 tan(fov / 2) on every side, large enough to reach the image: the Jacobian's limit acts."""
     camera = make_camera(40, 30)
-    means = [[s * 2.2, 0.1, 2.0] for s in (-1, 1)] + [[0.1, s * 1.6, 2.0] for s in (-1, 1)]
-    means += [[s * 2.5, s * 2.0, 2.5] for s in (-1, 1)] + [[9.0, 0.0, 2.0], [0.0, -30.0, 1.0]]
+    means = [[s * 2.2, 0.1, 2.0 + 0.1 * s] for s in (-1, 1)] + [[0.1, s * 1.6, 2.0 + 0.2 * s] for s in (-1, 1)]
+    means += [[s * 2.5, s * 2.0, 2.5 + 0.1 * s] for s in (-1, 1)] + [[9.0, 0.0, 2.0], [0.0, -30.0, 1.0]]
     field = make_field(_camera_space(means), scales=torch.tensor([0.9, 0.5, 0.7]), opacities=0.7, sh_degree=2)
     return Case("outside_frustum", field, camera, BLACK)
 
 
 def saturated() -> Case:
-    """Opacities that round to 1 stacked in depth: the 0.99 cap and the stop at 1e-4 are active almost everywhere."""
+    """Opacities of 0.993 and more stacked in depth: the 0.99 cap and the stop at 1e-4 act almost everywhere."""
     case = random_case(60, 40, 40, seed=8, sh_degree=1, pixels=(2.0, 9.0), name="saturated")
-    logits = torch.full((60,), 30.0, dtype=torch.float64)
+    logits = torch.linspace(5.0, 10.0, 60, dtype=torch.float64)
     return replace(case, field=case.field.with_parameters({"opacity_logits": logits}))
 
 
@@ -248,7 +249,8 @@ def crowd() -> Case:
     camera = make_camera(18, 18)
     generator = torch.Generator().manual_seed(9)
     means = torch.randn(3000, 3, generator=generator, dtype=torch.float64) * 0.05 + torch.tensor([0.0, 0.0, 3.0])
-    return Case("crowd", make_field(means, scales=0.3, opacities=0.006), camera, WHITE)
+    field = make_field(means, scales=torch.tensor([0.2, 0.3, 0.5]), opacities=0.006)
+    return Case("crowd", field, camera, WHITE)
 
 
 def opaque_crowd() -> Case:
@@ -256,7 +258,8 @@ def opaque_crowd() -> Case:
     camera = make_camera(18, 18)
     generator = torch.Generator().manual_seed(10)
     means = torch.randn(1000, 3, generator=generator, dtype=torch.float64) * 0.2 + torch.tensor([0.0, 0.0, 3.0])
-    return Case("opaque_crowd", make_field(means, scales=0.2, opacities=0.5, signed=True), camera, BLACK)
+    field = make_field(means, scales=torch.tensor([0.1, 0.2, 0.3]), opacities=0.5, signed=True)
+    return Case("opaque_crowd", field, camera, BLACK)
 
 
 def needles() -> Case:

@@ -31,7 +31,7 @@ def assert_equals_naive(case: Case) -> None:
     mask = threshold_mask(case.field, case.camera, sh_degree=case.sh_degree)
     assert_close_outside(actual.image, expected.image, mask.pixels, IMAGE_BOUND)
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, IMAGE_BOUND)
-    assert_radii_close(actual.radii, expected.radii, mask.gaussians)
+    assert_radii_close(actual.radii, expected.radii, mask.radii)
     assert actual.radii.dtype == torch.int32
 
 
@@ -55,7 +55,7 @@ def test_float32_equals_float64_outside_the_mask(name: str) -> None:
     assert actual.image.dtype == torch.float32
     assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND)
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, FLOAT32_BOUND)
-    assert_radii_close(actual.radii, expected.radii, mask.gaussians)
+    assert_radii_close(actual.radii, expected.radii, mask.radii)
 
 
 @given(scenes.random_cases())
@@ -66,7 +66,7 @@ def test_float32_equals_float64_outside_the_mask_on_random_scenes(case: Case) ->
     with torch.no_grad():
         actual, expected = rounded.render(ORACLE), rounded.to(torch.float64).render(ORACLE)
     assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND)
-    assert_radii_close(actual.radii, expected.radii, mask.gaussians)
+    assert_radii_close(actual.radii, expected.radii, mask.radii)
 
 
 # ------------------------------------------------------------------------------------------------------- laws
