@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 
 class LapgsError(Exception):
-    """Something went wrong that one clear line can explain; the command line prints that line and exits with 2.
+    """Something went wrong that one clear line can explain; the command line prints that line and exits with `exit_code`.
 
     The message says what was wrong, the value received, what was expected and what to do next.
     """
+
+    exit_code: ClassVar[int] = 2
 
 
 class UserInputError(LapgsError, ValueError):
@@ -28,6 +32,12 @@ class RunFolderError(UserInputError):
 
 class TrainingDivergedError(LapgsError):
     """Training produced NaN or inf; the last good archive is kept."""
+
+
+class TrainingStoppedError(LapgsError):
+    """The user asked to stop; a checkpoint is in the run folder."""
+
+    exit_code = 130  # what shells report after Ctrl-C
 
 
 class MissingExtraError(LapgsError, ImportError):

@@ -5,6 +5,10 @@ from __future__ import annotations
 
 def main() -> None:
     """Entry point of the console script."""
+    import os
+
+    # Before torch starts its threads: they must not spin on the cores that our kernels need (reference_raster.threads).
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from lapgs_plugin.cli.app import run
 
     run()

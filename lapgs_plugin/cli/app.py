@@ -1,25 +1,50 @@
-"""The typer application: every command registered in one place, errors turned into one line and exit code 2."""
+"""The typer application: every command registered in one place, errors turned into one line and an exit code."""
 
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 
+from lapgs_plugin import __version__
+from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError
 
 app = typer.Typer(
     name="lapgs",
-    help="Train 3D Gaussian Splatting as a Laplacian frequency hierarchy.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    add_completion=False,
 )
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"lapgs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Train 3D Gaussian Splatting as a Laplacian frequency hierarchy.
+
+    A scene comes from `lapgs sample` or `lapgs prepare`, `lapgs train` makes a run folder of it, and `lapgs eval`,
+    `lapgs render` and `lapgs report` look at that. `lapgs doctor` says what this machine can do.
+    """
+
+
+app.command("train")(train)
+
+
 def run() -> None:
-    """Run the command line; a `LapgsError` becomes one line on stderr and exit code 2."""
+    """Run the command line; a `LapgsError` becomes one line on stderr and its exit code."""
     try:
         app()
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(error.exit_code)

@@ -1,1 +1,22 @@
 """CPU rasterizers: an oracle to read and a fast one to train with."""
+
+from __future__ import annotations
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.reference_raster.fast import CpuRasterizer
+from lapgs_plugin.reference_raster.oracle import OracleRasterizer
+
+__all__ = ["CpuRasterizer", "OracleRasterizer", "make_rasterizer"]
+
+
+def make_rasterizer(name: str) -> Rasterizer:
+    """The rasterizer that manifests and the command line call `name`.
+
+    Raises:
+        UserInputError: there is none of that name.
+    """
+    known: dict[str, type[Rasterizer]] = {"cpu": CpuRasterizer, "oracle": OracleRasterizer}
+    if name not in known:
+        raise UserInputError(f"--rasterizer {name}: expected {' or '.join(known)}")
+    return known[name]()

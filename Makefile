@@ -1,0 +1,34 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`. Both set up .venv first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := runs/demo
+DEMO_ITERATIONS := 1000
+
+.PHONY: demo test check clean
+
+demo: $(VENV)/.installed
+	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
+	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/baseline --levels 1 --iterations $(DEMO_ITERATIONS) --eval --overwrite
+	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/hierarchy --levels 2 --iterations $(DEMO_ITERATIONS) --eval --overwrite
+	$(BIN)/lapgs eval $(DEMO)/baseline
+	$(BIN)/lapgs eval $(DEMO)/hierarchy
+	$(BIN)/lapgs render $(DEMO)/hierarchy
+	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
+
+test: check
+	$(BIN)/pytest
+
+check: $(VENV)/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) $(DEMO) .mypy_cache .pytest_cache .ruff_cache

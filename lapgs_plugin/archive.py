@@ -1,0 +1,682 @@
+"""Run folders: what a training run leaves behind, and the cache of predictions that the next stage builds on.
+
+    RUN/manifest.json              everything needed to render the run again
+    RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
+    RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
+    RUN/checkpoint.pt              state of an unfinished stage, the latest
+    RUN/history.jsonl              one JSON object a logging tick
+    RUN/metrics.json, RUN/renders/, RUN/report.html   what is made of it later
+
+Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
+after its PLY is on the disk: a run killed at any moment is a run that opens, with the levels that were finished.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_plugin import __version__
+from lapgs_plugin.errors import FieldError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.field import GaussianField, count_gaussians
+from lapgs_plugin.files import LOCK, TEMPORARY_PATTERN, FolderLock, atomic_write, one_line_errors
+
+FORMAT_VERSION = 1
+
+MANIFEST, HISTORY, METRICS, CHECKPOINT = "manifest.json", "history.jsonl", "metrics.json", "checkpoint.pt"
+RENDERS, REPORT, CACHE = "renders", "report.html", "cache"
+PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
+
+
+@dataclass(frozen=True)
+class SceneReference:
+    """Which images a run was trained on, and how they were read.
+
+    Attributes:
+        path: the scene folder, absolute.
+        resolution: the resolution setting as the user wrote it, such as "1k" or "1/4".
+        eval: whether every eighth view was held out.
+        background: RGB in [0, 1] behind the base field.
+        kind: "colmap" or "transforms".
+        images: name of the image folder in a COLMAP scene.
+    """
+
+    path: str
+    resolution: str
+    eval: bool
+    background: tuple[float, float, float]
+    kind: str
+    images: str = "images"
+
+
+@dataclass(frozen=True)
+class LevelRecord:
+    """What is known of a finished level.
+
+    Attributes:
+        level: pyramid level, 0 is full resolution.
+        signed: whether its field is a residual.
+        iterations: optimizer steps it was trained for.
+        num_gaussians: Gaussians in its PLY.
+        peak_gaussians: most Gaussians at any moment of its training.
+        train_seconds: iterative optimization alone.
+        overhead_seconds: everything else by name, such as "pyramid", "cache", "inheritance", "archive".
+        image_size: (width, height) in pixels it was trained at.
+    """
+
+    level: int
+    signed: bool
+    iterations: int
+    num_gaussians: int
+    peak_gaussians: int
+    train_seconds: float
+    overhead_seconds: dict[str, float]
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything needed to render a run again, and what it took to train it.
+
+    Attributes:
+        scene: the images it was trained on.
+        levels: number of levels L of the whole hierarchy, finished or not.
+        grid: pixel grid of the pyramid, "camera" or "even".
+        supervision, inherit: as named on the command line.
+        sh_degree: highest SH degree of the fields.
+        rasterizer: name of the rasterizer it was trained with.
+        seed: what the run's random choices were seeded with.
+        settings: every other setting of the trainer, as JSON.
+        records: the finished levels in training order, coarsest first.
+        created_by: program and version.
+        created: ISO 8601 time in UTC.
+        format_version: of the run folder.
+
+    Raises:
+        UserInputError: the records are not the first of the levels L-1, ..., 0.
+    """
+
+    scene: SceneReference
+    levels: int
+    grid: str
+    supervision: str
+    inherit: str
+    sh_degree: int
+    rasterizer: str
+    seed: int
+    settings: dict[str, Any]
+    records: tuple[LevelRecord, ...] = ()
+    created_by: str = f"lapgs_plugin {__version__}"
+    created: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    format_version: int = FORMAT_VERSION
+
+    def __post_init__(self) -> None:
+        finished = [record.level for record in self.records]
+        expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
+        if finished != expected:
+            raise UserInputError(f"finished levels {finished}, expected {expected} of {self.levels}, coarsest first")
+
+    @property
+    def complete(self) -> bool:
+        """Whether every level is finished."""
+        return len(self.records) == self.levels
+
+    @property
+    def next_level(self) -> int | None:
+        """The level to train next, None when the run is complete."""
+        return None if self.complete else self.levels - 1 - len(self.records)
+
+    def record(self, level: int) -> LevelRecord:
+        """The record of a finished level.
+
+        Raises:
+            RunFolderError: it is not finished.
+        """
+        for record in self.records:
+            if record.level == level:
+                return record
+        finished = ", ".join(str(record.level) for record in self.records) or "none"
+        raise RunFolderError(
+            f"level {level} is not in this run (finished: {finished} of {self.levels}); "
+            "continue it with `lapgs train --resume`"
+        )
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Manifest:
+        """The inverse of `dataclasses.asdict`, after a round trip through JSON.
+
+        Raises:
+            UserInputError: something is missing, unknown or inconsistent; names it.
+        """
+        values = _only_fields(cls, values)
+        scene = _only_fields(SceneReference, values["scene"])
+        scene["background"] = tuple(scene["background"])
+        records = [_only_fields(LevelRecord, record) for record in values["records"]]
+        values["scene"] = SceneReference(**scene)
+        values["records"] = tuple(LevelRecord(**{**r, "image_size": tuple(r["image_size"])}) for r in records)
+        return cls(**values)
+
+
+def _only_fields(kind: type[Any], values: Any) -> dict[str, Any]:
+    """`values` as keyword arguments of the dataclass `kind`, after checking that they are exactly its fields."""
+    expected = {f.name for f in fields(kind)}
+    given = set(values) if isinstance(values, dict) else set()
+    problems = [f"lacks {', '.join(sorted(expected - given))}"] * bool(expected - given)
+    problems += [f"has unknown {', '.join(sorted(given - expected))}"] * bool(given - expected)
+    if problems:
+        raise UserInputError(f"{kind.__name__} {' and '.join(problems)}")
+    return dict(values)
+
+
+class RunArchive:
+    """A run folder. One process at a time may write to it; any number may read.
+
+    Use `create` for a new run, `open` for an existing one, and the archive as a context manager (or `close`) to let go
+    of a folder opened for writing. Methods that write raise RunFolderError when the disk is full or the folder is not
+    writable; what was there before stays as it was.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None) -> None:
+        """Use `create` or `open`."""
+        self._folder = folder
+        self._manifest = manifest
+        self._lock = lock
+
+    @classmethod
+    def create(cls, path: Path | str, manifest: Manifest, overwrite: bool = False) -> RunArchive:
+        """Start a run in a new or empty folder and hold it for writing.
+
+        Args:
+            path: the folder; created with its parents.
+            manifest: without records.
+            overwrite: replace a run that is already there. Only files of a run are removed.
+
+        Raises:
+            RunFolderError: there is a run and `overwrite` is not given, the folder holds something else, another
+                process is writing to it, or it cannot be written.
+        """
+        assert not manifest.records, "a new run has no finished level"
+        folder = Path(path).absolute()
+        cls.require_room(folder, overwrite)
+        with one_line_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        archive = cls(folder, manifest, FolderLock.acquire(folder))
+        try:
+            cls.require_room(folder, overwrite)  # another process may have started one before the lock was ours
+            with one_line_errors(folder):
+                # Should this be interrupted, the folder is first the old run without its checkpoint, which the new one
+                # must never continue from, then an empty run; at no time a manifest without its fields.
+                archive.path(CHECKPOINT).unlink(missing_ok=True)
+                archive._write_json(MANIFEST, asdict(manifest))
+                _remove_results(folder)
+        except BaseException:
+            archive.close()
+            raise
+        return archive
+
+    @staticmethod
+    def require_room(path: Path | str, overwrite: bool = False) -> None:
+        """Check, before anything expensive is done, that `create` would accept the folder. Writes nothing.
+
+        Raises:
+            RunFolderError: as `create`, except for what only writing shows.
+        """
+        folder = Path(path).absolute()
+        if folder.exists() and not folder.is_dir():
+            raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
+        if _is_run(folder):
+            if not overwrite:
+                raise RunFolderError(
+                    f"{folder} already holds a run; continue it with --resume or replace it with --overwrite"
+                )
+            return
+        entries = list(folder.iterdir()) if folder.exists() else []
+        # A run that was killed before its first manifest leaves these two.
+        strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+        if strangers:
+            raise RunFolderError(
+                f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
+            )
+
+    @classmethod
+    def open(cls, path: Path | str, *, resume: bool = False) -> RunArchive:
+        """Open a run, checking that the fields of its finished levels are there and whole.
+
+        Args:
+            path: the folder.
+            resume: hold it for writing.
+
+        Raises:
+            RunFolderError: there is no run, it was written by another version, a level's PLY is missing or cut short,
+                or, with `resume`, another process is writing to it.
+        """
+        folder = Path(path).absolute()
+        manifest = _read_manifest(folder)
+        lock = FolderLock.acquire(folder) if resume else None
+        try:
+            if resume:
+                manifest = _read_manifest(folder)  # the process that held it may have finished a level meanwhile
+                with one_line_errors(folder):
+                    _remove_scratch(folder)
+            archive = cls(folder, manifest, lock)
+            archive._check_fields()
+        except BaseException:
+            if lock is not None:
+                lock.release()
+            raise
+        return archive
+
+    def close(self) -> None:
+        """Let go of a folder that was held for writing."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def __enter__(self) -> RunArchive:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def manifest(self) -> Manifest:
+        return self._manifest
+
+    @property
+    def available_levels(self) -> tuple[int, ...]:
+        """The finished levels, coarsest first."""
+        return tuple(record.level for record in self._manifest.records)
+
+    def path(self, *parts: str) -> Path:
+        """The run folder, or something in it."""
+        return self._folder.joinpath(*parts)
+
+    def field_path(self, level: int) -> Path:
+        return self.path(f"level_{level}", PLY)
+
+    def field(self, level: int) -> GaussianField:
+        """The field of a finished level, float32 on the CPU.
+
+        Raises:
+            RunFolderError: the level is not finished, or its PLY is not what the manifest says.
+        """
+        record = self._manifest.record(level)
+        try:
+            loaded = GaussianField.load_ply(self.field_path(level))
+        except FieldError as error:
+            raise RunFolderError(f"level {level} of {self._folder} is damaged: {error}") from error
+        return replace(loaded, signed=record.signed)
+
+    def finish_level(
+        self, record: LevelRecord, field: GaussianField, optimizer_state: dict[str, Any] | None = None
+    ) -> None:
+        """Keep the field of a trained level: its PLY first, then the manifest that lists it, and no checkpoint of it.
+
+        Args:
+            record: of the level `manifest.next_level`.
+            field: as trained.
+            optimizer_state: for full inheritance, what `optimizer_state` gives to the next level; kept until that one
+                is finished.
+
+        Raises:
+            FieldError: the field holds NaN or inf; nothing is written.
+        """
+        self._require_lock()
+        assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
+        field.require_finite()
+        manifest = replace(self._manifest, records=(*self._manifest.records, record))
+        path = self.field_path(record.level)
+        with one_line_errors(path):
+            path.parent.mkdir(exist_ok=True)
+            field.save_ply(path)
+        if optimizer_state is not None:
+            self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
+        self._write_json(MANIFEST, asdict(manifest))
+        self._manifest = manifest
+        with one_line_errors(self._folder):
+            self.path(CHECKPOINT).unlink(missing_ok=True)
+            self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
+
+    def optimizer_state(self, level: int) -> dict[str, Any]:
+        """The optimizer state that a finished level left for the next one, its tensors on the CPU.
+
+        Raises:
+            RunFolderError: there is none, or it cannot be read.
+        """
+        path = self.field_path(level).with_name(OPTIMIZER)
+        if not path.exists():
+            raise RunFolderError(
+                f"{path} does not exist, and --inherit full needs it; start again with --overwrite or inherit xyz"
+            )
+        return _read_tensors(path, "start again with --overwrite or inherit xyz")
+
+    def append_history(self, entry: dict[str, Any]) -> None:
+        """Add one entry to the history: JSON with finite numbers, having "level" and "iteration"."""
+        self._require_lock()
+        assert {"level", "iteration"} <= entry.keys(), "a history entry says where in the run it belongs"
+        line = json.dumps(entry, allow_nan=False) + "\n"
+        with one_line_errors(self.path(HISTORY)), self.path(HISTORY).open("a", encoding="utf-8") as stream:
+            stream.write(line)
+
+    def history(self) -> list[dict[str, Any]]:
+        """All entries in the order they were added. A last line torn by a crash is left out.
+
+        Raises:
+            RunFolderError: another line is not JSON.
+        """
+        path = self.path(HISTORY)
+        if not path.exists():
+            return []
+        with one_line_errors(path, "read"):
+            # What follows the last line break was being written when the run was killed.
+            *lines, _torn = path.read_text(encoding="utf-8").split("\n")
+        entries = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                entries.append(json.loads(line))
+            except json.JSONDecodeError as error:
+                raise RunFolderError(f"{path} line {number} is not JSON ({error.msg}); delete that line") from error
+        return entries
+
+    def rewind_history(self, level: int, iteration: int) -> None:
+        """Drop the entries after an iteration of a level, which a resumed run will add again.
+
+        Training visits level L-1 first, so an entry is later when its level is lower.
+        """
+        self._require_lock()
+        kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
+        text = "".join(json.dumps(entry) + "\n" for entry in kept)
+        with one_line_errors(self.path(HISTORY)), atomic_write(self.path(HISTORY)) as stream:
+            stream.write(text.encode())
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Replace the run's metrics: JSON with finite numbers. Needs no hold of the folder."""
+        self._write_json(METRICS, metrics)
+
+    def metrics(self) -> dict[str, Any] | None:
+        """The run's metrics, None when they were never measured.
+
+        Raises:
+            RunFolderError: the file is not JSON.
+        """
+        path = self.path(METRICS)
+        return _read_json(path) if path.exists() else None
+
+    def save_checkpoint(self, state: dict[str, Any]) -> None:
+        """Replace the checkpoint of the level in training: tensors, numbers, strings and containers of them."""
+        self._require_lock()
+        self._write_tensors(self.path(CHECKPOINT), {"level": self._manifest.next_level, "state": state})
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """The latest checkpoint of the next level to train, its tensors on the CPU; None when there is none.
+
+        Raises:
+            RunFolderError: it cannot be read.
+        """
+        path = self.path(CHECKPOINT)
+        if not path.exists():
+            return None
+        saved = _read_tensors(path, "delete it to continue from the last finished level")
+        # A run killed right after a level was finished leaves that level's checkpoint behind.
+        return saved["state"] if saved["level"] == self._manifest.next_level else None
+
+    def _check_fields(self) -> None:
+        for record in self._manifest.records:
+            path = self.field_path(record.level)
+            again = "train it again with --overwrite"
+            if not path.is_file():
+                raise RunFolderError(f"level {record.level} of {self._folder} is missing: no {path.name}; {again}")
+            try:
+                count = count_gaussians(path)
+            except FieldError as error:
+                raise RunFolderError(f"level {record.level} of {self._folder} is damaged: {error}; {again}") from error
+            if count != record.num_gaussians:
+                raise RunFolderError(
+                    f"level {record.level} of {self._folder} holds {count} Gaussians, the manifest says "
+                    f"{record.num_gaussians}; {again}"
+                )
+
+    def _write_json(self, name: str, values: dict[str, Any]) -> None:
+        text = json.dumps(values, indent=2, allow_nan=False) + "\n"
+        with one_line_errors(self.path(name)), atomic_write(self.path(name)) as stream:
+            stream.write(text.encode())
+
+    def _write_tensors(self, path: Path, state: dict[str, Any]) -> None:
+        with one_line_errors(path), atomic_write(path) as stream:
+            _torch_save(state, stream)
+
+    def _require_lock(self) -> None:
+        assert self._lock is not None, "open the run with resume=True to write to it"
+
+
+def _torch_save(state: dict[str, Any], stream: BinaryIO) -> None:
+    """torch.save that lets the OSError of a full disk through; torch replaces it by a RuntimeError."""
+    try:
+        torch.save(state, stream)
+    except RuntimeError as error:
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from error
+        raise
+
+
+def _read_tensors(path: Path, advice: str) -> dict[str, Any]:
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, OSError, ... by damage
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
+    return state
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        with one_line_errors(path, "read"):
+            values = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        if isinstance(error, RunFolderError):
+            raise
+        raise RunFolderError(f"{path} is not readable as JSON ({error}); restore it or train again") from error
+    if not isinstance(values, dict):
+        raise RunFolderError(f"{path} holds a JSON {type(values).__name__}, expected an object; restore it")
+    return values
+
+
+def _read_manifest(folder: Path) -> Manifest:
+    path = folder / MANIFEST
+    if not path.is_file():
+        what = "has no manifest.json" if folder.is_dir() else "does not exist"
+        raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
+    values = _read_json(path)
+    version = values.get("format_version")
+    if version != FORMAT_VERSION:
+        raise RunFolderError(
+            f"{path} has format_version {version!r}, this version of lapgs reads {FORMAT_VERSION}; "
+            f"use the version that wrote it ({values.get('created_by', 'unknown')})"
+        )
+    try:
+        return Manifest.from_json(values)
+    except (UserInputError, TypeError) as error:
+        raise RunFolderError(f"{path} is damaged: {error}; restore it or train again with --overwrite") from error
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether the manifest was written by any version of this package; others' manifest.json files are not ours."""
+    try:
+        values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and "lapgs_plugin" in str(values.get("created_by"))
+
+
+def _remove_results(folder: Path) -> None:
+    """Remove what a former run left, and nothing that a run does not write."""
+    _remove_scratch(folder)
+    for name in (HISTORY, METRICS, REPORT):
+        (folder / name).unlink(missing_ok=True)
+    if (folder / RENDERS).is_dir():
+        shutil.rmtree(folder / RENDERS)
+    for level in folder.glob("level_*/"):
+        (level / PLY).unlink(missing_ok=True)
+        (level / OPTIMIZER).unlink(missing_ok=True)
+        if not any(level.iterdir()):
+            level.rmdir()
+
+
+def _remove_scratch(folder: Path) -> None:
+    """Remove what a killed run could not: half-written temporaries, cached predictions, a torn line of history."""
+    for pattern in (TEMPORARY_PATTERN, f"level_*/{TEMPORARY_PATTERN}"):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
+    if (folder / CACHE).is_dir():
+        shutil.rmtree(folder / CACHE)
+    if (folder / HISTORY).exists():
+        with (folder / HISTORY).open("r+b") as stream:
+            stream.truncate(stream.read().rfind(b"\n") + 1)
+
+
+PRECISIONS = {"float32": np.float32, "float16": np.float16, "uint8": np.uint8}
+
+
+@dataclass(frozen=True)
+class _CachedImage:
+    """An encoded image: value = low + step * stored. On disk `stored` is None and `path` holds the bytes."""
+
+    shape: tuple[int, ...]
+    low: float
+    step: float
+    num_bytes: int
+    stored: NDArray[Any] | None
+    path: Path | None
+
+
+class PredictionCache:
+    """Up(I_hat^l) of every training view, kept for the next stage.
+
+    Args:
+        where: "memory", or "disk" for scenes larger than that.
+        precision: what a value is stored as: "float32" exact, "float16", or "uint8" in 256 steps over the range of
+            each image (predictions are not confined to [0, 1] between levels).
+        folder: for "disk", where to keep the files; made here and removed by `close`.
+
+    Raises:
+        UserInputError: an unknown place or precision.
+    """
+
+    def __init__(self, where: str = "memory", precision: str = "float32", folder: Path | None = None) -> None:
+        if where not in ("memory", "disk"):
+            raise UserInputError(f"--cache {where}: expected memory or disk")
+        if precision not in PRECISIONS:
+            raise UserInputError(f"--cache-precision {precision}: expected {', '.join(PRECISIONS)}")
+        assert where == "memory" or folder is not None, "a cache on disk needs a folder"
+        self._dtype = np.dtype(PRECISIONS[precision])
+        self._folder = folder if where == "disk" else None
+        self._images: dict[str, _CachedImage] = {}
+        self._coming: dict[str, Future[NDArray[np.float32]]] = {}
+        self._loader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prediction-cache")
+
+    def put(self, name: str, image: Tensor) -> None:
+        """Keep the prediction of a view.
+
+        Args:
+            name: of the view.
+            image: (3, h, w), any float type and device, not clamped.
+
+        Raises:
+            TrainingDivergedError: it holds NaN or inf.
+            RunFolderError: the disk is full or the folder not writable.
+        """
+        values = image.detach().to("cpu", torch.float32).contiguous().numpy()
+        low, high = float(values.min()), float(values.max())
+        if not np.isfinite(high - low):
+            raise TrainingDivergedError(
+                f"the prediction of view {name} holds NaN or inf; the levels finished before are kept"
+            )
+        if self._dtype == np.uint8:
+            step = (high - low) / 255 or 1.0  # a constant image is all zeros, whatever the step
+            stored = np.rint((values - np.float32(low)) / np.float32(step)).astype(np.uint8)
+        else:
+            low, step = 0.0, 1.0
+            stored = values.astype(self._dtype)  # a copy: the caller may go on using the image's memory
+        path = self._store(name, stored) if self._folder is not None else None
+        self._images[name] = _CachedImage(
+            values.shape, low, step, stored.nbytes, stored if path is None else None, path
+        )
+
+    def prefetch(self, name: str) -> None:
+        """Start loading, in the background, what `get` will be asked for next."""
+        if name not in self._coming:
+            self._coming[name] = self._loader.submit(self._load, self._images[name])
+
+    def get(self, name: str) -> Tensor:
+        """The prediction of a view, (3, h, w) float32 on the CPU; not to be modified.
+
+        Raises:
+            KeyError: it was never put.
+            RunFolderError: its file cannot be read any more.
+        """
+        coming = self._coming.pop(name, None)
+        return torch.from_numpy(self._load(self._images[name]) if coming is None else coming.result())
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all predictions, in memory or on disk."""
+        return sum(image.num_bytes for image in self._images.values())
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def close(self) -> None:
+        """Forget everything and remove the files."""
+        self._loader.shutdown(wait=True, cancel_futures=True)
+        self._coming.clear()
+        self._images.clear()
+        if self._folder is not None and self._folder.is_dir():
+            shutil.rmtree(self._folder)
+
+    def __enter__(self) -> PredictionCache:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _store(self, name: str, stored: NDArray[Any]) -> Path:
+        assert self._folder is not None
+        known = self._images.get(name)
+        # Numbered, because view names may hold slashes or what a file system refuses.
+        path = known.path if known and known.path else self._folder / f"{len(self._images):06d}.bin"
+        with one_line_errors(path):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            try:
+                path.write_bytes(stored.data)
+            except OSError:
+                path.unlink(missing_ok=True)  # half an image would only keep a full disk full
+                raise
+        return path
+
+    def _load(self, image: _CachedImage) -> NDArray[np.float32]:
+        # NumPy and not torch: this may run in the background thread, where torch would start a second thread pool.
+        stored = image.stored
+        if stored is None:
+            assert image.path is not None
+            with one_line_errors(image.path, "read"):
+                stored = np.fromfile(image.path, self._dtype).reshape(image.shape)
+        values = stored.astype(np.float32, copy=False)
+        if self._dtype == np.uint8:
+            values *= np.float32(image.step)
+            values += np.float32(image.low)
+        return values

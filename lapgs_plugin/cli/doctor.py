@@ -1,0 +1,113 @@
+"""`lapgs doctor`: what this machine has, what will be used, and what is missing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from lapgs_plugin.environment import Finding, Probe
+
+IMPORTED = ("OpenImageIO", "pycolmap")
+"""Packages with compiled parts that no other probe imports."""
+NOT_IN_THE_WAY = ("GPU", "Kernel cache")
+"""What may be broken while training on the CPU still works."""
+MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold red]!![/bold red]"}
+
+
+def doctor(
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print everything as JSON, for scripts and bug reports.")
+    ] = False,
+) -> None:
+    """Look at Python, PyTorch, GPU, compilers, packages and the current folder; say what `lapgs train` will use.
+
+    Nothing is changed, nothing is downloaded, and the exit code is always 0. Lines marked !! stand in the way of
+    something and say what to do; lines marked -- are not there and not needed.
+    """
+    import json
+    from dataclasses import asdict
+
+    sections = examine()
+    if as_json:
+        print(
+            json.dumps({title: [asdict(finding) for finding in found] for title, found in sections.items()}, indent=2)
+        )
+    else:
+        _print(sections)
+
+
+def examine() -> dict[str, list[Finding]]:
+    """All findings by section, the conclusion last. Slow probes run side by side."""
+    from concurrent.futures import ThreadPoolExecutor
+    from pathlib import Path
+
+    from lapgs_plugin import environment
+    from lapgs_plugin.adapters.known import KNOWN_EXTENSIONS, recognise_checkout
+    from lapgs_plugin.environment import Finding
+
+    requirements = environment.own_requirements()
+    with ThreadPoolExecutor() as pool:
+        torch_probe = pool.submit(environment.run_probe, "torch")
+        raster_probe = pool.submit(environment.run_probe, "rasterizer")
+        driver = pool.submit(environment.driver_version)
+        imports = {name: pool.submit(environment.run_probe, "import", name) for name in IMPORTED}
+        extensions = [pool.submit(environment.extension_finding, *known) for known in KNOWN_EXTENSIONS.items()]
+    torch = torch_probe.result()
+    compilers = environment.compiler_findings(torch.facts.get("cuda"))
+    checkout = recognise_checkout(Path.cwd())
+    here = (
+        Finding("Current folder", "ok", f"a checkout of {checkout.name}")
+        if checkout
+        else Finding("Current folder", "absent", "not a 3DGS checkout that is known")
+    )
+    sections = {
+        "System": environment.system_findings(),
+        "PyTorch": environment.torch_findings(torch, driver.result()),
+        "Compilers": compilers,
+        "CPU rasterizer": environment.numba_findings(raster_probe.result()),
+        "Packages": environment.package_findings(
+            requirements, {name: probe.result() for name, probe in imports.items()}
+        ),
+        "Extras": environment.extra_findings(requirements),
+        "Backbones": [
+            environment.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
+            *(extension.result() for extension in extensions),
+            here,
+        ],
+    }
+    return {**{title: found for title, found in sections.items() if found}, "lapgs train": _conclusion(sections, torch)}
+
+
+def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
+    """What training will use, or what stands in its way."""
+    from lapgs_plugin.environment import Finding
+
+    needed = [*sections["System"], *sections["PyTorch"], *sections["CPU rasterizer"], *sections["Packages"]]
+    broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_IN_THE_WAY]
+    if broken:
+        return [
+            Finding("will use", "problem", f"nothing until this is mended: {', '.join(broken)}", "see the lines !!")
+        ]
+    found = [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]
+    if torch.facts["gpus"]:
+        found.append(Finding("will not use", "absent", "the GPU: this version trains on the CPU"))
+    return found
+
+
+def _print(sections: dict[str, list[Finding]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column()
+    table.add_column(overflow="fold")  # whole paths, to be copied
+    for title, found in sections.items():
+        table.add_row("", f"[bold]{title}[/bold]")
+        for finding in found:
+            advice = f"\n[yellow]{escape(finding.advice)}[/yellow]" if finding.advice else ""
+            table.add_row(MARKS[finding.status], escape(finding.name), escape(finding.detail) + advice)
+    Console().print(table)

@@ -1,0 +1,107 @@
+"""`lapgs render`: the images of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.scenes import Scene, View
+
+SPLITS = ("test", "train", "all")
+FORMATS = ("png", "exr")
+
+
+def render(  # noqa: PLR0917 - a command line has as many parameters as options
+    run: Annotated[Path, typer.Argument(help="Run folder that `lapgs train` wrote.")],
+    views: Annotated[
+        str | None,
+        typer.Option(help="test (held out), train or all. Default: test, or train when nothing was held out."),
+    ] = None,
+    image_format: Annotated[
+        str, typer.Option("--format", help="png (8 bits, clamped) or exr (float, unclamped, residuals as they are).")
+    ] = "png",
+    level: Annotated[
+        int | None, typer.Option(help="Finest level to add; 0 is full resolution. Default: the finest that is trained.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/renders.")] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Also write photo, composition and their difference side by side.")
+    ] = False,
+    scene: Annotated[
+        Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
+    ] = None,
+) -> None:
+    """Write the images of RUN: base, each residual, and their composition, for every view.
+
+    Files are called <view>_base, <view>_residual_<level> and <view>_composed, in one folder for held-out and one for
+    training views. Base and residuals have their own level's size. In PNG residuals lie around mid-grey: zero is grey,
+    lighter adds, darker takes away.
+
+    Examples:
+
+        lapgs render runs/garden
+
+        lapgs render runs/garden --views all --format exr --out /tmp/garden
+    """
+    from lapgs_plugin.archive import RENDERS, RunArchive
+    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.rendering.run import run_renderer, run_scene
+
+    _require_one_of("--views", views, (None, *SPLITS))
+    _require_one_of("--format", image_format, FORMATS)
+    archive = RunArchive.open(run)
+    renderer = run_renderer(archive)
+    level = renderer.finest if level is None else level
+    renderer.require_level(level)
+    folder = archive.path(RENDERS) if out is None else out
+    with one_pool():
+        loaded = run_scene(archive, scene)
+        for split, chosen in _choose(loaded, views).items():
+            _write_views(renderer, chosen, level, folder=folder / split, image_format=image_format, compare=compare)
+    print(f"{folder} holds the images")
+
+
+def _require_one_of(option: str, value: str | None, accepted: Sequence[str | None]) -> None:
+    if value not in accepted:
+        raise UserInputError(f"{option} {value}: expected {', '.join(filter(None, accepted))}")
+
+
+def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
+    """The views to render, by the name of their folder."""
+    if views == "test" and not scene.test:
+        raise UserInputError(
+            "--views test: nothing was held out of this run; render --views train, or train with --eval"
+        )
+    wanted = views or ("test" if scene.test else "train")
+    return {
+        split: chosen
+        for split, chosen in (("test", scene.test), ("train", scene.train))
+        if wanted in (split, "all") and chosen
+    }
+
+
+def _write_views(
+    renderer: HierarchyRenderer, views: Sequence[View], level: int, *, folder: Path, image_format: str, compare: bool
+) -> None:
+    """Render and write the views of one split; each file appears whole or not at all."""
+    from lapgs_plugin.progress import item_progress
+    from lapgs_plugin.rendering.images import file_stems, view_images
+    from lapgs_plugin.scenes import write_image
+
+    stems = file_stems(views)
+    with item_progress("views") as progress:
+        task = progress.add_task(f"Rendering {folder.name} views", total=len(views))
+        for view in views:
+            composition = renderer.render(view.camera, level)
+            photo = renderer.pyramid.gaussian(view.image, level + 1)[level] if compare else None
+            for suffix, image in view_images(composition, photo, raw=image_format == "exr").items():
+                write_image(folder / f"{stems[view.name]}_{suffix}.{image_format}", image)
+            progress.advance(task)

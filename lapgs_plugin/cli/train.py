@@ -1,0 +1,304 @@
+"""`lapgs train`: a hierarchy without a checkout, on the CPU rasterizer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lapgs_plugin.archive import RunArchive, SceneReference
+    from lapgs_plugin.scenes import Scene
+    from lapgs_plugin.training.settings import TrainSettings
+
+HIERARCHY = "Hierarchy"
+SCHEDULE = "Schedule"
+RUN = "Run"
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+def train(  # noqa: PLR0917 - a command line has as many parameters as options
+    context: typer.Context,
+    scene: Annotated[Path, typer.Argument(help="Folder of a COLMAP or Blender-style scene.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
+    iterations: Annotated[
+        int, typer.Option(min=1, help="Optimizer steps, all stages together. The 3DGS schedule shrinks with it.")
+    ] = 30_000,
+    resolution: Annotated[
+        str, typer.Option(help="1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4.")
+    ] = "full",
+    images: Annotated[str, typer.Option(help="Image folder inside a COLMAP scene, such as images_4.")] = "images",
+    hold_out: Annotated[bool, typer.Option("--eval", help="Hold out every eighth view for testing.")] = False,
+    background: Annotated[
+        str, typer.Option(help="Behind the scene and behind transparent pixels: black, white or R,G,B from 0 to 1.")
+    ] = "black",
+    seed: Annotated[int, typer.Option(help="The same seed and settings give the same bits.")] = 0,
+    levels: Annotated[
+        int, typer.Option(rich_help_panel=HIERARCHY, help="Number of levels; 1 is a plain single field, the baseline.")
+    ] = 2,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Share of the iterations of each stage, coarsest first. Default: the paper's, 1/3,2/3 for two levels.",
+        ),
+    ] = None,
+    supervision: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="reconstructed (composed image against the photo), online_residual or gt_laplacian.",
+        ),
+    ] = "reconstructed",
+    inherit: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="What the next level starts from: xyz (positions), full (all parameters and optimizer state), or a "
+            "ratio in (0, 1] of the positions.",
+        ),
+    ] = "xyz",
+    grid: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Pixel grid of the pyramid: camera (where the cameras see) or even (every second pixel, as OpenCV).",
+        ),
+    ] = "camera",
+    sh_degree: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, help="Highest SH degree, 0 to 3.")] = 3,
+    densify_from: Annotated[
+        int | None, typer.Option(rich_help_panel=SCHEDULE, help="First densification. Default: 500 of 30000.")
+    ] = None,
+    densify_until: Annotated[
+        int | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE, help="Last one, of the whole run; stages scale it. Default: 15000 of 30000."
+        ),
+    ] = None,
+    densify_every: Annotated[
+        int | None, typer.Option(rich_help_panel=SCHEDULE, help="Iterations in between. Default: 100 of 30000.")
+    ] = None,
+    opacity_reset_every: Annotated[
+        int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
+    ] = None,
+    rasterizer: Annotated[
+        str, typer.Option(rich_help_panel=RUN, help="cpu (fast) or oracle (slow, plain PyTorch, for checking).")
+    ] = "cpu",
+    threads: Annotated[
+        int | None,
+        typer.Option(rich_help_panel=RUN, min=1, help="Processor threads. Default: all this process may use."),
+    ] = None,
+    cache: Annotated[
+        str, typer.Option(rich_help_panel=RUN, help="Where finished levels' predictions are kept: memory or disk.")
+    ] = "memory",
+    cache_precision: Annotated[
+        str, typer.Option(rich_help_panel=RUN, help="How they are stored: float32, float16 or uint8.")
+    ] = "float32",
+    test_every: Annotated[
+        int | None,
+        typer.Option(
+            rich_help_panel=RUN, min=1, help="Measure held-out PSNR this often. Default: at the end of each stage."
+        ),
+    ] = None,
+    checkpoint_every: Annotated[
+        int, typer.Option(rich_help_panel=RUN, min=1, help="Iterations between checkpoints; Ctrl-C writes one too.")
+    ] = 1000,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in --out where it stopped, with its settings.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
+) -> None:
+    """Train SCENE as a Laplacian frequency hierarchy, one small field a stage, into the run folder --out.
+
+    Examples:
+
+        lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
+
+        lapgs train data/garden -o runs/plain --levels 1       (the baseline: one field)
+
+        lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+    """
+    from rich.console import Console
+
+    from lapgs_plugin.archive import SceneReference
+    from lapgs_plugin.training.settings import Densification, TrainSettings
+
+    if resume and overwrite:
+        raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
+    settings = TrainSettings(
+        iterations=iterations,
+        levels=levels,
+        split=None if split is None else tuple(part.strip() for part in split.split(",")),
+        grid=grid,
+        supervision=supervision,
+        **_inheritance(inherit),
+        sh_degree=sh_degree,
+        seed=seed,
+        cache=cache,
+        cache_precision=cache_precision,
+        densification=Densification(densify_from, densify_until, densify_every, opacity_reset_every),
+    )
+    reference = SceneReference(str(scene.absolute()), resolution, hold_out, _color(background), images=images, kind="")
+    console = Console(stderr=True)
+    if resume:
+        archive = _resume(out, _options(reference, settings, rasterizer), _given(context))
+        reference = replace(archive.manifest.scene, path=reference.path)
+        loaded = _load(reference)
+    else:
+        archive, loaded = _create(out, reference, settings, rasterizer, overwrite)
+    with archive:
+        _run(
+            archive,
+            loaded,
+            console,
+            threads=threads,
+            test_every=test_every,
+            checkpoint_every=checkpoint_every,
+            resume=resume,
+        )
+    console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
+
+
+def _inheritance(text: str) -> dict[str, Any]:
+    """--inherit as settings: a mode, or a ratio of the positions."""
+    if text in ("xyz", "full"):
+        return {"inherit": text}
+    try:
+        return {"inherit_ratio": float(text)}
+    except ValueError as error:
+        raise UserInputError(f"--inherit {text!r}: expected xyz, full or a ratio in (0, 1] such as 0.5") from error
+
+
+def _color(text: str) -> tuple[float, float, float]:
+    """--background as RGB."""
+    if text in BACKGROUNDS:
+        return BACKGROUNDS[text]
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UserInputError(f"--background {text!r}: expected black, white or R,G,B such as 0.5,0.5,0.5") from error
+    if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
+        raise UserInputError(f"--background {text!r}: expected three values from 0 to 1")
+    return red, green, blue
+
+
+def _given(context: typer.Context) -> set[str]:
+    """Options that stand on the command line, as opposed to those left at their defaults."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+
+
+def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
+    """What decides a run's result, by the name of its option."""
+    densification = settings.densification
+    return {
+        "resolution": reference.resolution,
+        "images": reference.images,
+        "hold_out": reference.eval,
+        "background": reference.background,
+        "rasterizer": rasterizer,
+        "inherit": (settings.inherit, settings.inherit_ratio),
+        "densify_from": densification.start,
+        "densify_until": densification.until,
+        "densify_every": densification.every,
+        "opacity_reset_every": densification.reset_every,
+        **{
+            name: getattr(settings, name)
+            for name in ("iterations", "levels", "split", "supervision", "grid", "sh_degree", "seed")
+        },
+    }
+
+
+def _resume(out: Path, wanted: dict[str, Any], given: set[str]) -> RunArchive:
+    """Open a run to continue it, refusing options that say something else than the run was started with."""
+    from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.training.settings import TrainSettings
+
+    archive = RunArchive.open(out, resume=True)
+    try:
+        manifest = archive.manifest
+        started_with = _options(manifest.scene, TrainSettings.from_manifest(manifest), manifest.rasterizer)
+        for name in sorted(given & wanted.keys()):
+            if wanted[name] != started_with[name]:
+                option = "--eval" if name == "hold_out" else "--" + name.replace("_", "-")
+                raise UserInputError(
+                    f"{option} asks for {wanted[name]}, but the run in {out} was started with {started_with[name]}; "
+                    "leave the option out to continue it, or start again with --overwrite"
+                )
+    except BaseException:
+        archive.close()
+        raise
+    return archive
+
+
+def _load(reference: SceneReference) -> Scene:
+    from lapgs_plugin.scenes import load_scene
+
+    return load_scene(
+        reference.path,
+        resolution=reference.resolution,
+        images=reference.images,
+        eval=reference.eval,
+        background=reference.background,
+    )
+
+
+def _create(
+    out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
+) -> tuple[RunArchive, Scene]:
+    """Read the scene, check that it can be trained as asked, and only then make the run folder."""
+    from lapgs_plugin.archive import Manifest, RunArchive
+    from lapgs_plugin.reference_raster import make_rasterizer
+    from lapgs_plugin.training.trainer import make_plan
+
+    RunArchive.require_room(out, overwrite)
+    make_rasterizer(rasterizer)
+    loaded = _load(reference)
+    make_plan(loaded, settings)
+    manifest = Manifest(
+        scene=replace(reference, kind=loaded.kind),
+        rasterizer=rasterizer,
+        **settings.for_manifest(),
+    )
+    return RunArchive.create(out, manifest, overwrite), loaded
+
+
+def _run(
+    archive: RunArchive,
+    scene: Scene,
+    console: Console,
+    *,
+    threads: int | None,
+    test_every: int | None,
+    checkpoint_every: int,
+    resume: bool,
+) -> None:
+    """Train with a progress display."""
+    import torch
+
+    from lapgs_plugin.reference_raster import make_rasterizer
+    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.training.monitor import ProgressMonitor
+    from lapgs_plugin.training.settings import TrainSettings
+    from lapgs_plugin.training.trainer import Trainer
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    manifest = archive.manifest
+    with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
+        trainer = Trainer(
+            scene=scene,
+            settings=TrainSettings.from_manifest(manifest),
+            archive=archive,
+            rasterizer=make_rasterizer(manifest.rasterizer),
+            monitor=monitor,
+            checkpoint_every=checkpoint_every,
+            test_every=test_every,
+        )
+        trainer.run(resume)

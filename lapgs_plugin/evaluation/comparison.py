@@ -1,0 +1,97 @@
+"""A hierarchy beside its baseline: the table that `lapgs report` prints and its page shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lapgs_plugin.archive import Manifest
+
+Metrics = dict[str, Any]
+"""What metrics.json holds, see `figures.run_figures`."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure of one run: its value and how it is written."""
+
+    value: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of every run.
+
+    Attributes:
+        key: short name for scripts.
+        label: what people read, with the unit.
+        cells: the run's, then the baseline's when there is one.
+        change: the run against the baseline, "" without one.
+    """
+
+    key: str
+    label: str
+    cells: tuple[Cell, ...]
+    change: str = ""
+
+
+def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
+    """The figures of a run, and of its baseline beside it.
+
+    Args:
+        metrics: of the run, and of the baseline when there is one.
+    """
+    views = "held-out" if metrics[0]["split"] == "test" else "training"
+    table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
+        ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
+        ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
+        ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
+        ("overhead_seconds", "Beside it (s)", "{:.1f}", _difference("{:+.1f} s")),
+        ("num_gaussians", "Gaussians, all levels", "{:,.0f}", _ratio),
+        ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),
+    )
+    rows = []
+    for key, label, pattern, compare in table:
+        cells = tuple(_cell(each[key], pattern) for each in metrics)
+        change = compare(cells[0].value, cells[1].value) if len(cells) > 1 else ""
+        rows.append(Row(key, label, cells, change))
+    return tuple(rows)
+
+
+def _cell(value: float | dict[str, float], pattern: str) -> Cell:
+    """A number, or the sum of named numbers with these behind it."""
+    if not isinstance(value, dict):
+        return Cell(value, pattern.format(value))
+    total = math.fsum(value.values())
+    parts = [f"{f'level {name}' if name.isdigit() else name} {pattern.format(part)}" for name, part in value.items()]
+    return Cell(total, pattern.format(total) + (f" ({', '.join(parts)})" if len(parts) > 1 else ""))
+
+
+def _difference(pattern: str) -> Callable[[float, float], str]:
+    return lambda run, baseline: pattern.format(run - baseline)
+
+
+def _speed(run: float, baseline: float) -> str:
+    return f"{baseline / run:.2f}x as fast" if run and baseline else ""
+
+
+def _ratio(run: float, baseline: float) -> str:
+    return f"{run / baseline:.2f}x" if baseline else ""
+
+
+def unlike(run: Manifest, baseline: Manifest) -> list[str]:
+    """In what the two runs differ that makes their figures no comparison of methods, in words."""
+    pairs = {
+        "scene": (run.scene.path, baseline.scene.path),
+        "images": (run.scene.images, baseline.scene.images),
+        "resolution": (run.scene.resolution, baseline.scene.resolution),
+        "held-out views": (run.scene.eval, baseline.scene.eval),
+        "background": (run.scene.background, baseline.scene.background),
+        "rasterizer": (run.rasterizer, baseline.rasterizer),
+        "iterations": (run.settings.get("iterations"), baseline.settings.get("iterations")),
+        "SH degree": (run.sh_degree, baseline.sh_degree),
+    }
+    return [f"{name} {ours} against {theirs}" for name, (ours, theirs) in pairs.items() if ours != theirs]

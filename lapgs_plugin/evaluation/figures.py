@@ -1,0 +1,144 @@
+"""The figures of a finished run: what `lapgs eval` writes into metrics.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive
+from lapgs_plugin.environment import versions
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.metrics import psnr, ssim
+from lapgs_plugin.progress import item_progress
+from lapgs_plugin.reference_raster.threads import one_pool
+from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.scenes.scene import View
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """How well one view is rendered.
+
+    Attributes:
+        name: of the view's image.
+        psnr, ssim: of the composition at full resolution.
+        level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at that
+            level's size.
+        upsampled_psnr: by level, PSNR in dB of I_hat^l brought to full resolution with Up, against the photo: what
+            the hierarchy would give without its finer levels.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    level_psnr: dict[int, float]
+    upsampled_psnr: dict[int, float]
+
+
+def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer) -> ViewMetrics:
+    """Compare a rendered view with its photo, level by level."""
+    targets = renderer.pyramid.gaussian(view.image, renderer.levels)
+    level_psnr = {level: psnr(image, targets[level]) for level, image in composition.composed.items()}
+    upsampled = {
+        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), view.image)
+        for level, image in composition.composed.items()
+    }
+    return ViewMetrics(view.name, level_psnr[0], ssim(composition.composed[0], view.image), level_psnr, upsampled)
+
+
+def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str, Any]:
+    """Render the held-out views of a complete run, or the training views when none were held out, and measure it.
+
+    Shows a progress bar and writes the result to the run's metrics.json.
+
+    Args:
+        archive: the run.
+        moved_to: where its scene is now; None when it did not move.
+
+    Returns:
+        What is written, described in `run_figures`.
+
+    Raises:
+        RunFolderError: the run is not complete, or its scene is not where it was.
+    """
+    require_complete(archive)
+    renderer = run_renderer(archive)
+    with one_pool():
+        scene = run_scene(archive, moved_to)
+        split, views = ("test", scene.test) if scene.test else ("train", scene.train)
+        with item_progress("views") as progress:
+            measured = [
+                measure_view(view, renderer.render(view.camera), renderer)
+                for view in progress.track(views, description=f"Measuring {split} views")
+            ]
+    metrics = run_figures(archive.manifest, split, measured)
+    archive.write_metrics(metrics)
+    return metrics
+
+
+def require_complete(archive: RunArchive) -> None:
+    """Refuse a run whose training was interrupted: its figures would be those of an unfinished hierarchy.
+
+    Raises:
+        RunFolderError: a level is not finished.
+    """
+    manifest = archive.manifest
+    if not manifest.complete:
+        raise RunFolderError(
+            f"{archive.path()}: only {len(manifest.records)} of {manifest.levels} levels are trained; finish the run "
+            "with `lapgs train --resume`, or look at what is there with `lapgs render`"
+        )
+
+
+def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Figures of a complete run as JSON.
+
+    Keys, with levels as text because JSON has no other keys:
+        psnr, ssim: means over the views of each view's own value, at full resolution.
+        split, num_views: which views, "test" or "train", and how many.
+        train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
+        num_gaussians: by level; peak_gaussians: the most that were optimized at once.
+        levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
+            num_gaussians, peak_gaussians.
+        views: name, psnr, ssim of each, in the scene's order.
+        rasterizer, versions: what rendered them.
+    """
+    overhead: dict[str, float] = {}
+    for record in manifest.records:
+        for name, seconds in record.overhead_seconds.items():
+            overhead[name] = overhead.get(name, 0.0) + seconds
+    return {
+        "psnr": _mean(view.psnr for view in views),
+        "ssim": _mean(view.ssim for view in views),
+        "split": split,
+        "num_views": len(views),
+        "train_seconds": math.fsum(record.train_seconds for record in manifest.records),
+        "overhead_seconds": overhead,
+        "num_gaussians": {str(record.level): record.num_gaussians for record in manifest.records},
+        "peak_gaussians": max(record.peak_gaussians for record in manifest.records),
+        "levels": {str(record.level): _level_figures(record, views) for record in manifest.records},
+        "views": [{"name": view.name, "psnr": view.psnr, "ssim": view.ssim} for view in views],
+        "rasterizer": manifest.rasterizer,
+        "versions": versions(),
+    }
+
+
+def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    return {
+        "psnr": _mean(view.level_psnr[record.level] for view in views),
+        "upsampled_psnr": _mean(view.upsampled_psnr[record.level] for view in views),
+        "iterations": record.iterations,
+        "image_size": list(record.image_size),
+        "train_seconds": record.train_seconds,
+        "num_gaussians": record.num_gaussians,
+        "peak_gaussians": record.peak_gaussians,
+    }
+
+
+def _mean(values: Iterable[float]) -> float:
+    listed = list(values)
+    return math.fsum(listed) / len(listed)

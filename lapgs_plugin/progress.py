@@ -1,0 +1,33 @@
+"""The progress bar of everything that counts items: rate and time left, on stderr."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+
+class RateColumn(ProgressColumn):
+    """Items a second, and seconds an item where that is below one."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        rate = task.finished_speed or task.speed
+        if not rate:
+            return Text(f"- {self._unit}/s")
+        return Text(f"{rate:.1f} {self._unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s/{self._unit}")
+
+
+def item_progress(unit: str) -> Progress:
+    """A bar with count, rate in `unit` and time left, to be used as a context manager."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        RateColumn(unit),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )

@@ -1,0 +1,175 @@
+"""Image pyramids: Down and Up as one paired object, Gaussian and Laplacian pyramids, reconstruction.
+
+Down is the 5-tap binomial blur of Burt and Adelson (1983) followed by halving, odd sides rounded up; Up resizes to the
+exact finer size and applies the same blur. Both act on rows and columns separately, preserve constants, and clamp
+nothing. Two pixel grids say where a coarse pixel lies among the fine ones, for a side of n fine and m = ceil(n / 2)
+coarse pixels:
+
+    camera   coarse i is at fine (i + 0.5) n / m - 0.5, so that a camera with the same field of view at the coarse size
+             sees the pixel where it is. For even n it is the middle of a pair of fine pixels.
+    even     coarse i is at fine 2 i: every second pixel is kept, as OpenCV's pyrDown does. Against the cameras the
+             image is shifted by half a fine pixel a level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+
+GRIDS = ("camera", "even")
+BLUR_RADIUS = 2
+
+
+class Pyramid:
+    """Down and Up on one pixel grid, and the pyramids they make.
+
+    Images are (..., h, w) of any float type on any device, usually (3, h, w); results have the type and device of their
+    argument. Half-precision images are filtered in float32 and rounded once. Everything is linear and differentiable.
+
+    Args:
+        grid: "camera" or "even", see the module.
+
+    Raises:
+        UserInputError: another name.
+    """
+
+    def __init__(self, grid: str = "camera") -> None:
+        if grid not in GRIDS:
+            raise UserInputError(f"--grid {grid}: expected {' or '.join(GRIDS)}")
+        self.grid = grid
+
+    def down(self, image: Tensor) -> Tensor:
+        """Down: (..., h, w) to (..., ceil(h / 2), ceil(w / 2))."""
+        values = _working_precision(image)
+        for dim in (-2, -1):  # rows first: halving them is cheap and halves the work on the columns
+            fine = values.shape[dim]
+            values = _sample(_blur(values, dim), dim, self._coarse_centres(fine, (fine + 1) // 2))
+        return values.to(image.dtype)
+
+    def up(self, image: Tensor, size: tuple[int, int]) -> Tensor:
+        """Up: (..., ceil(h / 2), ceil(w / 2)) to (..., h, w).
+
+        Args:
+            image: the coarser image.
+            size: (h, w), height first.
+
+        Raises:
+            UserInputError: the image is not half of `size`.
+        """
+        halved = tuple((side + 1) // 2 for side in size)
+        if tuple(image.shape[-2:]) != halved:
+            raise UserInputError(
+                f"Up to {size[0]}x{size[1]} (height x width) needs an image of {halved[0]}x{halved[1]}, "
+                f"got {image.shape[-2]}x{image.shape[-1]}"
+            )
+        values = _working_precision(image)
+        for dim in (-1, -2):  # columns first, while there are half as many rows
+            fine = size[dim]
+            values = _blur(_sample(values, dim, self._fine_centres(fine, (fine + 1) // 2)), dim)
+        return values.to(image.dtype)
+
+    def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
+        """Gaussian pyramid: I^0 = `image`, I^(l+1) = Down(I^l), finest first.
+
+        Raises:
+            UserInputError: fewer than one level.
+        """
+        if levels < 1:
+            raise UserInputError(f"a pyramid of {levels} levels: expected at least 1")
+        images = [image]
+        while len(images) < levels:
+            images.append(self.down(images[-1]))
+        return images
+
+    def laplacian(self, image: Tensor, levels: int) -> list[Tensor]:
+        """Laplacian pyramid: R^l = I^l - Up(I^(l+1)) for l < levels - 1, then I^(levels-1); finest first.
+
+        Raises:
+            UserInputError: fewer than one level.
+        """
+        images = self.gaussian(image, levels)
+        residuals = [fine - self.up(coarse, _size(fine)) for fine, coarse in pairwise(images)]
+        return [*residuals, images[-1]]
+
+    def reconstruct(self, pyramid: Sequence[Tensor]) -> Tensor:
+        """The image of a Laplacian pyramid, finest level first: I^l = Up(I^(l+1)) + R^l, down to level 0."""
+        image = pyramid[-1]
+        for residual in reversed(pyramid[:-1]):
+            image = self.up(image, _size(residual)) + residual
+        return image
+
+    def _coarse_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
+        """Where the coarse samples lie among the fine ones: the first, the distance between two, how many."""
+        if self.grid == "even":
+            return 0.0, 2.0, coarse
+        return 0.5 * fine / coarse - 0.5, fine / coarse, coarse
+
+    def _fine_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
+        """Where the fine samples lie among the coarse ones."""
+        if self.grid == "even":
+            return 0.0, 0.5, fine
+        return 0.5 * coarse / fine - 0.5, coarse / fine, fine
+
+
+def _size(image: Tensor) -> tuple[int, int]:
+    return image.shape[-2], image.shape[-1]
+
+
+def _working_precision(image: Tensor) -> Tensor:
+    assert image.is_floating_point(), f"a pyramid needs floats, got {image.dtype}"
+    return image.float() if image.dtype in (torch.float16, torch.bfloat16) else image
+
+
+def _blur(image: Tensor, dim: int) -> Tensor:
+    """Convolve one dimension with (1 4 6 4 1) / 16, mirrored at the border without repeating the edge pixel."""
+    n = image.shape[dim]
+    before, after = _mirrored(n, image.device)
+    padded = torch.cat([image.index_select(dim, before), image, image.index_select(dim, after)], dim)
+    taps = [padded.narrow(dim, offset, n) for offset in range(2 * BLUR_RADIUS + 1)]
+    # Sums of shifted views: several times faster than a convolution with one channel on a CPU.
+    total = taps[0] + taps[4]
+    return total.add_(taps[1], alpha=4).add_(taps[3], alpha=4).add_(taps[2], alpha=6).mul_(1 / 16)
+
+
+@lru_cache(maxsize=256)
+def _mirrored(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Which samples stand for those just before and after the n of a side; sides of 1 and 2 mirror repeatedly."""
+    period = max(2 * (n - 1), 1)
+    outside = torch.tensor([[-2, -1], [n, n + 1]]) % period
+    before, after = torch.minimum(outside, period - outside).clamp_max(n - 1).to(device)
+    return before, after
+
+
+def _sample(image: Tensor, dim: int, centres: tuple[float, float, int]) -> Tensor:
+    """Linear interpolation along one dimension at evenly spaced positions, constant beyond the ends."""
+    lower, upper, fraction = _neighbours(image.shape[dim], centres, image.dtype, image.device)
+    if fraction is None:
+        return _take(image, dim, lower)
+    shape = [1] * image.ndim
+    shape[dim] = -1
+    return torch.lerp(_take(image, dim, lower), _take(image, dim, upper), fraction.view(shape))
+
+
+def _take(image: Tensor, dim: int, index: Tensor) -> Tensor:
+    """Samples of one dimension. On a CPU index_select copies whole rows fast, and is the slowest way for columns."""
+    return image[..., index] if dim == -1 else image.index_select(dim, index)
+
+
+@lru_cache(maxsize=256)
+def _neighbours(
+    n: int, centres: tuple[float, float, int], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Samples on both sides of each position and the weight of the upper one, None when all are on samples."""
+    first, distance, count = centres
+    positions = (first + distance * torch.arange(count, dtype=torch.float64)).clamp(0, n - 1)
+    lower = positions.floor().long()
+    fraction = positions - lower
+    upper = (lower + 1).clamp_max(n - 1)
+    weight = fraction.to(device, dtype) if bool(fraction.any()) else None
+    return lower.to(device), upper.to(device), weight

@@ -1,0 +1,68 @@
+"""Memory that is used again: at a million pixels, touching fresh memory costs as much as a kernel.
+
+`empty` hands out arrays that find their way back by themselves, when the array, all its views and all tensors made of it
+are gone: gradients that PyTorch owns as `.grad` come back when the optimizer drops them.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+ALIGNMENT = 64
+"""Bytes: a line of the cache, and the widest vector."""
+MAX_WASTE = 1.5
+"""A block serves requests down to this fraction of its size."""
+PATIENCE = 256
+"""Blocks that were not taken during this many requests are given back to the system: some ten iterations."""
+
+
+class _Block:
+    """Some bytes, and when they came back."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.memory = memoryview(np.empty(size + ALIGNMENT, np.uint8))
+        self.returned = 0
+
+
+class _Store:
+    """Free blocks."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # an array may be collected, and come back, while its thread is in `take`
+        self._free: list[_Block] = []
+        self._requests = 0
+
+    def take(self, size: int) -> _Block:
+        with self._lock:
+            self._requests += 1
+            self._free = [block for block in self._free if self._requests - block.returned < PATIENCE]
+            fitting = [block for block in self._free if size <= block.size <= MAX_WASTE * size]
+            if not fitting:
+                return _Block(size)
+            best = min(fitting, key=lambda block: block.size)
+            self._free.remove(best)
+            return best
+
+    def give_back(self, block: _Block) -> None:
+        with self._lock:
+            block.returned = self._requests
+            self._free.append(block)
+
+
+_store = _Store()
+
+
+def empty(size: int, dtype: DTypeLike) -> NDArray[Any]:
+    """A writable array of `size` elements, aligned for vectors, with anything in it."""
+    kind = np.dtype(dtype)
+    block = _store.take(max(size, 1) * kind.itemsize)
+    start = -np.frombuffer(block.memory, np.uint8).ctypes.data % ALIGNMENT
+    array = np.frombuffer(block.memory, kind, size, start)
+    weakref.finalize(array, _store.give_back, block).atexit = False
+    return array

@@ -1,0 +1,155 @@
+"""The fast CPU rasterizer: compiled kernels behind `lapgs_plugin.raster.Rasterizer`, with their own backward pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.reference_raster import pipeline
+from lapgs_plugin.reference_raster.buffers import empty
+from lapgs_plugin.reference_raster.lanes import Floats
+from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
+
+
+class CpuRasterizer:
+    """Renders and differentiates on the CPU, fast enough to train with.
+
+    Semantics, and where its gradients depart from the textbook, are those of `oracle`. It runs on
+    `torch.get_num_threads()` threads (see `threads` for what that means beside PyTorch's own), gives the same bits for
+    any number of them, and may be called from several Python threads at once. The first call on a machine compiles.
+
+    Gaussians whose position or covariance on the image is not finite are culled: they get radius 0 and no gradient.
+    """
+
+    @property
+    def name(self) -> str:
+        return "cpu"
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
+
+        Args:
+            field: float32 or float64, on the CPU.
+            camera: of any precision; its pose gets no gradient.
+            background: (3,) colour; may require a gradient.
+            sh_degree: see there.
+
+        Raises:
+            UserInputError: `sh_degree` is not one the field has, `background` is not a colour, or a tensor is not on
+                the CPU or not of the field's precision.
+        """
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        _check(field, background, degree)
+        kind = field.means.dtype
+        pose = camera.world_to_camera.detach().to("cpu", kind).numpy()
+        focal, principal = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        view = pipeline.make_view(camera.width, camera.height, pose, focal, principal)
+        background = background.to(kind)
+
+        n = len(field)
+        parameters = list(field.parameters.values())
+        differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in (*parameters, background))
+        # PyTorch fills large tensors on several threads, which then spin; see `threads`. NumPy does not.
+        means2d, absgrad2d = (torch.from_numpy(_zeros(n, 2, _numpy_type(kind))) for _ in range(2))
+        call = _Call(view, field.signed, degree, differentiable, means2d.detach(), absgrad2d)
+        means2d.requires_grad_(differentiable)
+        image, transmittance, radii = _Rasterize.apply(call, background, means2d, *parameters)
+        return RenderResult(image, transmittance, radii, means2d, absgrad2d)
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What one call hands to its autograd function beside tensors to differentiate by.
+
+    Attributes:
+        keep: whether there may be a backward pass.
+        means2d, absgrad2d: (n, 2) filled in the forward and the backward pass.
+    """
+
+    view: View
+    signed: bool
+    sh_degree: int
+    keep: bool
+    means2d: Tensor
+    absgrad2d: Tensor
+
+    def gaussians(self, parameters: Sequence[Tensor]) -> Gaussians:
+        """The field's parameters, in its order, as arrays."""
+        means, quats, log_scales, logits, sh = (p.detach().contiguous().numpy() for p in parameters)
+        return Gaussians(means, quats, log_scales, logits, sh, None, True, self.signed, self.sh_degree)
+
+
+class _Rasterize(torch.autograd.Function):
+    """(call, background, means2d, *parameters of the field) -> image, transmittance, radii."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, call: _Call, background: Tensor, means2d: Tensor, *parameters: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        color = background.detach().contiguous().numpy()
+        rendering = pipeline.render(call.gaussians(parameters), call.view, color, keep=call.keep)
+        np.copyto(call.means2d.numpy(), rendering.centres)
+        image, transmittance, radii = (
+            torch.from_numpy(array) for array in (rendering.image, rendering.transmittance, rendering.radii)
+        )
+        if call.keep:
+            ctx.call, ctx.rendering = call, rendering
+            ctx.save_for_backward(*parameters)
+            ctx.set_materialize_grads(False)
+            ctx.mark_non_differentiable(radii)
+        return image, transmittance, radii
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
+        call: _Call = ctx.call
+        rendering: Rendering = ctx.rendering
+        grad_image, grad_transmittance = (None if g is None else g.contiguous().numpy() for g in from_above[:2])
+        if grad_image is None:
+            grad_image = np.zeros_like(rendering.image)
+        gaussians = call.gaussians(ctx.saved_tensors)
+        found = pipeline.gradients(gaussians, call.view, rendering, grad_image, grad_transmittance)
+        np.copyto(call.absgrad2d.numpy(), found.absolute_centres)
+        by_background = None
+        if ctx.needs_input_grad[1]:
+            weights = rendering.transmittance.reshape(-1)
+            by_background = torch.from_numpy(grad_image.reshape(3, -1) @ weights)
+        arrays = (found.centres, found.means, found.quats, found.scales, found.opacities, found.sh)
+        return None, by_background, *(None if a is None else torch.from_numpy(a) for a in arrays)
+
+
+def _zeros(rows: int, columns: int, kind: type[np.floating[Any]]) -> Floats:
+    array = empty(rows * columns, kind).reshape(rows, columns)
+    array.fill(0)
+    return array
+
+
+def _numpy_type(kind: torch.dtype) -> type[np.floating[Any]]:
+    return np.float32 if kind == torch.float32 else np.float64
+
+
+def _check(field: GaussianField, background: Tensor, degree: int) -> None:
+    kind = field.means.dtype
+    if not 0 <= degree <= field.sh_degree:
+        raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
+    if background.shape != (3,):
+        raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
+    if kind not in (torch.float32, torch.float64):
+        raise UserInputError(f"the field's tensors are {kind}, expected float32 or float64; convert with field.to()")
+    for name, tensor in {**field.parameters, "background": background}.items():
+        if tensor.device.type != "cpu":
+            raise UserInputError(f"{name} is on {tensor.device}, expected the CPU; convert with .to('cpu')")
+        if tensor.dtype != kind and name != "background":
+            raise UserInputError(f"{name} is {tensor.dtype} and means are {kind}, expected one type; use field.to()")

@@ -1,0 +1,78 @@
+"""Numbers that the kernels agree on: thresholds of the 3DGS rasterizers, and what lies where in the arrays between them.
+
+A change here makes all kernels compile again.
+"""
+
+from __future__ import annotations
+
+import math
+
+TILE = 16
+"""Side of a tile in pixels. A Gaussian is blended in whole tiles, so this is part of the image."""
+BLOCK = 4
+"""Side of a block in pixels: 4x4 pixels are the 16 lanes of a vector, row by row."""
+BLOCKS = (TILE // BLOCK) ** 2
+"""Blocks of a tile, row by row. There are as many as lanes."""
+TILE_PIXELS = TILE * TILE
+
+NEAR_DEPTH = 0.2
+"""Gaussians whose centre is at this depth or nearer are culled."""
+PIXEL_VARIANCE = 0.3
+"""Added to the diagonal of the 2D covariance, in px^2."""
+JACOBIAN_LIMIT = 1.3
+"""The Jacobian is taken at most this many half image sides away from the optical axis."""
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+LOG2_MIN_ALPHA = -math.log2(255.0)
+"""Logarithm to base 2 of the smallest alpha that is blended, 1/255."""
+
+# A splat is a projected Gaussian. With an offset (dx, dy) in pixels from its centre, its alpha before the cap is
+#     2^(LOG2_OPACITY - u^2 - v^2),  u = FACTOR_XX dx + FACTOR_XY dy,  v = FACTOR_YY dy,
+# so the factors are the triangular root of the inverse covariance times sqrt(log2(e) / 2). As a sum of squares the
+# exponent cannot turn positive by rounding, where the usual quadratic form can.
+SPLAT = 16
+"""Floats of a splat, one line of the cache in float32."""
+(
+    CENTRE_X,  # pixels; the first pixel's centre is at 0
+    CENTRE_Y,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    LOG2_OPACITY,
+    RED,
+    GREEN,
+    BLUE,
+    REACH,  # alpha is under 1/255 where u^2 + v^2 exceeds this, in spite of rounding
+    RIDGE_X,  # dx where u^2 + v^2 is least for a given dy, over dy
+    RIDGE_Y,  # dy where u^2 + v^2 is least for a given dx, over dx
+    RED_FREE,  # 1 where the colour map passes gradients, 0 where it clamps
+    GREEN_FREE,
+    BLUE_FREE,
+    OPACITY,
+) = range(SPLAT)
+
+FACTOR_SCALE = math.sqrt(math.log2(math.e) / 2)
+"""What the factors carry beside the root of the inverse covariance."""
+
+# What the backward pass of a tile says about a splat: sums over pixels of the derivative d of the loss with respect to
+# the natural logarithm of alpha before the cap, times polynomials in u and v.
+SLOT = 16
+"""Floats of the gradient of one splat in one tile."""
+(
+    SUM_RED,  # derivative by the colour
+    SUM_GREEN,
+    SUM_BLUE,
+    SUM_1,
+    SUM_U,
+    SUM_V,
+    SUM_UU,
+    SUM_UV,
+    SUM_VV,
+    SUM_ABS_X,  # |d u|
+    SUM_ABS_Y,  # |d (FACTOR_XY u + FACTOR_YY v)|
+) = range(11)
+
+# A camera as the kernels take it: rotation and translation from world to camera, row by row, then the rest.
+CAMERA = 21
+ROTATION, TRANSLATION, POSITION = 0, 9, 12
+FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, LIMIT_X, LIMIT_Y = range(15, CAMERA)

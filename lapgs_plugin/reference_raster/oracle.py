@@ -1,0 +1,387 @@
+"""The oracle: a 3D Gaussian Splatting rasterizer written to be read, differentiated by PyTorch's autograd.
+
+Everything else that renders is checked against it. It states the semantics of the CUDA rasterizers of the 3DGS family:
+
+    projection   EWA splatting (Zwicker et al. 2002, eq. 29 and 31): Sigma' = J W Sigma W^T J^T, plus 0.3 px on the
+                 diagonal; pixel j of a row has the coordinate j, so a centre lands at fx X/Z + cx - 0.5
+    culling      depth <= 0.2, or no tile touched by [centre - radius, centre + radius], radius three sigma, rounded up
+    blending     per tile of 16x16 pixels, front to back by depth (ties by index):
+                 alpha = min(0.99, o exp(-q)), skipped under 1/255, ended before the transmittance would fall under 1e-4
+    background   blended last with the remaining transmittance
+
+Three sigma cut an opaque Gaussian at alpha = o exp(-4.5), before 1/255, in the pixels of tiles that its rectangle
+misses. That cut is part of the image.
+
+Gradients are those of the CUDA code. They differ from textbook differentiation of the image in two places, each marked
+DEPARTURE below. Two guards of the CUDA code against division by zero are left out: 1e-7 added to w, and to the squared
+determinant in the backward pass, where it shortens the gradient of the smallest Gaussians by one part in 80,000.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+
+TILE = 16
+"""Side of a tile in pixels."""
+NEAR_DEPTH = 0.2
+"""Gaussians whose centre is at this depth or nearer are culled."""
+PIXEL_VARIANCE = 0.3
+"""Added to the diagonal of the 2D covariance, in px^2: a Gaussian is never thinner than about a pixel."""
+JACOBIAN_LIMIT = 1.3
+"""The Jacobian is taken at most this many half image sides away from the optical axis."""
+RADIUS_SIGMAS = 3.0
+"""Radius of a footprint in standard deviations along its longer axis."""
+MIN_ROOT = 0.1
+"""Lower bound of the squared half difference of the 2D covariance's eigenvalues, in px^4."""
+MAX_RADIUS = 2**30
+"""Radii saturate here, in px, so that they fit int32."""
+MAX_ALPHA = 0.99
+MIN_ALPHA = 1 / 255
+MIN_TRANSMITTANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Projection:
+    """v Gaussians on the image plane, in the order of their index.
+
+    Attributes:
+        ids: (v,) their index in the field.
+        depths: (v,) camera-space z.
+        means2d: (v, 2) centres in pixel coordinates (the first pixel is at 0).
+        determinants: (v,) of the 2D covariances with the 0.3 px^2 added, in px^4.
+        conics: (v, 3) entries xx, xy, yy of the inverse covariance.
+        radii: (v,) three-sigma radii in whole pixels, in the field's float type.
+        rectangles: (v, 4) int64 tiles touched: x0, y0 (first), x1, y1 (one past the last).
+    """
+
+    ids: Tensor
+    depths: Tensor
+    means2d: Tensor
+    determinants: Tensor
+    conics: Tensor
+    radii: Tensor
+    rectangles: Tensor
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Which Gaussians each tile blends, front to back.
+
+    Attributes:
+        members: (i,) positions in the projection, tile after tile, in each tile by depth, ties by index.
+        counts: length of each tile's part of `members`, row by row of tiles.
+        columns, rows: number of tiles across and down.
+    """
+
+    members: Tensor
+    counts: list[int]
+    columns: int
+    rows: int
+
+
+class OracleRasterizer:
+    """Reference rasterizer in plain PyTorch: any device, float32 or float64, as the field's tensors are.
+
+    Each tile is computed again in the backward pass, so that memory holds the intermediates of one tile at a time.
+    """
+
+    @property
+    def name(self) -> str:
+        return "oracle"
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
+
+        Raises:
+            UserInputError: `sh_degree` is not one the field has, or `background` is not a colour.
+        """
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        if not 0 <= degree <= field.sh_degree:
+            raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
+        if background.shape != (3,):
+            raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
+        camera = camera.to(field.means.device, field.means.dtype)
+        background = background.to(field.means)  # (3,)
+
+        n = len(field)
+        seen = project(field, camera)
+        means2d = field.means.new_zeros(n, 2).index_put((seen.ids,), seen.means2d)  # (n, 2)
+        if means2d.requires_grad:
+            means2d.retain_grad()
+        absgrad2d = torch.zeros_like(means2d, requires_grad=False)  # (n, 2)
+        radii = torch.zeros(n, dtype=torch.int32, device=means2d.device)  # (n,)
+        radii[seen.ids] = seen.radii.to(torch.int32)
+
+        directions = torch.nn.functional.normalize(field.means[seen.ids] - camera.position, dim=-1)  # (v, 3)
+        splats = torch.cat(
+            [
+                means2d[seen.ids],  # (v, 2)
+                seen.conics,  # (v, 3)
+                torch.sigmoid(field.opacity_logits[seen.ids])[:, None],  # (v, 1)
+                sh_to_color(field.sh[seen.ids], directions, degree, signed=field.signed),  # (v, 3)
+            ],
+            dim=1,
+        )  # (v, 9)
+        lists = tile_lists(seen.depths, seen.rectangles, camera)
+        color, transmittance = _blend_tiles(splats, seen.ids, lists, absgrad2d)
+        height, width = camera.height, camera.width
+        color, transmittance = color[:, :height, :width], transmittance[:height, :width]
+        image = color + transmittance * background[:, None, None]  # (3, h, w)
+        return RenderResult(image, transmittance, radii, means2d, absgrad2d)
+
+
+def project(field: GaussianField, camera: Camera) -> Projection:
+    """EWA projection of the Gaussians that reach the image.
+
+    Args:
+        field: n Gaussians.
+        camera: with its pose on the field's device and in its precision.
+    """
+    # Found without gradients first: a Gaussian divided by a depth or determinant of zero must not enter the graph,
+    # where its zero gradient times infinity would be NaN.
+    with torch.no_grad():
+        everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device))
+        first, last = everyone.rectangles[:, :2], everyone.rectangles[:, 2:]  # (n, 2) each
+        seen = (everyone.depths > NEAR_DEPTH) & (everyone.determinants != 0) & (first < last).all(dim=1)  # (n,)
+    return _project_all(field, camera, everyone.ids[seen])
+
+
+def _project_all(field: GaussianField, camera: Camera, ids: Tensor) -> Projection:
+    """EWA projection of the Gaussians `ids`, whether they reach the image or not."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
+    points = field.means[ids] @ rotation.T + translation  # (v, 3) in camera coordinates
+    x, y, depths = points.unbind(-1)  # (v,) each
+    means2d = torch.stack(
+        [camera.fx * x / depths + camera.cx - 0.5, camera.fy * y / depths + camera.cy - 0.5], dim=-1
+    )  # (v, 2)
+
+    covariances3d = world_covariances(field.quaternions[ids], field.log_scales[ids])  # (v, 3, 3)
+    to_screen = projection_jacobians(points, camera) @ rotation  # (v, 2, 3)
+    covariances2d = to_screen @ covariances3d @ to_screen.mT  # (v, 2, 2)
+    xx = covariances2d[:, 0, 0] + PIXEL_VARIANCE  # (v,)
+    xy = covariances2d[:, 0, 1]  # (v,)
+    yy = covariances2d[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    determinants = xx * yy - xy * xy  # (v,)
+    conics = torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]  # (v, 3)
+
+    with torch.no_grad():
+        radii = footprint_radii(xx, yy, determinants)  # (v,)
+        rectangles = tile_rectangles(means2d, radii, camera)  # (v, 4)
+    return Projection(ids, depths, means2d, determinants, conics, radii, rectangles)
+
+
+def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
+    """Sigma = R S S^T R^T.
+
+    Args:
+        quaternions: (n, 4) wxyz, of any length.
+        log_scales: (n, 3) logarithms of the standard deviations.
+
+    Returns:
+        (n, 3, 3) covariances in world coordinates.
+    """
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # (n,) each
+    rotations = torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        dim=-1,
+    ).reshape(-1, 3, 3)  # fmt: skip
+    axes = rotations * torch.exp(log_scales)[:, None, :]  # (n, 3, 3) R S
+    return axes @ axes.mT
+
+
+def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
+    """Derivative of the pixel coordinates with respect to the camera-space point, taken at a point near the frustum.
+
+    Args:
+        points: (n, 3) in camera coordinates, in front of the camera.
+
+    Returns:
+        (n, 2, 3) Jacobians.
+    """
+    x, y, depth = points.unbind(-1)  # (n,) each
+    limit_x, limit_y = (JACOBIAN_LIMIT * tangent for tangent in camera.tan_half_fov)
+    # DEPARTURE: a coordinate clamped to the limit is limit * depth, but the CUDA code differentiates the Jacobian as if
+    # it were a constant: its backward pass zeroes the derivative by x and leaves that by the depth as for a free x.
+    x = torch.where((x / depth).abs() > limit_x, (limit_x * depth * x.sign()).detach(), x)
+    y = torch.where((y / depth).abs() > limit_y, (limit_y * depth * y.sign()).detach(), y)
+    zero = torch.zeros_like(depth)
+    return torch.stack(
+        [
+            camera.fx / depth, zero, -camera.fx * x / (depth * depth),
+            zero, camera.fy / depth, -camera.fy * y / (depth * depth),
+        ],
+        dim=-1,
+    ).reshape(-1, 2, 3)  # fmt: skip
+
+
+def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
+    """ceil(3 sqrt(lambda_max)) with the larger eigenvalue of the 2D covariance.
+
+    Args:
+        xx, yy: (n,) diagonal of the covariance in px^2.
+        determinant: (n,) of the covariance in px^4.
+
+    Returns:
+        (n,) whole pixels.
+    """
+    middle = (xx + yy) / 2  # (n,)
+    largest = middle + (middle * middle - determinant).clamp(min=MIN_ROOT).sqrt()  # (n,)
+    return torch.ceil(RADIUS_SIGMAS * largest.sqrt()).clamp(max=MAX_RADIUS)
+
+
+def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
+    """Tiles touched by [centre - radius, centre + radius].
+
+    As in the CUDA code a last tile is left out when centre + radius falls short of its second pixel.
+
+    Args:
+        means2d: (n, 2) centres in pixel coordinates.
+        radii: (n,) in pixels.
+
+    Returns:
+        (n, 4) int64: x0, y0, x1, y1 in tiles, first inclusive, last exclusive, empty outside the image.
+    """
+    grid = means2d.new_tensor([-(-camera.width // TILE), -(-camera.height // TILE)])  # (2,) tiles across and down
+    first = torch.floor((means2d - radii[:, None]) / TILE)  # (n, 2)
+    last = torch.floor((means2d + radii[:, None] + (TILE - 1)) / TILE)  # (n, 2)
+    corners = torch.cat([first, last], dim=1)  # (n, 4)
+    # A centre that overflowed is not a number here; an empty rectangle culls it.
+    return corners.nan_to_num(0, math.inf, -math.inf).clamp(min=0).minimum(grid.repeat(2)).to(torch.int64)
+
+
+def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
+    """Every (tile, Gaussian) pair, sorted by tile, then depth, then index.
+
+    Args:
+        depths: (v,) camera-space z.
+        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` gives them.
+    """
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    order = torch.sort(depths.detach(), stable=True).indices  # (v,) front to back
+    x0, y0, x1, y1 = rectangles[order].unbind(-1)  # (v,) each
+    areas = (x1 - x0) * (y1 - y0)  # (v,)
+    which = torch.repeat_interleave(areas)  # (i,) position in `order`
+    within = torch.arange(len(which), device=order.device) - (areas.cumsum(0) - areas)[which]  # (i,) 0 ... area - 1
+    width = (x1 - x0)[which]  # (i,)
+    tiles = (y0[which] + within // width) * columns + x0[which] + within % width  # (i,)
+    by_tile = torch.sort(tiles, stable=True).indices  # (i,)
+    counts = torch.bincount(tiles, minlength=columns * rows).tolist()
+    return TileLists(order[which[by_tile]], counts, columns, rows)
+
+
+def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tensor) -> tuple[Tensor, Tensor]:
+    """Blend every tile and put the tiles together.
+
+    Args:
+        splats: (v, 9) centre (2), conic (3), opacity (1), colour (3).
+        ids: (v,) rows of `absgrad2d`.
+        absgrad2d: (n, 2) buffer filled during the backward pass.
+
+    Returns:
+        (3, 16 rows, 16 columns) colour over black, (16 rows, 16 columns) transmittance.
+    """
+    # One gather for all tiles: a gather for each would cost a gradient as large as the field for each.
+    parts = torch.split(splats[lists.members], lists.counts)  # (k, 9) for each tile
+    owners = torch.split(ids[lists.members], lists.counts)  # (k,) for each tile
+    steps = torch.arange(TILE, dtype=splats.dtype, device=splats.device)  # (16,)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)  # (256, 2) x, y
+    tiles = []
+    for index, (part, owner) in enumerate(zip(parts, owners, strict=True)):
+        row, column = divmod(index, lists.columns)
+        pixels = grid + grid.new_tensor([column * TILE, row * TILE])  # (256, 2)
+        blended = _decide(part, pixels)  # (256, k)
+        used = blended.any(dim=0).nonzero()[:, 0]  # (m,) the others would only cost memory for gradients of zero
+        blend = partial(_blend, pixels=pixels, blended=blended[:, used], ids=owner[used], absgrad2d=absgrad2d)
+        tiles.append(checkpoint(blend, part[used], use_reentrant=False, preserve_rng_state=False))
+    tiled = torch.stack(tiles).reshape(lists.rows, lists.columns, TILE, TILE, 4)
+    image = tiled.permute(4, 0, 2, 1, 3).reshape(4, lists.rows * TILE, lists.columns * TILE)
+    return image[:3], image[3]
+
+
+@torch.no_grad()
+def _decide(splats: Tensor, pixels: Tensor) -> Tensor:
+    """(p, k) True where a pixel blends a Gaussian: it is visible there, and reached before the pixel is finished.
+
+    Args:
+        splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
+        pixels: (p, 2) pixel coordinates.
+    """
+    centres, conics, opacities, _ = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
+    alphas = _alphas(centres - pixels[:, None], conics, opacities[:, 0])  # (p, k)
+    visible = alphas >= MIN_ALPHA  # (p, k)
+    behind = torch.cumprod(1 - alphas * visible, dim=1)  # (p, k) the transmittance if nothing ended a pixel
+    return visible & (behind >= MIN_TRANSMITTANCE)
+
+
+def _blend(splats: Tensor, pixels: Tensor, blended: Tensor, ids: Tensor, absgrad2d: Tensor) -> Tensor:
+    """C = sum_i c_i alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), over the Gaussians each pixel blends.
+
+    Args:
+        splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
+        pixels: (p, 2) pixel coordinates.
+        blended: (p, k) which Gaussians each pixel blends.
+        ids: (k,) rows of `absgrad2d`.
+        absgrad2d: (n, 2) buffer filled during the backward pass.
+
+    Returns:
+        (p, 4) colour C and the transmittance that is left.
+    """
+    centres, conics, opacities, colors = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
+    offsets = centres - pixels[:, None]  # (p, k, 2)
+    if offsets.requires_grad:
+        offsets.register_hook(  # type: ignore[no-untyped-call]  # torch leaves this method without types
+            lambda gradient: _accumulate_absolute(gradient, ids, absgrad2d)
+        )
+    alphas = _alphas(offsets, conics, opacities[:, 0]).masked_fill(~blended, 0)  # (p, k)
+    behind = torch.cumprod(1 - alphas, dim=1)  # (p, k)
+    transmittances = torch.cat([torch.ones_like(pixels[:, :1]), behind], dim=1)  # (p, k + 1)
+    color = (alphas * transmittances[:, :-1]) @ colors  # (p, 3)
+    return torch.cat([color, transmittances[:, -1:]], dim=1)
+
+
+def _alphas(offsets: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
+    """alpha = min(0.99, o exp(-q)) with q = d^T conic d / 2.
+
+    Args:
+        offsets: (p, k, 2) centre minus pixel.
+        conics: (k, 3) entries xx, xy, yy.
+        opacities: (k,).
+
+    Returns:
+        (p, k) alphas; 0 where q < 0, which a rounded conic that is not positive definite can bring about.
+    """
+    dx, dy = offsets.unbind(-1)  # (p, k) each
+    xx, xy, yy = conics.unbind(-1)  # (k,) each
+    power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy  # (p, k) = -q
+    return _cap(opacities * torch.exp(power.masked_fill(power.detach() > 0, -math.inf)))
+
+
+def _cap(alpha: Tensor) -> Tensor:
+    """min(alpha, 0.99).
+
+    DEPARTURE: the CUDA code's backward pass does not look at the cap, so the gradient passes straight through it.
+    """
+    return alpha - (alpha.detach() - MAX_ALPHA).clamp(min=0)
+
+
+def _accumulate_absolute(gradient: Tensor, ids: Tensor, absgrad2d: Tensor) -> None:
+    """Add the (p, k, 2) gradient's absolute value, summed over the pixels, to the rows `ids` of the buffer."""
+    absgrad2d.index_add_(0, ids, gradient.abs().sum(dim=0))

@@ -1,0 +1,149 @@
+"""Front to back: splats sorted by depth, then dealt to the tiles they cover."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.reference_raster._jit import jit
+from lapgs_plugin.reference_raster.lanes import at, fetch_add
+
+DIGIT_BITS = 11
+"""Bits that one round of the radix sort looks at."""
+DIGITS = 1 << DIGIT_BITS
+
+
+@jit
+def count_pairs(n: int, boxes: NDArray[np.int32], first_pair: NDArray[np.int64]) -> int:
+    """Number the pairs of a splat and a tile, splat after splat.
+
+    Args:
+        boxes: (4 * m,) tiles covered: first across, first down, one past the last across, down.
+        first_pair: (n + 1,) filled with the number of each splat's first pair, then their total.
+
+    Returns:
+        Splats that cover a tile.
+    """
+    m = boxes.size // 4
+    total, shown = 0, 0
+    for i in range(n):
+        first_pair[i] = total
+        area = (boxes[i + 2 * m] - boxes[i]) * np.int64(boxes[i + 3 * m] - boxes[i + m])
+        if area > 0:
+            total += area
+            shown += 1
+    first_pair[n] = total
+    return shown
+
+
+@jit
+def sort_by_depth(
+    first_pair: NDArray[np.int64],  # (n + 1,)
+    keys: NDArray[np.unsignedinteger],  # (n,) bits of the depths: positive floats sort as integers
+    order: NDArray[np.int32],  # (shown,) filled: splats that cover a tile, nearest first, ties by index
+    spare: NDArray[np.int32],  # (shown,)
+    sorted_keys: NDArray[np.unsignedinteger],  # (shown,)
+    spare_keys: NDArray[np.unsignedinteger],  # (shown,)
+) -> None:
+    """Stable radix sort, least significant digit first."""
+    rounds = (keys.itemsize * 8 + DIGIT_BITS - 1) // DIGIT_BITS
+    counts = np.zeros((rounds, DIGITS), np.int64)
+    shown = 0
+    for i in range(keys.size):
+        if first_pair[i + 1] > first_pair[i]:
+            key = keys[i]
+            order[shown] = i
+            sorted_keys[shown] = key
+            shown += 1
+            for r in range(rounds):
+                counts[r, np.int64(key >> (r * DIGIT_BITS)) & (DIGITS - 1)] += 1
+    source, source_keys, target, target_keys = order, sorted_keys, spare, spare_keys
+    for r in range(rounds):
+        if counts[r].max() == shown:
+            continue  # all have the same digit
+        total = 0
+        for digit in range(DIGITS):
+            count = counts[r, digit]
+            counts[r, digit] = total
+            total += count
+        for i in range(shown):
+            key = source_keys[i]
+            digit = np.int64(key >> (r * DIGIT_BITS)) & (DIGITS - 1)
+            target[counts[r, digit]] = source[i]
+            target_keys[counts[r, digit]] = key
+            counts[r, digit] += 1
+        source, source_keys, target, target_keys = target, target_keys, source, source_keys
+    if source is not order:
+        order[:] = source
+
+
+@jit
+def count_tiles(
+    counter: NDArray[np.int64],  # (1,) zero
+    order: NDArray[np.int32],  # (shown,)
+    boxes: NDArray[np.int32],  # (4 * m,)
+    tiles_x: int,
+    counts: NDArray[np.int64],  # (chunks, tiles) zero
+) -> None:
+    """How many splats of each chunk of the order cover each tile."""
+    m = boxes.size // 4
+    chunks = counts.shape[0]
+    while True:
+        chunk = fetch_add(counter, 1)
+        if chunk >= chunks:
+            break
+        row = counts[chunk]
+        for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
+            i = np.int64(at(order, rank))
+            for y in range(at(boxes, i + m), at(boxes, i + 3 * m)):
+                for x in range(at(boxes, i), at(boxes, i + 2 * m)):
+                    row[y * tiles_x + x] += 1
+
+
+@jit
+def start_tiles(counts: NDArray[np.int64], tile_start: NDArray[np.int64]) -> None:
+    """Turn counts of (chunk, tile) into where each chunk's part of each tile's list begins.
+
+    Args:
+        counts: (chunks, tiles), replaced by the beginnings.
+        tile_start: (tiles + 1,) filled with the beginnings of the tiles' lists, then the length of all.
+    """
+    total = 0
+    for tile in range(counts.shape[1]):
+        tile_start[tile] = total
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = total
+            total += count
+    tile_start[counts.shape[1]] = total
+
+
+@jit
+def deal_to_tiles(
+    counter: NDArray[np.int64],  # (1,) zero
+    order: NDArray[np.int32],  # (shown,)
+    boxes: NDArray[np.int32],  # (4 * m,)
+    tiles_x: int,
+    starts: NDArray[np.int64],  # (chunks, tiles), used up
+    first_pair: NDArray[np.int64],  # (n + 1,)
+    members: NDArray[np.int32],  # (pairs,) filled: splats, tile after tile, nearest first
+    places: NDArray[np.int32],  # (pairs,) filled: where in `members` each splat's pairs are, splat after splat
+) -> None:
+    """Stable counting sort of the pairs by tile."""
+    m = boxes.size // 4
+    chunks = starts.shape[0]
+    while True:
+        chunk = fetch_add(counter, 1)
+        if chunk >= chunks:
+            break
+        row = starts[chunk]
+        for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
+            i = np.int64(at(order, rank))
+            pair = at(first_pair, i)
+            for y in range(at(boxes, i + m), at(boxes, i + 3 * m)):
+                for x in range(at(boxes, i), at(boxes, i + 2 * m)):
+                    place = row[y * tiles_x + x]
+                    row[y * tiles_x + x] = place + 1
+                    members[place] = i
+                    places[pair] = place
+                    pair += 1

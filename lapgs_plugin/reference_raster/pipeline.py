@@ -1,0 +1,248 @@
+"""The CPU rasterizer on plain arrays: what `fast` wraps for autograd and stand-ins for CUDA modules can wrap otherwise.
+
+    project_kernels.project -> ordering_kernels -> tile_kernels.blend
+    tile_kernels.blend_backward -> projection_kernels.project_backward
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.reference_raster import ordering_kernels, projection_kernels, tile_kernels
+from lapgs_plugin.reference_raster.buffers import empty
+from lapgs_plugin.reference_raster.lanes import WIDTH, Floats
+from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, SLOT, SPLAT, TILE
+from lapgs_plugin.reference_raster.threads import num_threads, parallel
+
+
+@dataclass(frozen=True)
+class View:
+    """An image size and a camera.
+
+    Attributes:
+        width, height: in pixels.
+        camera: as `layout.CAMERA` says.
+    """
+
+    width: int
+    height: int
+    camera: Floats
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Tiles across and down."""
+        return -(-self.width // TILE), -(-self.height // TILE)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """n Gaussians as contiguous arrays of one float type.
+
+    Attributes:
+        means: (n, 3) centres in world coordinates.
+        quats: (n, 4) rotations, wxyz.
+        scales: (n, 3) standard deviations in world units, or their logarithms.
+        opacities: (n,) opacities, or their logits.
+        sh: (n, k, 3) spherical-harmonic coefficients, k of 1, 4, 9, 16; or None if there are colours.
+        colors: (n, 3) colours, or None if there are coefficients.
+        raw: True for logarithms, logits and quaternions of any length; False for activated values.
+        signed: True if the colour is the SH value itself, False for max(value + 0.5, 0). Given colours are left alone.
+        sh_degree: highest degree evaluated, not more than k has.
+    """
+
+    means: Floats
+    quats: Floats
+    scales: Floats
+    opacities: Floats
+    sh: Floats | None
+    colors: Floats | None
+    raw: bool
+    signed: bool
+    sh_degree: int
+
+    @property
+    def columns(self) -> int:
+        """Coefficients of a Gaussian, all channels."""
+        return 0 if self.sh is None else self.sh.shape[1] * 3
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """An image, and what its backward pass needs.
+
+    Attributes:
+        image: (3, height, width).
+        transmittance: (height, width).
+        radii: (n,) int32.
+        centres: (n, 2).
+    """
+
+    image: Floats
+    transmittance: Floats
+    radii: NDArray[np.int32]
+    centres: Floats
+    _kept: _Kept | None
+
+
+@dataclass(frozen=True)
+class _Kept:
+    splats: Floats
+    background: Floats
+    first_pair: NDArray[np.int64]
+    places: NDArray[np.int32]
+    tile_start: NDArray[np.int64]
+    members: NDArray[np.int32]
+    hits: NDArray[np.uint16]
+    reached: NDArray[np.int64]
+    final: Floats
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Derivatives of the loss by each array of `Gaussians`, in its shape, by the projected centres in pixels, and sums
+    over pixels of the latter's absolute value."""
+
+    means: Floats
+    quats: Floats
+    scales: Floats
+    opacities: Floats
+    sh: Floats | None
+    colors: Floats | None
+    centres: Floats
+    absolute_centres: Floats
+
+
+def render(gaussians: Gaussians, view: View, background: Floats, *, keep: bool) -> Rendering:
+    """Render n Gaussians.
+
+    Args:
+        background: (3,) in the Gaussians' float type.
+        keep: whether `gradients` will be asked for.
+    """
+    n, kind = len(gaussians.means), gaussians.means.dtype
+    padded = -(-n // WIDTH) * WIDTH
+    tiles_x, tiles_y = view.tiles
+    splats, centres, depths = empty(padded * SPLAT, kind), empty(padded * 2, kind), empty(padded, kind)
+    boxes, radii = empty(padded * 4, np.int32), empty(padded, np.int32)
+    parallel(
+        projection_kernels.project, n, *_arrays(gaussians), gaussians.raw, gaussians.signed, gaussians.sh_degree,
+        view.camera, tiles_x, tiles_y, splats, boxes, radii, depths, centres,
+    )  # fmt: skip
+    first_pair, places, tile_start, members = _order(n, boxes, depths, tiles_x, tiles_x * tiles_y)
+
+    pairs, tiles, pixels = len(members), tiles_x * tiles_y, view.width * view.height
+    image, transmittance = empty(3 * pixels, kind), empty(pixels, kind)
+    reached = np.zeros(tiles, np.int64)
+    hits = empty(pairs if keep else 0, np.uint16)
+    final = empty(tiles * tile_kernels.FINAL if keep else 0, kind)
+    parallel(
+        tile_kernels.blend, view.width, view.height, tiles_x, tile_start, members, splats, background, _offsets(kind),
+        image, transmittance, keep, hits, reached, final,
+    )  # fmt: skip
+    kept = _Kept(splats, background, first_pair, places, tile_start, members, hits, reached, final) if keep else None
+    return Rendering(
+        image.reshape(3, view.height, view.width),
+        transmittance.reshape(view.height, view.width),
+        radii[:n],
+        centres[: n * 2].reshape(n, 2),
+        kept,
+    )
+
+
+def gradients(
+    gaussians: Gaussians, view: View, rendering: Rendering, grad_image: Floats, grad_transmittance: Floats | None
+) -> Gradients:
+    """Gradients of a loss of the image that `render` made of the same Gaussians, asked to keep what this needs.
+
+    Args:
+        grad_image: (3, height, width) derivative of the loss by the image.
+        grad_transmittance: (height, width) that by the transmittance, or None if the loss does not depend on it.
+    """
+    kept = rendering._kept
+    assert kept is not None, "rendered without keep=True"
+    n, kind = len(gaussians.means), gaussians.means.dtype
+    padded = -(-n // WIDTH) * WIDTH
+    slots = empty(len(kept.members) * SLOT, kind)
+    nothing = np.empty(0, kind)
+    parallel(
+        tile_kernels.blend_backward, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
+        kept.background, _offsets(kind), kept.hits, kept.reached, kept.final, grad_image.reshape(-1),
+        nothing if grad_transmittance is None else grad_transmittance.reshape(-1), slots,
+    )  # fmt: skip
+    means, quats, scales, opacities, centres, absolute_centres = (
+        empty(padded * columns, kind) for columns in (3, 4, 3, 1, 2, 2)
+    )
+    sh = empty(padded * gaussians.columns, kind)
+    colors = empty(0 if gaussians.colors is None else padded * 3, kind)
+    flat_means, flat_quats, flat_scales, _, flat_sh, _, columns = _arrays(gaussians)
+    parallel(
+        projection_kernels.project_backward, n, flat_means, flat_quats, flat_scales, flat_sh, columns, gaussians.raw,
+        gaussians.sh_degree, view.camera, kept.splats, kept.first_pair, kept.places, slots, means, quats, scales,
+        opacities, sh, colors, centres, absolute_centres,
+    )  # fmt: skip
+    return Gradients(
+        means[: n * 3].reshape(n, 3),
+        quats[: n * 4].reshape(n, 4),
+        scales[: n * 3].reshape(n, 3),
+        opacities[:n],
+        None if gaussians.sh is None else sh[: n * columns].reshape(gaussians.sh.shape),
+        None if gaussians.colors is None else colors[: n * 3].reshape(n, 3),
+        centres[: n * 2].reshape(n, 2),
+        absolute_centres[: n * 2].reshape(n, 2),
+    )
+
+
+def make_view(
+    width: int, height: int, world_to_camera: Floats, focal: tuple[float, float], principal: tuple[float, float]
+) -> View:
+    """A view from a camera as `lapgs_plugin.camera.Camera` describes one.
+
+    Args:
+        world_to_camera: (4, 4), in the Gaussians' float type.
+        focal, principal: in pixels, x and y.
+    """
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    limits = JACOBIAN_LIMIT * width / (2 * focal[0]), JACOBIAN_LIMIT * height / (2 * focal[1])
+    parts = [rotation.ravel(), translation, -rotation.T @ translation, focal, principal, limits]
+    return View(width, height, np.concatenate(parts).astype(world_to_camera.dtype))
+
+
+def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, int]:
+    """Flat arrays as the projection kernels take them; colours or coefficients that are not there are empty."""
+    sh, colors = (
+        np.empty(0, gaussians.means.dtype) if array is None else array.reshape(-1)
+        for array in (gaussians.sh, gaussians.colors)
+    )
+    means, quats, scales = (a.reshape(-1) for a in (gaussians.means, gaussians.quats, gaussians.scales))
+    return means, quats, scales, gaussians.opacities, sh, colors, gaussians.columns
+
+
+def _order(
+    n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
+    """The tiles' lists of splats, front to back; see `ordering_kernels`."""
+    first_pair = empty(n + 1, np.int64)
+    shown = ordering_kernels.count_pairs(n, boxes, first_pair)
+    pairs = int(first_pair[n])
+    keys = depths[:n].view(np.uint32 if depths.itemsize == 4 else np.uint64)
+    order, spare = empty(shown, np.int32), empty(shown, np.int32)
+    ordering_kernels.sort_by_depth(
+        first_pair, keys, order, spare, empty(shown, keys.dtype), empty(shown, keys.dtype)
+    )  # fmt: skip
+    starts = np.zeros((num_threads(), tiles), np.int64)
+    tile_start = np.empty(tiles + 1, np.int64)
+    members, places = empty(pairs, np.int32), empty(pairs, np.int32)
+    parallel(ordering_kernels.count_tiles, order, boxes, tiles_x, starts)
+    ordering_kernels.start_tiles(starts, tile_start)
+    parallel(ordering_kernels.deal_to_tiles, order, boxes, tiles_x, starts, first_pair, members, places)
+    return first_pair, places, tile_start, members
+
+
+@lru_cache
+def _offsets(kind: Any) -> Floats:
+    return tile_kernels.pixel_offsets(kind)

@@ -1,0 +1,321 @@
+"""Where an image hangs on a comparison that rounding can turn: the pixels and Gaussians two correct rasterizers may
+disagree on.
+
+A rasterizer decides: in front or behind, in which tiles, in which order, visible or skipped, last one or one more. Two
+implementations that round differently may decide differently where the compared numbers agree to within rounding, and
+then differ by far more than rounding. Everywhere else they must agree, so comparisons are made outside this mask.
+
+The mask is computed in float64 with a running first-order error bound. `tolerance` is the relative error of an
+elementary result (a dot product of a few terms); each quantity gets the bound that follows from its own formula,
+including cancellation: a needle's 2D determinant, say, is known far less well than its entries. A pixel is masked when,
+before the transmittance has surely fallen under its limit, for any Gaussian
+    - alpha is within its bound of 1/255, or of the cap 0.99 and not surely over it,
+    - the exponent's sign is open (an indefinite conic is skipped),
+    - the transmittance is within its bound of 1e-4,
+    - it is in the pixel's tile or not depending on the bounds of centre, radius (rounded up) and depth (culled at 0.2),
+    - the next Gaussian that contributes is not surely behind it. Exactly equal centres are not masked: their depths are
+      computed from the same numbers, so they tie in any implementation and the index decides.
+Of a Gaussian the radius may be open, and its gradient where it has a kink: a colour channel at the clamp, or a centre
+at the limit where the Jacobian stops following it.
+
+Gradients mix pixels; compare those of a loss whose weights vanish on the masked pixels, for Gaussians not at a kink.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.reference_raster.oracle import (
+    JACOBIAN_LIMIT,
+    MAX_ALPHA,
+    MAX_RADIUS,
+    MIN_ALPHA,
+    MIN_ROOT,
+    MIN_TRANSMITTANCE,
+    NEAR_DEPTH,
+    PIXEL_VARIANCE,
+    RADIUS_SIGMAS,
+    TILE,
+    projection_jacobians,
+    tile_lists,
+    tile_rectangles,
+    world_covariances,
+)
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_basis
+
+ROUNDINGS = 8
+"""Default tolerance in units of the float type's epsilon: the longest dot products of the projection."""
+
+
+@dataclass(frozen=True)
+class ThresholdMask:
+    """What two correct implementations may legitimately disagree on.
+
+    Attributes:
+        pixels: (h, w) True where a decision within rounding changes the pixel.
+        radii: (n,) True where a Gaussian's radius, or whether it is culled, is within rounding.
+        kinks: (n,) True where a Gaussian's gradient has a kink within rounding.
+    """
+
+    pixels: Tensor
+    radii: Tensor
+    kinks: Tensor
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """The v Gaussians that might reach the image, each quantity with the bound of its error, in float64.
+
+    Attributes:
+        ids: (v,) their index in the field.
+        means: (v, 3) centres in world coordinates.
+        depths, depth_errors: (v,) camera-space z; the error is 0 where every implementation computes the same bits.
+        means2d, mean_errors: (v, 2) centres in pixels.
+        conics: (v, 3) xx, xy, yy of the inverse covariance.
+        conic_errors: (v,) relative error of the quadratic form with this conic.
+        opacities, opacity_errors: (v,) the error is relative.
+        surely: (v, 4) tiles the Gaussian touches however it is rounded: x0, y0, x1, y1; empty if it may be culled.
+        possibly: (v, 4) tiles it touches with some rounding.
+        open_radii, kinks: (v,) as in `ThresholdMask`.
+    """
+
+    ids: Tensor
+    means: Tensor
+    depths: Tensor
+    depth_errors: Tensor
+    means2d: Tensor
+    mean_errors: Tensor
+    conics: Tensor
+    conic_errors: Tensor
+    opacities: Tensor
+    opacity_errors: Tensor
+    surely: Tensor
+    possibly: Tensor
+    open_radii: Tensor
+    kinks: Tensor
+
+
+@torch.no_grad()
+def threshold_mask(
+    field: GaussianField, camera: Camera, *, sh_degree: int | None = None, tolerance: float | None = None
+) -> ThresholdMask:
+    """Pixels and Gaussians whose rendering hangs on rounding.
+
+    Args:
+        field: n Gaussians, with exactly the numbers that are rendered.
+        camera: the view.
+        sh_degree: highest SH degree rendered; None means all.
+        tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
+    """
+    if tolerance is None:
+        tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
+    field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
+    bounded = _project(field, camera, field.sh_degree if sh_degree is None else sh_degree, tolerance)
+    radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
+    radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
+    return ThresholdMask(_open_pixels(bounded, camera, tolerance), radii, kinks)
+
+
+def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float) -> _Bounded:
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
+    points = field.means @ rotation.T + translation  # (n, 3)
+    errors = tolerance * (field.means.abs() @ rotation.abs().T + translation.abs())  # (n, 3)
+    ids = (points[:, 2] > NEAR_DEPTH - errors[:, 2] - tolerance).nonzero()[:, 0]  # (v,)
+    points, errors = points[ids], errors[ids]  # (v, 3)
+    depths = points[:, 2]  # (v,)
+    slopes = points[:, :2] / depths[:, None]  # (v, 2)
+    slope_errors = (errors[:, :2] + slopes.abs() * errors[:, 2:]) / depths[:, None] + tolerance * slopes.abs()  # (v, 2)
+    focal = points.new_tensor([camera.fx, camera.fy])  # (2,)
+    principal = points.new_tensor([camera.cx - 0.5, camera.cy - 0.5])  # (2,)
+    means2d = focal * slopes + principal  # (v, 2)
+    mean_errors = focal * slope_errors + tolerance * (means2d.abs() + principal.abs())  # (v, 2)
+
+    relative = tolerance + 4 * errors.norm(dim=1) / depths  # (v,) error of the Jacobian, twice in the covariance
+    shapes = _shapes(field, ids, points, camera, relative, tolerance)
+    may_be_culled = (depths - NEAR_DEPTH <= errors[:, 2] + tolerance) | shapes.degenerate  # (v,)
+    surely, possibly = _tiles(means2d, mean_errors, shapes, camera)  # (v, 4) each
+    surely = surely * (~may_be_culled)[:, None]  # (v, 4)
+    touched, surely_touched = _area(possibly) > 0, _area(surely) > 0  # (v,) each
+    open_radii = touched & ((shapes.smallest_radii != shapes.largest_radii) | ~surely_touched)  # (v,)
+
+    limits = points.new_tensor(camera.tan_half_fov) * JACOBIAN_LIMIT  # (2,)
+    at_limit = ((slopes.abs() - limits).abs() <= slope_errors + tolerance * limits).any(1)  # (v,)
+    kinks = touched & (at_limit | _at_clamp(field, camera, ids, degree, tolerance))  # (v,)
+    # A row of the rotation that only picks a coordinate makes the depth one exactly rounded sum: the same bits for all.
+    axis_aligned = bool((rotation[2].abs() == 1).any())
+    logits = field.opacity_logits[ids]  # (v,)
+    return _Bounded(
+        ids=ids,
+        means=field.means[ids],
+        depths=depths,
+        depth_errors=torch.zeros_like(depths) if axis_aligned else errors[:, 2],
+        means2d=means2d,
+        mean_errors=mean_errors,
+        conics=shapes.conics,
+        conic_errors=shapes.conic_errors,
+        opacities=torch.sigmoid(logits),
+        opacity_errors=tolerance * (1 + logits.abs()),
+        surely=surely,
+        possibly=possibly,
+        open_radii=open_radii,
+        kinks=kinks,
+    )
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """The v Gaussians' footprints.
+
+    Attributes:
+        conics: (v, 3) xx, xy, yy of the inverse covariance.
+        conic_errors: (v,) relative error of the quadratic form with this conic.
+        smallest_radii, largest_radii: (v,) whole pixels.
+        degenerate: (v,) True where the determinant may round to 0.
+    """
+
+    conics: Tensor
+    conic_errors: Tensor
+    smallest_radii: Tensor
+    largest_radii: Tensor
+    degenerate: Tensor
+
+
+def _shapes(
+    field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float
+) -> _Shapes:
+    """Footprints of the Gaussians `ids` at (v, 3) camera-space `points`; `relative` (v,) is the Jacobians' error."""
+    jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
+    to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
+    covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
+    xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    xy = covariances[:, 0, 1]  # (v,)
+    # Sigma' is a sum of terms as large as the longest axis seen from the side, whatever is left of them.
+    largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + PIXEL_VARIANCE
+    errors = largest_term * relative  # (v,) of each entry of the covariance
+    determinants = xx * yy - xy * xy  # (v,)
+    determinant_errors = tolerance * (xx * yy + xy * xy)  # (v,) of the subtraction alone
+
+    middle = (xx + yy) / 2  # (v,)
+    squared = (middle * middle - determinants).clamp(min=MIN_ROOT)  # (v,)
+    squared_errors = 4 * middle * errors + tolerance * middle * middle + determinant_errors  # (v,)
+    root_errors = (squared_errors / squared.sqrt()).minimum(squared_errors.sqrt())  # (v,)
+    largest = middle + squared.sqrt()  # (v,) eigenvalue
+    smallest = determinants.abs() / largest  # (v,) eigenvalue
+    radii = RADIUS_SIGMAS * largest.sqrt()  # (v,) before they are rounded up
+    radius_errors = RADIUS_SIGMAS * (errors + root_errors) / largest.sqrt() + tolerance * radii  # (v,)
+    return _Shapes(
+        conics=torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None],
+        conic_errors=2 * errors / smallest + determinant_errors / determinants.abs(),
+        smallest_radii=torch.ceil(radii - radius_errors).clamp(max=MAX_RADIUS),
+        largest_radii=torch.ceil(radii + radius_errors).clamp(max=MAX_RADIUS),
+        degenerate=determinants.abs() <= determinant_errors + 4 * middle * errors,
+    )
+
+
+def _tiles(means2d: Tensor, errors: Tensor, shapes: _Shapes, camera: Camera) -> tuple[Tensor, Tensor]:
+    """(v, 4) tiles that each Gaussian touches whatever the (v, 2) errors of its centre are, and those it may touch."""
+    extremes = torch.stack(
+        [
+            tile_rectangles(means2d + side * errors, radii, camera)
+            for radii in (shapes.smallest_radii, shapes.largest_radii)
+            for side in (-1, 1)
+        ]
+    )  # (4, v, 4)
+    low, high = extremes.amin(0), extremes.amax(0)  # (v, 4)
+    return torch.cat([high[:, :2], low[:, 2:]], dim=1), torch.cat([low[:, :2], high[:, 2:]], dim=1)
+
+
+def _area(rectangles: Tensor) -> Tensor:
+    """(v,) number of tiles of (v, 4) rectangles."""
+    return (rectangles[:, 2:] - rectangles[:, :2]).clamp(min=0).prod(dim=1)
+
+
+def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, tolerance: float) -> Tensor:
+    """(v,) True where a colour channel is within rounding of 0, where an unsigned field clamps."""
+    if field.signed:
+        return torch.zeros(len(ids), dtype=torch.bool, device=ids.device)
+    offsets = field.means[ids] - camera.position  # (v, 3)
+    basis = sh_basis(torch.nn.functional.normalize(offsets, dim=-1), degree)[:, :, None]  # (v, k, 1)
+    sh = field.sh[ids, : basis.shape[1]]  # (v, k, 3)
+    values = (basis * sh).sum(1) + 0.5  # (v, 3)
+    # The direction is a difference of positions, so its relative error grows as the Gaussian nears the camera.
+    positions = (field.means[ids].abs() + camera.position.abs()).sum(1)  # (v,)
+    steepness = 1 + degree * (1 + positions / offsets.norm(dim=1))  # (v,)
+    errors = tolerance * (0.5 + steepness[:, None] * sh.abs().sum(1))  # (v, 3)
+    return torch.any(values.abs() <= errors, dim=1)
+
+
+def _open_pixels(bounded: _Bounded, camera: Camera, tolerance: float) -> Tensor:
+    """(h, w) True where a decision is open."""
+    lists = tile_lists(bounded.depths, bounded.possibly, camera)
+    offsets = torch.arange(TILE, dtype=torch.float64, device=bounded.depths.device)  # (16,)
+    mask = torch.zeros(lists.rows, lists.columns, TILE, TILE, dtype=torch.bool, device=bounded.depths.device)
+    for index, members in enumerate(torch.split(lists.members, lists.counts)):
+        row, column = divmod(index, lists.columns)
+        y, x = torch.meshgrid(offsets + row * TILE, offsets + column * TILE, indexing="ij")  # (16, 16) each
+        pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)  # (256, 2)
+        x0, y0, x1, y1 = bounded.surely[members].unbind(-1)  # (k,) each
+        surely_here = (x0 <= column) & (column < x1) & (y0 <= row) & (row < y1)  # (k,)
+        mask[row, column] = _open_in_tile(bounded, members, surely_here, pixels, tolerance).reshape(TILE, TILE)
+    image = mask.permute(0, 2, 1, 3).reshape(lists.rows * TILE, lists.columns * TILE)
+    return image[: camera.height, : camera.width]
+
+
+def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixels: Tensor, tolerance: float) -> Tensor:
+    """Which pixels of a tile have an open decision.
+
+    Args:
+        members: (k,) rows of `bounded` that may be in the tile, by depth.
+        surely_here: (k,) False for those whose presence is open.
+        pixels: (p, 2) pixel coordinates.
+
+    Returns:
+        (p,) bool.
+    """
+    low, middle, high, sign_open = _alphas(bounded, members, pixels, tolerance)  # (p, k) each
+    maybe_visible = high >= MIN_ALPHA  # (p, k)
+    alpha = torch.where(maybe_visible, middle.clamp(max=MAX_ALPHA), 0)  # (p, k)
+    alpha_errors = torch.where(maybe_visible, high.clamp(max=MAX_ALPHA) - low.clamp(max=MAX_ALPHA), 0)  # (p, k)
+    behind = torch.cumprod(1 - alpha, dim=1)  # (p, k) transmittance behind each Gaussian
+    behind_errors = (alpha_errors / (1 - alpha) + tolerance * maybe_visible).cumsum(1)  # (p, k) relative
+    before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)  # (p, k)
+    before_errors = torch.cat([torch.zeros_like(behind[:, :1]), behind_errors[:, :-1]], dim=1)  # (p, k)
+    reached = before * (1 + before_errors) >= MIN_TRANSMITTANCE  # (p, k)
+
+    presence = (low < MIN_ALPHA) | sign_open | ~surely_here  # (p, k)
+    at_cap = (low <= MAX_ALPHA) & (high >= MAX_ALPHA)  # (p, k)
+    at_stop = (behind - MIN_TRANSMITTANCE).abs() <= behind * behind_errors  # (p, k)
+    decisions = presence | at_cap | at_stop | _ties(bounded, members, maybe_visible)  # (p, k)
+    return (decisions & maybe_visible & reached).any(1)
+
+
+def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float) -> tuple[Tensor, ...]:
+    """o exp(-q) before the cap: lower bound, value, upper bound, and whether the sign of q is open; (p, k) each."""
+    dx, dy = (bounded.means2d[members] - pixels[:, None]).unbind(-1)  # (p, k) each
+    xx, xy, yy = bounded.conics[members].unbind(-1)  # (k,) each
+    q = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (p, k)
+    terms = 0.5 * (xx * dx * dx + yy * dy * dy) + (xy * dx * dy).abs()  # (p, k)
+    shift_x, shift_y = bounded.mean_errors[members].unbind(-1)  # (k,) each
+    shifted = (xx * dx + xy * dy).abs() * shift_x + (xy * dx + yy * dy).abs() * shift_y  # (p, k) |grad q| . error
+    q_errors = q * bounded.conic_errors[members] + tolerance * (1 + terms) + shifted  # (p, k)
+    opacities, relative = bounded.opacities[members], bounded.opacity_errors[members]  # (k,) each
+    low = opacities * (1 - relative) * torch.exp(-q - q_errors)  # (p, k)
+    high = opacities * (1 + relative) * torch.exp((q_errors - q).clamp(max=0))  # (p, k)
+    return low, opacities * torch.exp(-q), high, q < tolerance * terms
+
+
+def _ties(bounded: _Bounded, members: Tensor, visible: Tensor) -> Tensor:
+    """(p, k) True where a Gaussian is not surely behind the one that contributes before it in that pixel."""
+    order = torch.arange(len(members), device=members.device).expand_as(visible)  # (p, k)
+    latest = torch.where(visible, order, -1).cummax(dim=1).values  # (p, k)
+    previous = torch.cat([torch.full_like(latest[:, :1], -1), latest[:, :-1]], dim=1)  # (p, k), -1: none
+    depths, errors = bounded.depths[members], bounded.depth_errors[members]  # (k,) each
+    close = depths - depths[previous] < errors + errors[previous]  # (p, k)
+    means = bounded.means[members]  # (k, 3)
+    same_centre = (means == means[previous]).all(-1)  # (p, k)
+    return (previous >= 0) & close & ~same_centre

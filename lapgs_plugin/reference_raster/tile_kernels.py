@@ -1,0 +1,466 @@
+"""Blending splats in tiles, forward and backward.
+
+A tile is worked on by one thread, in 16 blocks of 4x4 pixels, each one vector. Splats that the tile's list holds but no
+pixel of a block sees are left out exactly: the least u^2 + v^2 over the block's rectangle has a closed form, and one
+vector, with a block in each lane, tells it for the whole tile. Compact blocks waste fewer lanes than rows of 16 pixels.
+
+The forward pass goes block by block, so that the pixels stay in registers while a batch of splats passes. The backward
+pass goes splat by splat from the last one, so that a splat's gradient stays in registers while the blocks pass. Its
+pixels carry two numbers: the transmittance behind the splat and the loss's derivative by it, times it.
+
+Both passes evaluate alpha by the same expression and therefore agree, bit by bit, on which splats are blended.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.reference_raster._jit import inline, jit
+from lapgs_plugin.reference_raster.lanes import (
+    WIDTH,
+    Floats,
+    Lanes,
+    absolute,
+    any_lane,
+    at,
+    bits,
+    broadcast,
+    exp2,
+    fetch_add,
+    fma,
+    load,
+    lowest_bit,
+    maximum,
+    minimum,
+    select,
+    splat,
+    store,
+    store_sums,
+)
+from lapgs_plugin.reference_raster.layout import (
+    BLOCK,
+    BLOCKS,
+    BLUE,
+    CENTRE_X,
+    CENTRE_Y,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    GREEN,
+    LOG2_MIN_ALPHA,
+    LOG2_OPACITY,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    REACH,
+    RED,
+    RIDGE_X,
+    RIDGE_Y,
+    SLOT,
+    SPLAT,
+    TILE,
+    TILE_PIXELS,
+)
+
+BATCH = 256
+"""Splats that are dealt to the blocks of a tile at a time; their lists stay in the level-1 cache."""
+
+# Vectors of a block's state, forward: transmittance (negative once the pixel is opaque or if it is outside of the
+# image), colour, and how far down the tile's list the last blended splat is, counted from 1.
+_T, _R, _G, _B, _LAST, _FORWARD = range(6)
+# Backward: transmittance behind the splat, derivative by it times it, derivatives by the colour, last blended splat.
+_T_BEHIND, _REST, _GRAD_R, _GRAD_G, _GRAD_B, _FINAL, _BACKWARD = range(7)
+
+FINAL = 2 * TILE_PIXELS
+"""Floats that the forward pass keeps of a tile for the backward pass: a block's transmittance, then its last splat."""
+
+
+def pixel_offsets(dtype: type[np.floating]) -> Floats:
+    """Coordinates relative to their tile: of each block's pixels (x, then y), then of the blocks' corners (x, then y)."""
+    corner_y, corner_x = (axis.ravel() * BLOCK for axis in np.indices((TILE // BLOCK, TILE // BLOCK)))  # (16,) each
+    y, x = (axis.ravel() for axis in np.indices((BLOCK, BLOCK)))  # (16,) each
+    pixels = np.stack([corner_x[:, None] + x, corner_y[:, None] + y], axis=1)  # (16, 2, 16)
+    return np.concatenate([pixels.ravel(), corner_x, corner_y]).astype(dtype)
+
+
+_CORNERS = 2 * TILE_PIXELS
+
+
+@inline
+def _pixels_x(offsets: Floats, block: int, tile_x: int) -> Lanes:
+    return load(offsets, 2 * block * WIDTH) + tile_x * TILE
+
+
+@inline
+def _pixels_y(offsets: Floats, block: int, tile_y: int) -> Lanes:
+    return load(offsets, (2 * block + 1) * WIDTH) + tile_y * TILE
+
+
+@inline
+def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
+    """The blocks, as bits, in which the splat at `s` has an alpha of 1/255 or more anywhere.
+
+    The least u^2 + v^2 over a rectangle is at its centre or on one of the two sides that face it: on the side nearest
+    in x, where y is best for that x, or on the side nearest in y, where x is best for that y.
+
+    Args:
+        left, top: pixel coordinates of the blocks' first pixels.
+    """
+    x0, y0 = left - broadcast(splats, s + CENTRE_X), top - broadcast(splats, s + CENTRE_Y)
+    x1, y1 = x0 + (BLOCK - 1.0), y0 + (BLOCK - 1.0)
+    near_x, near_y = minimum(maximum(x0, 0.0), x1), minimum(maximum(y0, 0.0), y1)
+    best_x = minimum(maximum(near_y * broadcast(splats, s + RIDGE_X), x0), x1)
+    best_y = minimum(maximum(near_x * broadcast(splats, s + RIDGE_Y), y0), y1)
+    least = minimum(_distance(splats, s, near_x, best_y), _distance(splats, s, best_x, near_y))
+    return bits(least <= broadcast(splats, s + REACH))
+
+
+@inline
+def _distance(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> Lanes:
+    """u^2 + v^2."""
+    u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
+    v = dy * broadcast(splats, s + FACTOR_YY)
+    return fma(u, u, v * v)
+
+
+# ------------------------------------------------------------------------------------------------ forward
+
+
+@jit
+def blend(
+    counter: NDArray[np.int64],  # (1,) zero
+    width: int,
+    height: int,
+    tiles_x: int,
+    tile_start: NDArray[np.int64],  # (tiles + 1,) where each tile's splats begin in `members`
+    members: NDArray[np.int32],  # (pairs,) splats, tile after tile, nearest first
+    splats: Floats,  # (n * SPLAT,)
+    background: Floats,  # (3,)
+    offsets: Floats,  # see `pixel_offsets`
+    image: Floats,  # (3 * height * width,)
+    transmittance: Floats,  # (height * width,)
+    keep: bool,  # whether to fill what follows, for the backward pass
+    hits: NDArray[np.uint16],  # (pairs,) the blocks, as bits, in which a pair may be blended
+    reached: NDArray[np.int64],  # (tiles,) pairs looked at before the tile was opaque
+    final: Floats,  # (tiles * FINAL,)
+) -> None:
+    """Blend all splats front to back over the background."""
+    state = np.empty(_FORWARD * TILE_PIXELS, splats.dtype)
+    lists = np.empty(BLOCKS * BATCH, np.int64)
+    counts = np.empty(BLOCKS, np.int64)
+    while True:
+        tile = fetch_add(counter, 1)
+        if tile >= reached.size:
+            break
+        tile_y, tile_x = divmod(tile, tiles_x)
+        alive = _open_tile(state, offsets, tile_x, tile_y, width, height)
+        start, end = at(tile_start, tile), at(tile_start, tile + 1)
+        batch = start
+        while batch < end and alive != 0:
+            size = min(end - batch, BATCH)
+            _deal_to_blocks(batch, size, members, splats, offsets, tile_x, tile_y, alive, lists, counts, keep, hits)
+            pending = alive
+            while pending != 0:
+                block = lowest_bit(pending)
+                pending &= pending - 1
+                done = _blend_block(block, start, members, splats, offsets, tile_x, tile_y, lists, counts, state)
+                if done >= 0:
+                    alive &= ~(1 << block)
+                    if keep:
+                        for j in range(done, at(counts, block)):
+                            hits[at(lists, block * BATCH + j)] &= ~(1 << block)
+            batch += size
+        if keep:
+            reached[tile] = batch - start
+            for block in range(BLOCKS):
+                place = tile * FINAL + 2 * block * WIDTH
+                store(final, place, absolute(load(state, (_FORWARD * block + _T) * WIDTH)))
+                store(final, place + WIDTH, load(state, (_FORWARD * block + _LAST) * WIDTH))
+        _close_tile(state, background, tile_x, tile_y, width, height, image, transmittance)
+
+
+@inline
+def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: int, height: int) -> int:
+    """Set pixels to black and transparent; returns the blocks, as bits, that hold pixels of the image."""
+    alive = 0
+    for block in range(BLOCKS):
+        inside = (_pixels_x(offsets, block, tile_x) < width) & (_pixels_y(offsets, block, tile_y) < height)
+        one, zero = splat(state, 1.0), splat(state, 0.0)
+        store(state, (_FORWARD * block + _T) * WIDTH, select(inside, one, -one))
+        for quantity in range(_R, _FORWARD):
+            store(state, (_FORWARD * block + quantity) * WIDTH, zero)
+        if any_lane(inside):
+            alive |= 1 << block
+    return alive
+
+
+@inline
+def _deal_to_blocks(
+    batch: int,
+    size: int,
+    members: NDArray[np.int32],
+    splats: Floats,
+    offsets: Floats,
+    tile_x: int,
+    tile_y: int,
+    alive: int,
+    lists: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    keep: bool,
+    hits: NDArray[np.uint16],
+) -> None:
+    """List the pairs from `batch` on by the blocks that they reach."""
+    left, top = load(offsets, _CORNERS) + tile_x * TILE, load(offsets, _CORNERS + WIDTH) + tile_y * TILE
+    for block in range(BLOCKS):
+        counts[block] = 0
+    for pair in range(batch, batch + size):
+        reached = _blocks_reached(splats, np.int64(at(members, pair)) * SPLAT, left, top) & alive
+        if keep:
+            hits[pair] = reached
+        while reached != 0:
+            block = lowest_bit(reached)
+            reached &= reached - 1
+            lists[block * BATCH + at(counts, block)] = pair
+            counts[block] += 1
+
+
+@inline
+def _blend_block(
+    block: int,
+    start: int,
+    members: NDArray[np.int32],
+    splats: Floats,
+    offsets: Floats,
+    tile_x: int,
+    tile_y: int,
+    lists: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    state: Floats,
+) -> int:
+    """Blend a block's list into its pixels.
+
+    Returns:
+        How much of the list was blended when all pixels had become opaque, or -1 if some have not.
+    """
+    place = _FORWARD * block * WIDTH
+    t, last = load(state, place + _T * WIDTH), load(state, place + _LAST * WIDTH)
+    red, green, blue = (
+        load(state, place + _R * WIDTH), load(state, place + _G * WIDTH), load(state, place + _B * WIDTH)
+    )  # fmt: skip
+    x, y = _pixels_x(offsets, block, tile_x), _pixels_y(offsets, block, tile_y)
+    done = -1
+    for j in range(at(counts, block)):
+        pair = at(lists, block * BATCH + j)
+        s = np.int64(at(members, pair)) * SPLAT
+        dx, dy = x - broadcast(splats, s + CENTRE_X), y - broadcast(splats, s + CENTRE_Y)
+        u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
+        v = dy * broadcast(splats, s + FACTOR_YY)
+        exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+        alpha = minimum(exp2(exponent), MAX_ALPHA)
+        visible = exponent >= LOG2_MIN_ALPHA
+        behind = fma(-alpha, t, t)
+        blended = visible & (behind >= MIN_TRANSMITTANCE)
+        weight = select(blended, alpha * t, 0.0)
+        red = fma(weight, broadcast(splats, s + RED), red)
+        green = fma(weight, broadcast(splats, s + GREEN), green)
+        blue = fma(weight, broadcast(splats, s + BLUE), blue)
+        last = select(blended, splat(splats, np.float64(pair - start + 1)), last)
+        t = select(blended, behind, select(visible, minimum(t, -t), t))
+        if not any_lane(t > 0.0):
+            done = j + 1
+            break
+    store(state, place + _T * WIDTH, t)
+    store(state, place + _R * WIDTH, red)
+    store(state, place + _G * WIDTH, green)
+    store(state, place + _B * WIDTH, blue)
+    store(state, place + _LAST * WIDTH, last)
+    return done
+
+
+@inline
+def _close_tile(
+    state: Floats,
+    background: Floats,
+    tile_x: int,
+    tile_y: int,
+    width: int,
+    height: int,
+    image: Floats,
+    transmittance: Floats,
+) -> None:
+    """Blend the background and write the pixels that are inside of the image."""
+    pixels = width * height
+    for block in range(BLOCKS):
+        place = _FORWARD * block * WIDTH
+        t = absolute(load(state, place + _T * WIDTH))
+        store(state, place + _T * WIDTH, t)
+        for channel in range(3):
+            color = load(state, place + (_R + channel) * WIDTH)
+            store(state, place + (_R + channel) * WIDTH, fma(t, at(background, channel), color))
+        block_y, block_x = divmod(block, TILE // BLOCK)
+        first_x = tile_x * TILE + block_x * BLOCK
+        first_y = tile_y * TILE + block_y * BLOCK
+        for row in range(min(BLOCK, height - first_y)):
+            for column in range(min(BLOCK, width - first_x)):
+                pixel = (first_y + row) * width + first_x + column
+                lane = place + row * BLOCK + column
+                transmittance[pixel] = at(state, lane + _T * WIDTH)
+                image[pixel] = at(state, lane + _R * WIDTH)
+                image[pixels + pixel] = at(state, lane + _G * WIDTH)
+                image[2 * pixels + pixel] = at(state, lane + _B * WIDTH)
+
+
+# ------------------------------------------------------------------------------------------------ backward
+
+
+@jit
+def blend_backward(
+    counter: NDArray[np.int64],  # (1,) zero
+    width: int,
+    height: int,
+    tiles_x: int,
+    tile_start: NDArray[np.int64],  # (tiles + 1,)
+    members: NDArray[np.int32],  # (pairs,)
+    splats: Floats,  # (n * SPLAT,)
+    background: Floats,  # (3,)
+    offsets: Floats,  # see `pixel_offsets`
+    hits: NDArray[np.uint16],  # (pairs,)
+    reached: NDArray[np.int64],  # (tiles,)
+    final: Floats,  # (tiles * FINAL,)
+    grad_image: Floats,  # (3 * height * width,)
+    grad_transmittance: Floats,  # (height * width,), or empty for zeros
+    slots: Floats,  # (pairs * SLOT,) filled: see `layout.SLOT`
+) -> None:
+    """Gradient of each splat in each tile."""
+    state = np.empty(_BACKWARD * TILE_PIXELS, splats.dtype)
+    while True:
+        tile = fetch_add(counter, 1)
+        if tile >= reached.size:
+            break
+        tile_y, tile_x = divmod(tile, tiles_x)
+        _reopen_tile(
+            state, tile, tile_x, tile_y, width, height, background, final, grad_image, grad_transmittance
+        )  # fmt: skip
+        start = at(tile_start, tile)
+        end = start + at(reached, tile)
+        none = splat(slots, 0.0)
+        for pair in range(end, at(tile_start, tile + 1)):
+            store(slots, pair * SLOT, none)
+        for pair in range(end - 1, start - 1, -1):
+            blocks = np.int64(at(hits, pair))
+            if blocks == 0:
+                store(slots, pair * SLOT, none)
+            else:
+                _splat_backward(pair, start, members, splats, offsets, tile_x, tile_y, blocks, state, slots)
+
+
+@inline
+def _reopen_tile(
+    state: Floats,
+    tile: int,
+    tile_x: int,
+    tile_y: int,
+    width: int,
+    height: int,
+    background: Floats,
+    final: Floats,
+    grad_image: Floats,
+    grad_transmittance: Floats,
+) -> None:
+    """Put the pixels into the state behind the last splat; those outside of the image have no gradient."""
+    pixels = width * height
+    for block in range(BLOCKS):
+        place = _BACKWARD * block * WIDTH
+        for quantity in range(_REST, _FINAL):
+            store(state, place + quantity * WIDTH, splat(state, 0.0))
+        block_y, block_x = divmod(block, TILE // BLOCK)
+        first_x = tile_x * TILE + block_x * BLOCK
+        first_y = tile_y * TILE + block_y * BLOCK
+        for row in range(min(BLOCK, height - first_y)):
+            for column in range(min(BLOCK, width - first_x)):
+                pixel = (first_y + row) * width + first_x + column
+                lane = place + row * BLOCK + column
+                state[lane + _GRAD_R * WIDTH] = at(grad_image, pixel)
+                state[lane + _GRAD_G * WIDTH] = at(grad_image, pixels + pixel)
+                state[lane + _GRAD_B * WIDTH] = at(grad_image, 2 * pixels + pixel)
+                if grad_transmittance.size > 0:
+                    state[lane + _REST * WIDTH] = at(grad_transmittance, pixel)
+        t = load(final, tile * FINAL + 2 * block * WIDTH)
+        rest = load(state, place + _REST * WIDTH)
+        for channel in range(3):
+            rest = fma(load(state, place + (_GRAD_R + channel) * WIDTH), at(background, channel), rest)
+        store(state, place + _T_BEHIND * WIDTH, t)
+        store(state, place + _REST * WIDTH, t * rest)
+        store(state, place + _FINAL * WIDTH, load(final, tile * FINAL + (2 * block + 1) * WIDTH))
+
+
+@inline
+def _splat_backward(
+    pair: int,
+    start: int,
+    members: NDArray[np.int32],
+    splats: Floats,
+    offsets: Floats,
+    tile_x: int,
+    tile_y: int,
+    blocks: int,
+    state: Floats,
+    slots: Floats,
+) -> None:
+    """Step in front of one splat in the given blocks of a tile, and sum its gradient up.
+
+    With T the transmittance in front of the splat, c its colour times the pixel's gradient and R the loss's derivative
+    by the transmittance behind it times that transmittance, the derivative by alpha is T c - R / (1 - alpha), and in
+    front of the splat R is more by alpha T c.
+    """
+    s = np.int64(at(members, pair)) * SPLAT
+    centre_x, centre_y = broadcast(splats, s + CENTRE_X), broadcast(splats, s + CENTRE_Y)
+    xx, xy, yy = broadcast(splats, s + FACTOR_XX), broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
+    log2_opacity = broadcast(splats, s + LOG2_OPACITY)
+    red, green, blue = broadcast(splats, s + RED), broadcast(splats, s + GREEN), broadcast(splats, s + BLUE)
+    position = splat(splats, np.float64(pair - start + 1))
+    none = splat(splats, 0.0)
+    sum_red, sum_green, sum_blue = none, none, none
+    sum_1, sum_u, sum_v, sum_uu, sum_uv, sum_vv = none, none, none, none, none, none
+    sum_abs_x, sum_abs_y = none, none
+    while blocks != 0:
+        block = lowest_bit(blocks)
+        blocks &= blocks - 1
+        place = _BACKWARD * block * WIDTH
+        dx, dy = _pixels_x(offsets, block, tile_x) - centre_x, _pixels_y(offsets, block, tile_y) - centre_y
+        u = fma(dx, xx, dy * xy)
+        v = dy * yy
+        exponent = fma(-u, u, fma(-v, v, log2_opacity))
+        density = exp2(exponent)
+        alpha = minimum(density, MAX_ALPHA)
+        blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, place + _FINAL * WIDTH) >= position)
+        t, rest = load(state, place + _T_BEHIND * WIDTH), load(state, place + _REST * WIDTH)
+        grad_red, grad_green, grad_blue = (
+            load(state, place + _GRAD_R * WIDTH),
+            load(state, place + _GRAD_G * WIDTH),
+            load(state, place + _GRAD_B * WIDTH),
+        )
+        inverse = 1.0 / (1.0 - alpha)
+        in_front = t * inverse
+        shade = fma(red, grad_red, fma(green, grad_green, blue * grad_blue))
+        weight = select(blended, alpha * in_front, 0.0)
+        store(state, place + _T_BEHIND * WIDTH, select(blended, in_front, t))
+        store(state, place + _REST * WIDTH, fma(weight, shade, rest))
+        # The cap at 0.99 passes the gradient as if it were not there, as the CUDA code does.
+        d = select(blended, density * (fma(t, shade, -rest) * inverse), 0.0)
+        d_u, d_v = d * u, d * v
+        sum_red = fma(weight, grad_red, sum_red)
+        sum_green = fma(weight, grad_green, sum_green)
+        sum_blue = fma(weight, grad_blue, sum_blue)
+        sum_1 = sum_1 + d
+        sum_u = sum_u + d_u
+        sum_v = sum_v + d_v
+        sum_uu = fma(d_u, u, sum_uu)
+        sum_uv = fma(d_u, v, sum_uv)
+        sum_vv = fma(d_v, v, sum_vv)
+        sum_abs_x = sum_abs_x + absolute(d_u)
+        sum_abs_y = sum_abs_y + absolute(fma(d_u, xy, d_v * yy))
+    store_sums(
+        slots, pair * SLOT,
+        sum_red, sum_green, sum_blue, sum_1, sum_u, sum_v, sum_uu, sum_uv, sum_vv, sum_abs_x, sum_abs_y,
+    )  # fmt: skip

@@ -1,0 +1,162 @@
+"""From the fields of a hierarchy to images: one level added to what the coarser levels made, or all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.plan import level_size
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.raster import Rasterizer
+
+
+@dataclass(frozen=True)
+class Composition:
+    """One view, level by level; nothing is clamped.
+
+    Attributes:
+        base: (3, h, w) the coarsest level's render, background blended in.
+        residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size.
+        composed: by level, finest last: (3, h, w) I_hat^l at that level's size; at the coarsest level it is `base`.
+    """
+
+    base: Tensor
+    residuals: dict[int, Tensor]
+    composed: dict[int, Tensor]
+
+
+def level_camera(camera: Camera, level: int) -> Camera:
+    """The camera of a pyramid level, from the camera of the full-resolution view."""
+    return camera.resized(*level_size((camera.width, camera.height), level))
+
+
+def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) -> Tensor:
+    """Up, `level` times: a composed image of that level at the size of the full-resolution view, as if every finer
+    residual were zero.
+
+    Args:
+        image: (3, h, w) at the size of `level`.
+        camera: of the full-resolution view.
+    """
+    for finer in range(level - 1, -1, -1):
+        width, height = level_size((camera.width, camera.height), finer)
+        image = pyramid.up(image, (height, width))
+    return image
+
+
+@dataclass(frozen=True)
+class HierarchyRenderer:
+    """Renders the finished levels of a hierarchy and adds them up.
+
+    Attributes:
+        fields: by level; contiguous from `levels - 1` down to the finest that is finished.
+        levels: number of levels of the whole hierarchy, L.
+        pyramid: Up between two levels; on the grid the hierarchy was trained with.
+        rasterizer: renders every field.
+        background: RGB behind the base. Residuals are always rendered over zero.
+
+    Raises:
+        UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
+            base should be or the reverse.
+    """
+
+    fields: Mapping[int, GaussianField]
+    levels: int
+    pyramid: Pyramid
+    rasterizer: Rasterizer
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        given = sorted(self.fields, reverse=True)
+        expected = list(range(self.levels - 1, -1, -1))[: len(given)]
+        if not given or given != expected:
+            raise UserInputError(
+                f"fields of levels {given}, expected {self.levels - 1}, ..., 0 or the first of these without gaps"
+            )
+        for level, field in self.fields.items():
+            if field.signed != (level != self.levels - 1):
+                kind = "signed (a residual)" if field.signed else "unsigned (a base)"
+                raise UserInputError(
+                    f"the field of level {level} is {kind}; expected the coarsest level, {self.levels - 1}, unsigned "
+                    "and all others signed"
+                )
+
+    @classmethod
+    def from_archive(cls, archive: RunArchive, rasterizer: Rasterizer) -> HierarchyRenderer:
+        """A renderer of a run's finished levels.
+
+        Raises:
+            RunFolderError: a field is damaged, or no level is finished.
+        """
+        manifest = archive.manifest
+        manifest.record(manifest.levels - 1)
+        return cls(
+            fields={level: archive.field(level) for level in archive.available_levels},
+            levels=manifest.levels,
+            pyramid=Pyramid(manifest.grid),
+            rasterizer=rasterizer,
+            background=manifest.scene.background,
+        )
+
+    @property
+    def finest(self) -> int:
+        """The finest level that can be rendered; 0 for a complete hierarchy."""
+        return min(self.fields)
+
+    def require_level(self, level: int) -> None:
+        """Check that `level` can be rendered.
+
+        Raises:
+            UserInputError: it is not there.
+        """
+        if not self.finest <= level < self.levels:
+            raise UserInputError(
+                f"level {level} cannot be rendered, expected {self.finest} to {self.levels - 1}; "
+                "levels count from 0, the finest, and this run has no others"
+            )
+
+    @torch.no_grad()
+    def render(self, camera: Camera, level: int = 0) -> Composition:
+        """Render a view from the coarsest level down to `level`.
+
+        Args:
+            camera: of the full-resolution view.
+            level: finest level to add.
+
+        Raises:
+            UserInputError: that level is not there.
+        """
+        self.require_level(level)
+        rendered: dict[int, Tensor] = {}
+        composed: dict[int, Tensor] = {}
+        for each in range(self.levels - 1, level - 1, -1):
+            rendered[each], composed[each] = self.render_level(camera, each, composed.get(each + 1))
+        base = rendered.pop(self.levels - 1)
+        return Composition(base, residuals=rendered, composed=composed)
+
+    def render_level(self, camera: Camera, level: int, coarser: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Render one level and add it to what the coarser levels made: I_hat^l = Up(I_hat^(l+1)) + R_hat^l.
+
+        Args:
+            camera: of the full-resolution view.
+            level: which field to render.
+            coarser: (3, h, w) I_hat^(l+1) of the same view, None for the coarsest level.
+
+        Returns:
+            The field's own render and the composed image I_hat^l, both (3, h, w) at the level's size.
+        """
+        field = self.fields[level]
+        at_level = level_camera(camera, level)
+        # A residual adds to the image; a background behind it would be added twice.
+        color = torch.zeros(3) if field.signed else torch.tensor(self.background)
+        image = self.rasterizer(field, at_level, background=color.to(field.means)).image
+        if coarser is None:
+            return image, image
+        return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image

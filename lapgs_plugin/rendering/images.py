@@ -1,0 +1,63 @@
+"""Renders as files: what is shown of each level, and under which name."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.rendering.compose import Composition
+from lapgs_plugin.scenes.scene import View
+
+
+def around_grey(signed: Tensor) -> Tensor:
+    """A signed image as one to look at: zero is mid-grey, -1 black, 1 white."""
+    return 0.5 + 0.5 * signed
+
+
+def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> dict[str, Tensor]:
+    """The images of a rendered view by the suffix of their file, (3, h, w) each, at their level's size.
+
+    Args:
+        composition: of one or more levels.
+        photo: when given, at the finest composed level's size, adds "compare": photo, composition and their
+            difference side by side.
+        raw: residuals and differences as they are, for formats that hold negative values; otherwise around mid-grey.
+
+    Returns:
+        "base", "residual_<l>" for each residual, and "composed", or "composed_<l>" when l is not 0. A single image is
+        not written twice: one level gives "composed" alone, the coarsest level of several "base" alone.
+    """
+    finest = min(composition.composed)
+    composed = composition.composed[finest]
+    images = {}
+    if composition.residuals or finest > 0:
+        images["base"] = composition.base
+    for level, residual in composition.residuals.items():
+        images[f"residual_{level}"] = residual if raw else around_grey(residual)
+    if composition.residuals or finest == 0:
+        images["composed" if finest == 0 else f"composed_{finest}"] = composed
+    if photo is not None:
+        difference = composed.clamp(0.0, 1.0) - photo
+        images["compare"] = torch.cat([photo, composed, difference if raw else around_grey(difference)], dim=2)
+    return images
+
+
+def file_stems(views: Sequence[View]) -> dict[str, str]:
+    """By view name, what its files are called: the name without extension, unless two views would share it.
+
+    Folders inside a name are kept, and nothing leads out of the folder that the files go to.
+    """
+    paths = {view.name: _inside(view.name) for view in views}
+    users = Counter(path.with_suffix("") for path in paths.values())
+    return {
+        name: str(path.with_suffix("") if users[path.with_suffix("")] == 1 else path) for name, path in paths.items()
+    }
+
+
+def _inside(name: str) -> PurePosixPath:
+    """The name as a relative path without steps upwards."""
+    return PurePosixPath(*(part for part in PurePosixPath(name).parts if part not in ("/", "..")))

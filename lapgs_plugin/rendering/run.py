@@ -1,0 +1,59 @@
+"""A run folder put back together: its fields, its scene, and a rasterizer for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.plan import level_size
+from lapgs_plugin.reference_raster import make_rasterizer
+from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.scenes.scene import Scene, load_scene
+
+
+def run_renderer(archive: RunArchive) -> HierarchyRenderer:
+    """A renderer of a run's finished levels, with the rasterizer it was trained with.
+
+    Raises:
+        RunFolderError: no level is finished, or a field is damaged.
+    """
+    return HierarchyRenderer.from_archive(archive, make_rasterizer(archive.manifest.rasterizer))
+
+
+def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
+    """The scene a run was trained on, read as it was then.
+
+    Args:
+        moved_to: where the scene is now; None when it is still where the manifest says.
+
+    Raises:
+        RunFolderError: it is not there, or not the scene that the run was trained on.
+        SceneError: it cannot be read.
+    """
+    reference = archive.manifest.scene
+    path = Path(reference.path) if moved_to is None else moved_to
+    if moved_to is None and not path.is_dir():
+        raise RunFolderError(
+            f"{archive.path()} was trained on {path}, which is not there any more; say where it is now with --scene"
+        )
+    scene = load_scene(
+        path,
+        resolution=reference.resolution,
+        images=reference.images,
+        eval=reference.eval,
+        background=reference.background,
+    )
+    _require_same(archive, scene)
+    return scene
+
+
+def _require_same(archive: RunArchive, scene: Scene) -> None:
+    """Refuse a scene whose images are not of the size that was trained, before figures of it mislead."""
+    for record in archive.manifest.records:
+        size = level_size(scene.smallest_size, record.level)
+        if size != record.image_size:
+            raise RunFolderError(
+                f"{scene.path}: level {record.level} would be {size[0]}x{size[1]} pixels, the run was trained at "
+                f"{record.image_size[0]}x{record.image_size[1]}; give the scene of {archive.path()} with --scene"
+            )

@@ -1,0 +1,205 @@
+"""Scenes of transforms files: NeRF's Blender scenes, instant-ngp and nerfstudio.
+
+Poses are camera-to-world matrices in OpenGL axes (x right, y up, z backwards). Two layouts exist: the pair
+`transforms_train.json` and `transforms_test.json` with one horizontal field of view and PNGs named without extension
+(https://github.com/bmild/nerf), and a single `transforms.json` with intrinsics in pixels for the whole file or for each
+frame (https://docs.nerf.studio/quickstart/data_conventions.html).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyParseError
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.images import image_size
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out, in_name_order
+
+SINGLE_FILE = "transforms.json"
+TRAIN_FILE = "transforms_train.json"
+TEST_FILE = "transforms_test.json"
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+POINT_FILES = ("points3d.ply", "points3D.ply")
+
+RANDOM_POINTS = 100_000
+OBJECT_RADIUS = 1.3 / 4.03
+"""Half side of the cube of random points for a Blender scene, in distances from the cameras to its middle: 3DGS's
+cube of 1.3 around NeRF's objects, which are seen from a distance of 4.03."""
+CAPTURE_RADIUS = 1.0
+"""The same for a single transforms file, whose photos show surroundings too: up to the cameras and as far behind."""
+
+Values = dict[str, Any]
+
+
+def has_transforms(path: Path) -> bool:
+    """Whether the folder holds a transforms layout."""
+    return (path / TRAIN_FILE).is_file() or (path / SINGLE_FILE).is_file()
+
+
+def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
+    """The frames and points of a transforms layout in folder `path`.
+
+    A pair of files holds out what `transforms_test.json` lists and trains on both without `evaluate`, as 3DGS does; a
+    single file holds out every eighth frame. Without a PLY of points (`ply_file_path`, points3d.ply) 100,000 random
+    grey ones, always the same, fill a cube around the point that the cameras look at.
+
+    Args:
+        path: the scene folder.
+        images: a folder to take the images from instead of the one that `file_path` names; "images" leaves it.
+        evaluate: hold out views.
+
+    Raises:
+        SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
+    """
+    if (path / TRAIN_FILE).is_file():
+        values = _read_json(path / TRAIN_FILE)
+        train, test = _read_pair(path, values, images, evaluate)
+        radius = OBJECT_RADIUS
+    else:
+        values = _read_json(path / SINGLE_FILE)
+        train, test = hold_out(_read_frames(path, SINGLE_FILE, values, images), evaluate)
+        radius = CAPTURE_RADIUS
+    points, colors = _read_points(path, values) or _random_points([*train, *test], radius)
+    return SceneSource("transforms", train, test, points, colors)
+
+
+def _read_pair(
+    path: Path, train_values: Values, images: str, evaluate: bool
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    train = _read_frames(path, TRAIN_FILE, train_values, images)
+    test: list[Frame] = []
+    if (path / TEST_FILE).is_file():
+        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images)
+    elif evaluate:
+        raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
+    return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
+
+
+def _read_json(file: Path) -> Values:
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{file}: not readable as JSON ({error}); export the scene again") from error
+    if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
+        raise SceneError(f"{file}: no list of frames in it, expected the transforms of NeRF, instant-ngp or nerfstudio")
+    return values
+
+
+def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Frame]:
+    frames = []
+    for index, frame in enumerate(values["frames"]):
+        where = f"{path / file}: frame {index}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise SceneError(f"{where} has no file_path, expected the name of its image")
+        image = _image_path(path, frame["file_path"], images)
+        where = f"{where} ({frame['file_path']})"
+        camera = _camera({**values, **frame}, image, where, _world_to_camera(frame.get("transform_matrix"), where))
+        inside = os.path.normpath(path)
+        name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
+        frames.append(Frame(name, image, camera))
+    return frames
+
+
+def _image_path(path: Path, file_path: str, images: str) -> Path:
+    # instant-ngp writes backslashes on Windows, and ".." where its photos lie beside the scene.
+    image = Path(os.path.normpath(path / file_path.replace("\\", "/")))
+    if images != "images":
+        image = path / images / image.name
+    if image.is_file():
+        return image
+    candidates = [image.with_name(image.name + suffix) for suffix in IMAGE_SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), image)
+
+
+def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
+    """(4, 4) in OpenCV axes from a camera-to-world matrix in OpenGL axes, 4x4 or 3x4."""
+    try:
+        camera_to_world = np.array(matrix, np.float64)
+    except (TypeError, ValueError):
+        camera_to_world = np.empty(0)
+    if camera_to_world.shape not in ((4, 4), (3, 4)) or not np.isfinite(camera_to_world).all():
+        raise SceneError(f"{where} has no transform_matrix of 4x4 finite numbers; export the scene again")
+    rotation, position = camera_to_world[:3, :3] * (1.0, -1.0, -1.0), camera_to_world[:3, 3]
+    u, _, vt = np.linalg.svd(rotation)
+    rigid = u @ vt  # the nearest rotation: JSON files round to few digits
+    if np.abs(rigid - rotation).max() > 1e-2 or np.linalg.det(rigid) < 0:
+        raise SceneError(f"{where} has a transform_matrix that is no rotation and translation; export without scaling")
+    result: NDArray[np.float64] = np.eye(4)
+    result[:3, :3] = rigid.T
+    result[:3, 3] = -rigid.T @ position
+    return result
+
+
+def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np.float64]) -> Camera:
+    """The pinhole camera of a frame whose own values stand before the file's in `values`."""
+    model = values.get("camera_model", "OPENCV")
+    distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
+    if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
+        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
+        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {UNDISTORT_HINT}")
+    try:
+        width, height = (int(values["w"]), int(values["h"])) if "w" in values and "h" in values else image_size(image)
+        fx = _focal(values, "x", width)
+        fy = _focal(values, "y", height) or fx
+        cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    except (TypeError, ValueError) as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export the scene again") from error
+    if fx is None or fy is None:
+        raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export the scene again")
+    return Camera(width, height, fx, fy, cx, cy, torch.from_numpy(world_to_camera))
+
+
+def _focal(values: Values, axis: str, side: int) -> float | None:
+    """Focal length in pixels along an axis, from pixels or from a field of view in radians; None without either."""
+    if f"fl_{axis}" in values:
+        return float(values[f"fl_{axis}"])
+    if f"camera_angle_{axis}" in values:
+        return side / (2.0 * math.tan(float(values[f"camera_angle_{axis}"]) / 2.0))
+    return None
+
+
+def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Positions and colours (n, 3) of the scene's PLY; None if it has none."""
+    named = values.get("ply_file_path")
+    file = path / named if named else next((path / name for name in POINT_FILES if (path / name).is_file()), None)
+    if file is None:
+        return None
+    try:
+        vertices = PlyData.read(str(file))["vertex"].data
+        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    except (OSError, KeyError, ValueError, PlyParseError) as error:
+        raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
+    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+        return points, np.full_like(points, 0.5)
+    colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
+    return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
+
+
+def _random_points(frames: list[Frame], radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Grey points in a cube around what the cameras look at, `radius` times their mean distance from it each way."""
+    poses = np.stack([frame.camera.world_to_camera.numpy() for frame in frames])  # (v, 4, 4)
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])  # (v, 3)
+    axes = poses[:, 2, :3]  # (v, 3) viewing directions in world coordinates
+    # Least-squares point closest to all optical axes; relative to the mean centre, so that parallel axes, which leave
+    # the depth open, put it among the cameras.
+    projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)  # (v, 3, 3)
+    middle = centers.mean(axis=0)
+    offsets = np.einsum("vij,vj->i", projectors, centers - middle)
+    focus = middle + np.linalg.lstsq(projectors.sum(axis=0), offsets, rcond=1e-6)[0]
+    half_side = radius * np.linalg.norm(centers - focus, axis=1).mean()
+    cube = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_POINTS, 3))
+    return focus + half_side * cube, np.full((RANDOM_POINTS, 3), 0.5)

@@ -1,0 +1,113 @@
+"""COLMAP scenes: `images/` and a sparse model in `sparse/0/` or `sparse/`, binary or text.
+
+The formats are described at https://colmap.github.io/format.html; pycolmap reads them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.colmap_binary import check_whole
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out
+
+MODEL_FILES = ("cameras", "images", "points3D")
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models that are pinhole cameras when all their distortion parameters are zero; fisheye models never are."""
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder below `path` that holds a COLMAP model, complete or not; None if there is none."""
+    for folder in (path / "sparse" / "0", path / "sparse"):
+        if any((folder / f"{name}.{suffix}").is_file() for name in MODEL_FILES for suffix in ("bin", "txt")):
+            return folder
+    return None
+
+
+def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
+    """The frames and points of the COLMAP model in folder `model` of the scene `path`.
+
+    Args:
+        path: the scene folder.
+        model: what `find_model` found.
+        images: name of the image folder inside the scene, "images" or a smaller copy such as "images_4".
+        evaluate: hold out every eighth image.
+
+    Raises:
+        SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
+    """
+    reconstruction = _read_model(model)
+    folder = path / images
+    if not folder.is_dir():
+        others = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
+        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
+        raise SceneError(f"{folder}: no such folder of images; {hint}")
+    posed = [image for image in reconstruction.images.values() if image.has_pose]
+    used = sorted({image.camera_id for image in posed})
+    cameras = {key: _intrinsics(reconstruction.cameras[key], model) for key in used}
+    frames = [Frame(image.name, folder / image.name, _with_pose(cameras[image.camera_id], image)) for image in posed]
+    points = [(point.xyz, point.color) for point in reconstruction.points3D.values()]
+    if not points:
+        raise SceneError(f"{model}: the model has no 3D points, expected the sparse points of a reconstruction")
+    train, test = hold_out(frames, evaluate)
+    return SceneSource(
+        "colmap",
+        train,
+        test,
+        points=np.array([xyz for xyz, _ in points], np.float64),
+        colors=np.array([rgb for _, rgb in points], np.float64) / 255.0,
+    )
+
+
+def _read_model(model: Path) -> pycolmap.Reconstruction:
+    suffix = next(
+        (s for s in ("bin", "txt") if all((model / f"{name}.{s}").is_file() for name in MODEL_FILES)),
+        None,
+    )
+    if suffix is None:
+        found = ", ".join(sorted(entry.name for entry in model.iterdir() if entry.stem in MODEL_FILES))
+        raise SceneError(
+            f"{model}: the sparse model is incomplete, it has only {found}; "
+            "expected cameras, images and points3D, all as .bin or all as .txt"
+        )
+    if suffix == "bin":
+        check_whole(model)
+    try:
+        return pycolmap.Reconstruction(str(model))
+    except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
+        raise SceneError(
+            f"{model}: the sparse model cannot be read ({' '.join(str(error).split())}); copy or export it again"
+        ) from error
+
+
+def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
+    """The camera without a pose."""
+    kind = camera.model.name
+    distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
+    if kind not in PINHOLE_MODELS or any(distortion):
+        values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
+        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {UNDISTORT_HINT}")
+    matrix = camera.calibration_matrix()  # (3, 3)
+    return Camera(
+        width=camera.width,
+        height=camera.height,
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]),
+        cy=float(matrix[1, 2]),
+        world_to_camera=torch.eye(4, dtype=torch.float64),
+    )
+
+
+def _with_pose(camera: Camera, image: pycolmap.Image) -> Camera:
+    pose: NDArray[np.float64] = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()  # (3, 4)
+    return replace(camera, world_to_camera=torch.from_numpy(pose))

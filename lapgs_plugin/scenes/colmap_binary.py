@@ -1,0 +1,93 @@
+"""Whether COLMAP's binary files are whole.
+
+pycolmap trusts the counts in them: reading a file that was cut short it fills records with whatever is in memory, or
+allocates and loops for minutes. So their records are walked first. Their layout is that of
+https://colmap.github.io/format.html, and for rigs and frames that of COLMAP's reconstruction_io_binary.cc.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+from lapgs_plugin.errors import SceneError
+
+COUNT = struct.Struct("<Q")
+SMALL_COUNT = struct.Struct("<I")
+POSE_BYTES = 7 * 8  # quaternion and translation
+SENSOR_BYTES = 4 + 4  # type and id
+
+
+def check_whole(folder: Path) -> None:
+    """Check every binary file of the model in `folder` that exists.
+
+    Raises:
+        SceneError: a file ends before the records that it announces.
+    """
+    for name, record_end in RECORD_ENDS.items():
+        file = folder / f"{name}.bin"
+        if not file.is_file():
+            continue  # rigs and frames exist only in models that COLMAP 3.12 or later wrote
+        data = file.read_bytes()
+        if not _holds_all(data, record_end):
+            raise SceneError(
+                f"{file}: the file is damaged or cut short at {len(data)} bytes, "
+                "expected all the records that it announces; copy it again"
+            )
+
+
+def _holds_all(data: bytes, record_end: Callable[[bytes, int], int]) -> bool:
+    try:
+        offset = COUNT.size
+        for _ in range(COUNT.unpack_from(data)[0]):
+            offset = record_end(data, offset)
+            if offset > len(data):
+                return False
+    except (struct.error, ValueError):  # the data ends inside a count or a name, or a camera model does not exist
+        return False
+    return True
+
+
+def _camera_end(data: bytes, start: int) -> int:
+    (model,) = struct.unpack_from("<i", data, start + 4)
+    camera = pycolmap.Camera()
+    camera.model = pycolmap.CameraModelId(model)
+    parameters = [*camera.focal_length_idxs(), *camera.principal_point_idxs(), *camera.extra_params_idxs()]
+    return start + 4 + 4 + 8 + 8 + 8 * len(parameters)
+
+
+def _image_end(data: bytes, start: int) -> int:
+    name_end = data.index(b"\0", start + 4 + POSE_BYTES + 4) + 1
+    return name_end + COUNT.size + (8 + 8 + 8) * int(COUNT.unpack_from(data, name_end)[0])
+
+
+def _point_end(data: bytes, start: int) -> int:
+    track = start + 8 + 3 * 8 + 3 + 8
+    return track + COUNT.size + (4 + 4) * int(COUNT.unpack_from(data, track)[0])
+
+
+def _rig_end(data: bytes, start: int) -> int:
+    (sensors,) = SMALL_COUNT.unpack_from(data, start + 4)
+    end = start + 4 + SMALL_COUNT.size + (SENSOR_BYTES if sensors else 0)  # the reference sensor has no pose
+    for _ in range(sensors - 1):
+        (has_pose,) = struct.unpack_from("<?", data, end + SENSOR_BYTES)
+        end += SENSOR_BYTES + 1 + (POSE_BYTES if has_pose else 0)
+    return end
+
+
+def _frame_end(data: bytes, start: int) -> int:
+    images = start + 4 + 4 + POSE_BYTES
+    return images + SMALL_COUNT.size + (SENSOR_BYTES + 8) * int(SMALL_COUNT.unpack_from(data, images)[0])
+
+
+RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
+    "cameras": _camera_end,
+    "images": _image_end,
+    "points3D": _point_end,
+    "rigs": _rig_end,
+    "frames": _frame_end,
+}
+"""For each file, where the record that starts at an offset ends."""

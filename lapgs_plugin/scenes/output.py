@@ -1,0 +1,76 @@
+"""The folder a scene is written to: never somebody else's, never half a scene."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lapgs_plugin.errors import LapgsError, UserInputError
+
+SCENE_ENTRIES = frozenset({"images", "sparse"})
+"""What a scene folder of ours holds; anything else in it is somebody's work and is never deleted."""
+
+
+def check_output(out: Path, overwrite: bool, own: frozenset[str] = SCENE_ENTRIES) -> None:
+    """Refuse a folder that must not be written to.
+
+    Args:
+        out: the folder, which may be missing.
+        overwrite: replace what is there, if it is nothing but a scene.
+        own: names of the entries that may be replaced.
+
+    Raises:
+        UserInputError: `out` is a file, holds a scene and `overwrite` is False, or holds anything else.
+    """
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise UserInputError(f"{out}: a file, expected a folder or a new name")
+    entries = {entry.name for entry in out.iterdir()}
+    if foreign := sorted(entries - own):
+        raise UserInputError(
+            f"{out}: it holds {foreign[0]}, expected an empty or new folder; choose another or remove that yourself"
+        )
+    if entries and not overwrite:
+        raise UserInputError(f"{out}: the folder already holds a scene; choose another or replace it with --overwrite")
+
+
+@contextmanager
+def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder beside `out` that takes its place when the block ends without an error, and is removed otherwise.
+
+    Raises:
+        UserInputError: as `check_output`.
+        LapgsError: the disk is full or the folder cannot be written.
+    """
+    out = out.absolute()
+    check_output(out, overwrite)
+    partial, replaced = out.with_name(f"{out.name}.partial"), out.with_name(f"{out.name}.replaced")
+    with one_line_errors(out):
+        try:
+            for leftover in (partial, replaced):
+                if leftover.exists():
+                    shutil.rmtree(leftover)
+            partial.mkdir(parents=True)
+            yield partial
+            if out.exists():
+                out.rename(replaced)
+            partial.rename(out)
+            shutil.rmtree(replaced, ignore_errors=True)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+@contextmanager
+def one_line_errors(out: Path) -> Iterator[None]:
+    """Turn an OSError while a scene is written into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise LapgsError(
+            f"{out}: the scene cannot be written ({error.strerror or error}); check free space and permissions, then "
+            "run the command again"
+        ) from error

@@ -1,0 +1,98 @@
+"""Image sizes by name: the paper's 1k, 2k and 4k settings, a width in pixels, or a fraction of the full size.
+
+Only downscaling exists: a setting that asks for more pixels than an image has keeps the image's own size.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+from lapgs_plugin.errors import UserInputError
+
+PAPER_WIDTH = 1600
+"""Width of the paper's 1K setting, which is what 3DGS codebases shrink large photos to unless told otherwise."""
+
+MIN_WIDTH = 16
+"""Smaller widths are refused: `--resolution 4` is someone who means a quarter."""
+
+ACCEPTED = "1k, 2k, 4k, full, a width in pixels such as 800, or a fraction of the full size such as 1/4 or 0.25"
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """A rule that turns an image's full size into the size it is trained at.
+
+    Widths decide, in portrait images too, as in the paper and in 3DGS.
+
+    Attributes:
+        text: the setting as the user wrote it.
+        width: width to shrink to, in pixels; None where `fraction` decides.
+        midpoint: go only half of the way from the full width to `width`.
+        fraction: share of the full width and height, in (0, 1], used where `width` is None.
+    """
+
+    text: str
+    width: int | None = None
+    midpoint: bool = False
+    fraction: Fraction = Fraction(1)
+
+    def size_for(self, width: int, height: int) -> tuple[int, int]:
+        """Size (width, height) that an image of `width` x `height` pixels is trained at; never larger than it is.
+
+        Rounds as 3DGS does: sides of a fraction to the nearest integer, heights that follow from a width downwards.
+        Unlike 3DGS it divides exactly, so that a width of 1600 never becomes 1599.
+
+        >>> parse_resolution("1k").size_for(3118, 2078)
+        (1600, 1066)
+        """
+        if self.width is None:
+            return max(1, round(width * self.fraction)), max(1, round(height * self.fraction))
+        if self.width >= width:
+            return width, height
+        target = (width + self.width) // 2 if self.midpoint else self.width
+        return target, max(1, height * target // width)
+
+    def falls_short(self, width: int) -> bool:
+        """Whether this setting asks for more than an image of `width` pixels has, so that the image stays as it is."""
+        return self.width is not None and self.width > width
+
+
+def parse_resolution(text: str) -> Resolution:
+    """The resolution a user wrote: "1k", "2k", "4k", "full", a width such as "800", or "1/4" or "0.25".
+
+    1k is width 1600, 4k the full size and 2k the midpoint of the two widths, as the paper defines them.
+
+    Raises:
+        UserInputError: the text is none of these.
+    """
+    setting = text.strip().lower()
+    if setting == "1k":
+        return Resolution(text, width=PAPER_WIDTH)
+    if setting == "2k":
+        return Resolution(text, width=PAPER_WIDTH, midpoint=True)
+    if setting in ("4k", "full"):
+        return Resolution(text)
+    if re.fullmatch(r"[0-9]{1,9}", setting):
+        return _from_width(text, int(setting))
+    if re.fullmatch(r"[0-9]{1,9}/[0-9]{1,9}|[0-9]{0,9}\.[0-9]{1,9}", setting):
+        return _from_fraction(text, setting)
+    raise UserInputError(f"--resolution {text!r}: expected {ACCEPTED}")
+
+
+def _from_width(text: str, width: int) -> Resolution:
+    if width < MIN_WIDTH:
+        hint = f"; for a fraction of the full size write 1/{width}" if width > 1 else ""
+        raise UserInputError(f"--resolution {text!r}: expected a width of at least {MIN_WIDTH} pixels{hint}")
+    return Resolution(text, width=width)
+
+
+def _from_fraction(text: str, setting: str) -> Resolution:
+    try:
+        fraction = Fraction(setting)
+    except ZeroDivisionError as error:
+        raise UserInputError(f"--resolution {text!r}: division by zero, expected {ACCEPTED}") from error
+    if not 0 < fraction <= 1:
+        raise UserInputError(f"--resolution {text!r}: expected a fraction above 0 and at most 1, images only shrink")
+    return Resolution(text, fraction=fraction)

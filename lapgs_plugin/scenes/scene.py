@@ -1,0 +1,237 @@
+"""Scenes: posed views with their images in memory, and the sparse points training starts from."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.progress import item_progress
+from lapgs_plugin.scenes.blender import has_transforms, read_transforms
+from lapgs_plugin.scenes.colmap import find_model, read_colmap
+from lapgs_plugin.scenes.images import image_size, read_image
+from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
+from lapgs_plugin.scenes.source import Frame, SceneSource
+
+ProgressCallback = Callable[[int, int], None]
+"""Called with the number of images read and their total."""
+
+MAX_WORKERS = 16
+EXTENT_MARGIN = 1.1
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class View:
+    """One photo and the camera that took it.
+
+    Attributes:
+        name: unique name of the image in its scene, such as "0001.jpg" or "train/r_0.png": relative to the image folder
+            of a COLMAP scene, to the scene folder otherwise.
+        camera: size, intrinsics and pose; float32. Its size is the image's.
+        image: (3, h, w) float32 RGB, in [0, 1] unless the file holds wider values (EXR), on the CPU.
+    """
+
+    name: str
+    camera: Camera
+    image: Tensor  # (3, h, w)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything training reads from a scene folder.
+
+    Attributes:
+        path: the scene folder.
+        kind: "colmap" or "transforms".
+        train: views to train on, in name order, at least two.
+        test: views held out, in name order; empty unless asked for.
+        points: (n, 3) float32 positions of the sparse points, in world units, n at least 1.
+        colors: (n, 3) float32 RGB of the points, in [0, 1].
+        extent: size of the scene in world units as 3DGS measures it: 1.1 times the largest distance of a training
+            camera's centre from the mean of all of them.
+        background: RGB in [0, 1] that transparent pixels were blended over.
+    """
+
+    path: Path
+    kind: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: Tensor  # (n, 3)
+    colors: Tensor  # (n, 3)
+    extent: float
+    background: tuple[float, float, float]
+
+    @property
+    def smallest_size(self) -> tuple[int, int]:
+        """Smallest width and smallest height over all views, in pixels: what a plan must fit into."""
+        cameras = [view.camera for view in (*self.train, *self.test)]
+        return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+
+
+def load_scene(
+    path: Path | str,
+    *,
+    resolution: str = "full",
+    images: str = "images",
+    eval: bool = False,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: bool | ProgressCallback = True,
+) -> Scene:
+    """Read a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
+
+    Everything but the pixels is checked first. Views may differ in size.
+
+    Args:
+        path: the scene folder.
+        resolution: "full", "1k", "2k", "4k", a width or a fraction; see `parse_resolution`. It counts from the size of
+            the image files, which may be the model's or a multiple of it.
+        images: name of the image folder, such as "images_4" for smaller copies.
+        eval: hold out every eighth view in name order, or what `transforms_test.json` lists.
+        background: RGB that shows through transparent pixels.
+        progress: True shows a bar on stderr, False nothing; a function is called with the number of images read and
+            their total.
+
+    Raises:
+        SceneError: the folder, its model or an image is not usable; the message names the file.
+        UserInputError: the resolution is none of the accepted ones.
+    """
+    rule = parse_resolution(resolution)
+    path = Path(path)
+    source = _read_source(path, images, eval)
+    _check_source(path, source)
+    frames = [*source.train, *source.test]
+    cameras = [_sized_camera(frame, rule) for frame in frames]
+    short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
+    if short:
+        logger.warning(
+            "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
+            *(resolution, len(short), len(frames), max(short)),
+        )
+    views = _load_views(frames, cameras, background, progress)
+    return Scene(
+        path=path,
+        kind=source.kind,
+        train=tuple(views[: len(source.train)]),
+        test=tuple(views[len(source.train) :]),
+        points=torch.from_numpy(source.points).float(),
+        colors=torch.from_numpy(source.colors).float().clamp(0.0, 1.0),
+        extent=_extent(path, source.train),
+        background=background,
+    )
+
+
+def _read_source(path: Path, images: str, evaluate: bool) -> SceneSource:
+    if not path.is_dir():
+        raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
+    model = find_model(path)
+    if model is not None:
+        return read_colmap(path, model, images, evaluate)
+    if has_transforms(path):
+        return read_transforms(path, images, evaluate)
+    raise SceneError(
+        f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; "
+        "make a scene from photos with `lapgs prepare PHOTOS OUT`"
+    )
+
+
+def _check_source(path: Path, source: SceneSource) -> None:
+    """Refuse what cannot be trained on, before any image is read."""
+    frames = [*source.train, *source.test]
+    if len(source.train) < 2:
+        held_out = f" besides {len(source.test)} held out" if source.test else ""
+        hint = "train without --eval or add photos" if source.test else "add photos and reconstruct again"
+        raise SceneError(f"{path}: {len(source.train)} training views{held_out}, expected at least 2; {hint}")
+    names = [frame.name for frame in frames]
+    if len(set(names)) < len(names):
+        double = next(name for name in names if names.count(name) > 1)
+        raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
+    for frame in frames:
+        if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
+            # Renders are written under these names.
+            raise SceneError(
+                f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it; "
+                "copy the photos there and reconstruct or export again"
+            )
+        camera = frame.camera
+        numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+        if not (torch.isfinite(numbers).all() and torch.isfinite(camera.world_to_camera).all()):
+            raise SceneError(f"{path}: the camera of {frame.name} has NaN or inf in it; reconstruct or export it again")
+        if min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
+            raise SceneError(
+                f"{path}: the camera of {frame.name} is {camera.width}x{camera.height} pixels with focal lengths "
+                f"{camera.fx:g} and {camera.fy:g}, expected positive numbers; reconstruct or export it again"
+            )
+    if len(source.points) == 0 or not bool(torch.isfinite(torch.from_numpy(source.points)).all()):
+        raise SceneError(f"{path}: the sparse points are none or hold NaN or inf; reconstruct or export them again")
+
+
+def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
+    """The camera at the size its image is trained at, after comparing the file's shape with the model's."""
+    camera = frame.camera
+    width, height = image_size(frame.path)
+    # Both sides may have been rounded by up to a pixel when the file was resized.
+    if abs(width / camera.width - height / camera.height) > 1.0 / camera.width + 1.0 / camera.height:
+        raise SceneError(
+            f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
+            "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
+        )
+    resized = camera.resized(*rule.size_for(width, height))
+    return resized.to(dtype=torch.float32)
+
+
+def _load_views(
+    frames: Sequence[Frame],
+    cameras: Sequence[Camera],
+    background: tuple[float, float, float],
+    progress: bool | ProgressCallback,
+) -> list[View]:
+    """Read all images in parallel, in the order of `frames`; the first one that fails in that order is the error."""
+
+    def load(frame: Frame, camera: Camera) -> View:
+        size = (camera.width, camera.height)
+        return View(frame.name, camera, read_image(frame.path, size=size, background=background))
+
+    bar = item_progress("images") if progress is True else None
+    task = bar.add_task("Reading images", total=len(frames)) if bar else None
+    views = []
+    # One thread an image: each worker's own pool inside torch would only compete with the others.
+    pool = ThreadPoolExecutor(_workers(), initializer=torch.set_num_threads, initargs=(1,))
+    with bar or nullcontext():
+        try:
+            futures = [pool.submit(load, frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
+            for done, future in enumerate(futures, start=1):
+                views.append(future.result())
+                if bar and task is not None:
+                    bar.update(task, completed=done)
+                elif callable(progress):
+                    progress(done, len(frames))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return views
+
+
+def _workers() -> int:
+    """Threads for reading: the processors this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(usable, MAX_WORKERS)
+
+
+def _extent(path: Path, train: Sequence[Frame]) -> float:
+    centers = torch.stack([frame.camera.position for frame in train])  # (v, 3)
+    extent = EXTENT_MARGIN * float((centers - centers.mean(dim=0)).norm(dim=1).max())
+    if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
+        raise SceneError(
+            f"{path}: all {len(train)} training cameras stand at the same point, expected photos from different places"
+        )
+    return extent

@@ -1,0 +1,95 @@
+"""What a run tells the person who waits for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column
+
+from lapgs_plugin.plan import Stage
+
+
+@dataclass(frozen=True)
+class Tick:
+    """The state of training at one moment.
+
+    Attributes:
+        level, iteration: where in the run; the iteration counts from 1 within the stage.
+        elapsed: optimization seconds since the start of the run, over all stages.
+        loss: smoothed photometric loss.
+        num_gaussians: Gaussians being optimized.
+        rate: iterations a second since the last tick.
+        psnr: held-out PSNR in dB of the composed image at full resolution, when it was measured.
+    """
+
+    level: int
+    iteration: int
+    elapsed: float
+    loss: float
+    num_gaussians: int
+    rate: float
+    psnr: float | None = None
+
+
+class Monitor:
+    """Receives a run's progress; every method is a no-op to override."""
+
+    def stage_started(self, stage: Stage, first_iteration: int) -> None:
+        """Training of `stage` begins, at iteration `first_iteration` when it was resumed."""
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        """Some iterations later."""
+
+    def say(self, text: str) -> None:
+        """Something worth a line."""
+
+
+class ProgressMonitor(Monitor):
+    """A progress bar a stage: rate, time left, loss, Gaussians and held-out PSNR. Use as a context manager."""
+
+    def __init__(self, console: Console, levels: int) -> None:
+        self._levels = levels
+        self._progress = Progress(
+            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            BarColumn(bar_width=None, table_column=Column(ratio=1)),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[figures]}", table_column=Column(no_wrap=True)),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True, table_column=Column(no_wrap=True)),
+            console=console,
+            expand=True,
+        )
+        self._task: TaskID | None = None
+        self._psnr: float | None = None
+
+    def __enter__(self) -> ProgressMonitor:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def stage_started(self, stage: Stage, first_iteration: int) -> None:
+        width, height = stage.image_size
+        name = "field" if self._levels == 1 else "residual" if stage.signed else "base"
+        self._psnr = None
+        self._task = self._progress.add_task(
+            f"{name} {width}x{height}",
+            total=stage.iterations,
+            completed=first_iteration - 1,
+            figures="",
+        )
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        assert self._task is not None
+        self._psnr = tick.psnr if tick.psnr is not None else self._psnr  # measured rarely: the last one stays in sight
+        held_out = "" if self._psnr is None else f" {self._psnr:.2f} dB"
+        figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
+        self._progress.update(self._task, completed=tick.iteration, figures=figures)
+
+    def say(self, text: str) -> None:
+        self._progress.console.print(text)

@@ -1,0 +1,147 @@
+"""What a user can choose for a built-in training run, and what each stage's schedule makes of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.plan import Stage
+
+if TYPE_CHECKING:
+    from lapgs_plugin.archive import Manifest
+
+REFERENCE_ITERATIONS = 30_000
+"""Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
+
+IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
+"""Settings that the manifest has fields of its own for."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam step sizes, as 3DGS publishes them. Positions are in units of the scene's extent."""
+
+    means_first: float = 1.6e-4
+    means_last: float = 1.6e-6
+    sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
+    opacities: float = 5e-2
+    scales: float = 5e-3
+    quats: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Densification:
+    """When Gaussians are cloned, split, pruned and reset, in iterations of a whole run (see `StageSchedule`).
+
+    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 100, 3,000), shrunk in proportion for shorter runs.
+    """
+
+    start: int | None = None
+    until: int | None = None
+    every: int | None = None
+    reset_every: int | None = None
+    grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Everything that decides the result of a run besides the scene."""
+
+    iterations: int = 30_000
+    levels: int = 2
+    split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
+    grid: str = "camera"
+    supervision: str = "reconstructed"
+    inherit: str = "xyz"
+    inherit_ratio: float = 1.0
+    sh_degree: int = 3
+    sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
+    ssim_weight: float = 0.2
+    seed: int = 0
+    cache: str = "memory"
+    cache_precision: str = "float32"
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+    densification: Densification = field(default_factory=Densification)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sh_degree <= 3:
+            raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
+        if not 0.0 < self.inherit_ratio <= 1.0:
+            raise UserInputError(
+                f"--inherit {self.inherit_ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)"
+            )
+        if not 0.0 <= self.ssim_weight <= 1.0:
+            raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+
+    def for_manifest(self) -> dict[str, Any]:
+        """The settings as keyword arguments of `Manifest`: those it names itself, and the rest under "settings"."""
+        values = asdict(self)
+        return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
+
+    @classmethod
+    def from_manifest(cls, manifest: Manifest) -> TrainSettings:
+        """The settings a run was started with.
+
+        Raises:
+            RunFolderError: they hold a key this version does not know or lack one.
+        """
+        values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
+        if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
+            raise RunFolderError(
+                f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
+                f"match); continue it with {manifest.created_by}"
+            )
+        values["learning_rates"] = LearningRates(**values["learning_rates"])
+        values["densification"] = Densification(**values["densification"])
+        values["split"] = None if values["split"] is None else tuple(values["split"])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class StageSchedule:
+    """The schedule of one stage: an iteration in, small answers out, no state.
+
+    Inside a stage of n of N iterations densification stops at `until` scaled by n/N and the position learning rate
+    decays to its last value at n; the other constants stay as the user set them. Iterations count from 1 in each stage.
+    """
+
+    iterations: int
+    densify_start: int
+    densify_until: int
+    densify_every: int
+    reset_every: int
+    sh_every: int
+    sh_degree: int
+    means_first: float
+    means_last: float
+
+    @classmethod
+    def create(cls, settings: TrainSettings, stage: Stage) -> StageSchedule:
+        shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
+        given = settings.densification
+
+        def constant(chosen: int | None, reference: int, smallest: int) -> int:
+            return chosen if chosen is not None else max(smallest, round(reference * shrink))
+
+        until = constant(given.until, REFERENCE_ITERATIONS // 2, 1)
+        return cls(
+            iterations=stage.iterations,
+            densify_start=constant(given.start, 500, 1),
+            densify_until=round(until * stage.iterations / settings.iterations),
+            densify_every=constant(given.every, 100, 25),
+            reset_every=constant(given.reset_every, 3000, 300),
+            sh_every=constant(settings.sh_every, 1000, 1),
+            sh_degree=settings.sh_degree,
+            means_first=settings.learning_rates.means_first,
+            means_last=settings.learning_rates.means_last,
+        )
+
+    def means_learning_rate(self, iteration: int) -> float:
+        """Log-linear decay from the first iteration to the last, in units of the scene's extent."""
+        progress = min(max(iteration / self.iterations, 0.0), 1.0)
+        return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
+
+    def active_sh_degree(self, iteration: int) -> int:
+        return min(self.sh_degree, iteration // self.sh_every)

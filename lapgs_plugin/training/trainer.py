@@ -1,0 +1,282 @@
+"""A whole run: stages from the coarsest level to the finest, archived one by one, resumable at any moment."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.inheritance import field_from_points, inherit
+from lapgs_plugin.plan import Stage, StagePlan, parse_split
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
+from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.supervision import Supervision, parse_supervision
+from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.interrupt import StopRequest, stop_request
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.settings import StageSchedule, TrainSettings
+from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.views import level_views
+
+LOG_TICKS = 200
+"""About how often a run writes to its history and updates its progress display."""
+
+
+def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
+    """The stages of a run on this scene.
+
+    Raises:
+        UserInputError: levels, split and image size do not go together.
+    """
+    split = None if settings.split is None else parse_split(",".join(settings.split))
+    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split)
+
+
+@dataclass
+class Trainer:
+    """Trains the hierarchy of one scene into a run folder.
+
+    Attributes:
+        scene: views, points and background.
+        settings: what decides the result.
+        archive: the run folder; its manifest already says the same settings.
+        rasterizer: renders every field.
+        user_hooks: run after the stock ones.
+        monitor: told about progress.
+        checkpoint_every: iterations between two checkpoints; one is also written when a run is asked to stop.
+        test_every: iterations between two measurements of held-out PSNR; None measures it once at the end of a stage.
+    """
+
+    scene: Scene
+    settings: TrainSettings
+    archive: RunArchive
+    rasterizer: Rasterizer
+    user_hooks: Sequence[StageHook] = ()
+    monitor: Monitor = field(default_factory=Monitor)
+    checkpoint_every: int = 1000
+    test_every: int | None = None
+
+    def __post_init__(self) -> None:
+        self.plan = make_plan(self.scene, self.settings)
+        self._pyramid = Pyramid(self.settings.grid)
+        self._supervision = parse_supervision(self.settings.supervision)
+        self._overhead: dict[str, float] = {}
+        self._train_cache: PredictionCache | None = None
+        self._test_cache: PredictionCache | None = None
+        self._last_tick = (0.0, 0)
+
+    def run(self, resume: bool = False) -> None:
+        """Train all stages that are not finished yet.
+
+        Args:
+            resume: continue from the run folder's checkpoint, or after its last finished level.
+
+        Raises:
+            TrainingStoppedError: the user asked to stop; everything needed to resume is on disk.
+            TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
+        """
+        checkpoint = self.archive.load_checkpoint() if resume else None
+        moments: dict[str, dict[str, Tensor]] | None = None
+        with stop_request() as stop:
+            try:
+                for stage in self.plan:
+                    if stage.level in self.archive.available_levels:
+                        continue
+                    here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
+                    moments = self._run_stage(stage, here, moments, stop)
+            finally:
+                self._close_caches()
+
+    def _run_stage(
+        self,
+        stage: Stage,
+        checkpoint: dict[str, Any] | None,
+        moments: dict[str, dict[str, Tensor]] | None,
+        stop: StopRequest,
+    ) -> dict[str, dict[str, Tensor]]:
+        """Train and archive one stage; returns its Adam moments for the next one to inherit."""
+        self._overhead = {} if checkpoint is None else dict(checkpoint["overhead"])
+        run = self._prepare(stage, self._first_model(stage, checkpoint, moments))
+        if checkpoint is not None:
+            run.restore(checkpoint)
+        self.archive.rewind_history(stage.level, run.progress.iteration)
+        if checkpoint is None and self.settings.inherit == "full":
+            self._save_checkpoint(run)  # it holds the optimizer state that the next lines inherit from nowhere else
+        self.monitor.stage_started(stage, run.progress.iteration + 1)
+        self._last_tick = (run.progress.seconds, run.progress.iteration)
+        run.hooks.on_stage_start(stage)
+
+        def after_iteration(run: StageRun) -> None:
+            self._after_iteration(run, stop)
+
+        run.run(after_iteration)
+        run.hooks.on_stage_end(stage)
+        self._finish(run)
+        return run.model.optimizer_moments()
+
+    def _first_model(
+        self, stage: Stage, checkpoint: dict[str, Any] | None, moments: dict[str, dict[str, Tensor]] | None
+    ) -> TrainableField:
+        """The field a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
+        torch.manual_seed(self.settings.seed * 1000 + stage.level)  # split positions; the same however we got here
+        rates, extent = self.settings.learning_rates, self.scene.extent
+        if checkpoint is not None:
+            return TrainableField.from_state(checkpoint["model"], rates, extent)
+        with self._timed("inheritance"):
+            if not stage.signed:
+                points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
+                return TrainableField.create(points, rates, extent)
+            generator = torch.Generator().manual_seed(self.settings.seed)
+            field, kept = inherit(
+                self.archive.field(stage.level + 1), self.settings.inherit, self.settings.inherit_ratio, generator
+            )
+            model = TrainableField.create(field, rates, extent)
+            if self.settings.inherit == "full":
+                if moments is None:
+                    raise RunFolderError(
+                        f"{self.archive.path()}: --inherit full needs the optimizer state of level {stage.level + 1}, "
+                        "which only the checkpoint held, and that is gone; start again with --overwrite"
+                    )
+                model.adopt_moments(moments, kept)
+            return model
+
+    def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
+        schedule = StageSchedule.create(self.settings, stage)
+        with self._timed("pyramid"):
+            views = level_views(
+                self.scene.train,
+                stage.level,
+                self.plan.levels,
+                self._pyramid,
+                with_coarse=self._supervision is Supervision.GT_LAPLACIAN,
+            )
+        self._fill_caches(stage)
+        return StageRun(
+            stage=stage,
+            schedule=schedule,
+            settings=self.settings,
+            views=views,
+            accumulated=self._train_cache,
+            background=torch.zeros(3) if stage.signed else torch.tensor(self.scene.background),
+            extent=self.scene.extent,
+            rasterizer=self.rasterizer,
+            hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
+            model=model,
+            densifier=Densifier(schedule, self.settings.densification, self.scene.extent),
+        )
+
+    def _fill_caches(self, stage: Stage) -> None:
+        """Keep Up of the finished levels' composed prediction of every view that this stage will look at."""
+        self._close_caches()
+        if not stage.signed:
+            return
+        with self._timed("cache"):
+            self._train_cache = self._predictions(stage, self.scene.train, "train")
+        with self._timed("evaluation"):
+            self._test_cache = self._predictions(stage, self.scene.test, "test")
+
+    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> PredictionCache:
+        """Up(I_hat^(l+1)) of each view, for the stage of level l."""
+        settings, coarser = self.settings, stage.level + 1
+        cache = PredictionCache(settings.cache, settings.cache_precision, self.archive.path(CACHE, name))
+        if views:
+            renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer)
+            for view in views:
+                camera = level_camera(view.camera, stage.level)
+                composed = renderer.render(view.camera, level=coarser).composed[coarser]
+                cache.put(view.name, self._pyramid.up(composed, (camera.height, camera.width)))
+        return cache
+
+    def _close_caches(self) -> None:
+        for cache in (self._train_cache, self._test_cache):
+            if cache is not None:
+                cache.close()
+        self._train_cache = self._test_cache = None
+        shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
+
+    def _after_iteration(self, run: StageRun, stop: StopRequest) -> None:
+        """Log, measure, save and stop, whatever is due; none of it counts as optimization time."""
+        iteration = run.progress.iteration
+        last = iteration == run.stage.iterations
+        due_test = last if self.test_every is None else (last or iteration % self.test_every == 0)
+        psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
+        if psnr is not None or last or iteration % max(1, self.plan.iterations // LOG_TICKS) == 0:
+            self._tick(run, psnr)
+        if stop.requested or iteration % self.checkpoint_every == 0:
+            self._save_checkpoint(run)
+        if stop.requested:
+            raise TrainingStoppedError(
+                f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
+                f"a checkpoint is in {self.archive.path()}, the same command with --resume continues"
+            )
+
+    def _tick(self, run: StageRun, psnr: float | None) -> None:
+        before_seconds, before_iteration = self._last_tick
+        progress = run.progress
+        self._last_tick = (progress.seconds, progress.iteration)
+        finished = sum(record.train_seconds for record in self.archive.manifest.records)
+        tick = Tick(
+            level=run.stage.level,
+            iteration=progress.iteration,
+            elapsed=finished + progress.seconds,
+            loss=progress.loss,
+            num_gaussians=len(run.model),
+            rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
+            psnr=psnr,
+        )
+        self.archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
+        self.monitor.tick(run.stage, tick)
+
+    @torch.no_grad()
+    def _held_out_psnr(self, run: StageRun) -> float:
+        """Mean PSNR in dB of the held-out views, composed so far and brought to full resolution."""
+        with self._timed("evaluation"):
+            values = []
+            for view in self.scene.test:
+                camera = level_camera(view.camera, run.stage.level)
+                image = self.rasterizer(run.model.field, camera, background=run.background).image
+                if self._test_cache is not None:
+                    image = image + self._test_cache.get(view.name)
+                values.append(psnr(to_full_size(image, view.camera, run.stage.level, self._pyramid), view.image))
+            return math.fsum(values) / len(values)
+
+    def _save_checkpoint(self, run: StageRun) -> None:
+        with self._timed("checkpoints"):
+            self.archive.save_checkpoint({**run.state(), "overhead": dict(self._overhead)})
+
+    def _finish(self, run: StageRun) -> None:
+        field = run.model.field.detach()
+        record = LevelRecord(
+            level=run.stage.level,
+            signed=run.stage.signed,
+            iterations=run.stage.iterations,
+            num_gaussians=len(field),
+            peak_gaussians=run.progress.peak_gaussians,
+            train_seconds=run.progress.seconds,
+            overhead_seconds=dict(self._overhead),
+            image_size=run.stage.image_size,
+        )
+        self.archive.finish_level(record, field)
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        """Add the time spent inside to the stage's overhead under `what`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._overhead[what] = self._overhead.get(what, 0.0) + time.perf_counter() - start

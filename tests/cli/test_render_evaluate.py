@@ -1,0 +1,217 @@
+"""`lapgs render` and `lapgs eval`: their files against each other and against NumPy."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.render import render
+from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError, UserInputError
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.scenes import read_image
+from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
+
+app = typer.Typer()
+app.command("render")(render)
+app.command("eval")(evaluate)
+
+
+def lapgs(*arguments: object) -> str:
+    """Standard output of a command that succeeds; a LapgsError comes through as it is."""
+    result = CliRunner(env={"COLUMNS": "100"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def run(scene: Path, tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run", scene)
+
+
+def test_render_writes_every_image_of_the_held_out_views(run: Path) -> None:
+    output = lapgs("render", run)
+    suffixes = ("base", "residual_0", "composed")
+    assert files_in(run / "renders") == {f"test/photos/{i}_{s}.png" for i in ("00", "08") for s in suffixes}
+    assert str(run / "renders") in output
+
+
+def test_exr_files_add_up_and_png_files_show_them(run: Path) -> None:
+    lapgs("render", run, "--format", "exr")
+    lapgs("render", run)
+    folder = run / "renders" / "test" / "photos"
+    exr = {s: read_image(folder / f"00_{s}.exr") for s in ("base", "residual_0", "composed")}
+    assert exr["base"].shape == (3, 20, 28)
+    assert exr["residual_0"].min() < -0.05
+    up = Pyramid("camera").up(exr["base"], (40, 56))
+    np.testing.assert_allclose(exr["composed"], up + exr["residual_0"], atol=1e-6)
+    shown = {
+        "base": exr["base"].clamp(0, 1),
+        "residual_0": (0.5 + exr["residual_0"] / 2).clamp(0, 1),
+        "composed": exr["composed"].clamp(0, 1),
+    }
+    for suffix, image in shown.items():
+        png = cv2.imread(str(folder / f"00_{suffix}.png"))[:, :, ::-1] / 255.0
+        np.testing.assert_allclose(png, image.permute(1, 2, 0).numpy(), atol=0.5 / 255 + 1e-6)
+
+
+def test_compare_puts_photo_and_composition_side_by_side(run: Path, scene: Path) -> None:
+    lapgs("render", run, "--compare")
+    folder = run / "renders" / "test" / "photos"
+    compare = cv2.imread(str(folder / "08_compare.png")).astype(int)
+    photo, composed = cv2.imread(str(scene / "photos" / "08.png")), cv2.imread(str(folder / "08_composed.png"))
+    np.testing.assert_array_equal(compare[:, :56], photo)
+    np.testing.assert_array_equal(compare[:, 56:112], composed)
+    expected = 127.5 + (composed.astype(int) - photo.astype(int)) / 2
+    np.testing.assert_allclose(
+        compare[:, 112:], expected, atol=1.0
+    )  # three roundings of half a step, one of them halved
+
+
+def test_render_options(run: Path, tmp_path: Path) -> None:
+    lapgs("render", run, "--level", "1", "--out", tmp_path / "coarse")
+    assert files_in(tmp_path / "coarse") == {"test/photos/00_base.png", "test/photos/08_base.png"}
+    lapgs("render", run, "--views", "all", "--out", tmp_path / "all")
+    assert len(files_in(tmp_path / "all" / "train")) == 8 * 3
+    assert len(files_in(tmp_path / "all" / "test")) == 2 * 3
+    assert not (run / "renders").exists()
+
+
+def test_one_level_has_one_image_a_view(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, levels=1, hold_out=False)
+    lapgs("render", run)
+    assert files_in(run / "renders") == {f"train/photos/{i:02d}_composed.png" for i in range(10)}
+
+
+def test_an_interrupted_run_renders_what_is_there_and_is_not_measured(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, finished=1)
+    lapgs("render", run)
+    assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
+        lapgs("render", run, "--level", 0)
+    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
+        lapgs("eval", run)
+    empty = write_run(tmp_path / "empty", scene, finished=0)
+    with pytest.raises(RunFolderError, match="level 1 is not in this run"):
+        lapgs("render", empty)
+
+
+def test_view_names_that_would_share_a_file_keep_their_extension(tmp_path: Path) -> None:
+    names = ["a/1.png", "a/1.tif", *(f"b/{i}.png" for i in range(8))]
+    scene = write_scene(tmp_path / "scene", names)
+    run = write_run(tmp_path / "run", scene, levels=1, hold_out=False)
+    lapgs("render", run)
+    written = files_in(run / "renders" / "train")
+    assert {"a/1.png_composed.png", "a/1.tif_composed.png", "b/0_composed.png"} <= written
+    assert len(written) == 10
+
+
+def test_eval_agrees_with_numpy_on_the_rendered_files(run: Path, scene: Path) -> None:
+    output = lapgs("eval", run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    lapgs("render", run, "--format", "exr")
+    values = []
+    for view in ("00", "08"):
+        rendered = read_image(run / "renders" / "test" / "photos" / f"{view}_composed.exr").numpy()
+        photo = cv2.imread(str(scene / "photos" / f"{view}.png"))[:, :, ::-1].transpose(2, 0, 1) / 255.0
+        values.append(-10 * math.log10(np.mean((rendered.clip(0, 1) - photo) ** 2)))
+    assert [view["name"] for view in metrics["views"]] == ["photos/00.png", "photos/08.png"]
+    assert [view["psnr"] for view in metrics["views"]] == pytest.approx(values, abs=1e-4)  # worst seen 2e-6
+    assert metrics["psnr"] == pytest.approx(np.mean(values), abs=1e-4)
+    assert metrics["levels"]["0"]["psnr"] == pytest.approx(metrics["psnr"], abs=1e-12)
+    assert metrics["levels"]["0"]["upsampled_psnr"] == pytest.approx(metrics["psnr"], abs=1e-12)
+    assert 0 < metrics["ssim"] < 1
+    assert f"{metrics['psnr']:.2f} dB" in output
+    assert output.index("photos/00.png" if values[0] < values[1] else "photos/08.png") < output.index(
+        "photos/08.png" if values[0] < values[1] else "photos/00.png"
+    )
+
+
+def test_eval_sums_what_training_recorded(run: Path) -> None:
+    lapgs("eval", run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["split"] == "test"
+    assert metrics["num_views"] == 2
+    assert metrics["train_seconds"] == SECONDS[0] + SECONDS[1]
+    assert metrics["num_gaussians"] == {"1": 250, "0": 200}
+    assert metrics["peak_gaussians"] == 257
+    assert metrics["overhead_seconds"] == {"pyramid": 0.625, "cache": 0.25}
+    assert metrics["levels"]["1"]["image_size"] == [28, 20]
+    assert metrics["rasterizer"] == "cpu"
+    assert metrics["versions"].keys() >= {"lapgs_plugin", "torch", "python"}
+    assert RunArchive.open(run).metrics() == metrics
+
+
+def test_without_held_out_views_eval_says_so(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, hold_out=False)
+    assert "TRAINING" in lapgs("eval", run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert (metrics["split"], metrics["num_views"]) == ("train", 10)
+    with pytest.raises(UserInputError, match="nothing was held out"):
+        lapgs("render", run, "--views", "test")
+
+
+def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> None:
+    old = tmp_path / "old"
+    shutil.copytree(scene, old)
+    run = write_run(tmp_path / "run", old)
+    old.rename(tmp_path / "new")
+    for command in ("render", "eval"):
+        with pytest.raises(RunFolderError, match="old, which is not there any more; say where it is now with --scene"):
+            lapgs(command, run)
+        lapgs(command, run, "--scene", tmp_path / "new")
+        with pytest.raises(SceneError, match="no such scene folder"):
+            lapgs(command, run, "--scene", tmp_path / "nowhere")
+
+
+def test_another_scene_is_refused(run: Path, tmp_path: Path) -> None:
+    other = write_scene(tmp_path / "other", size=(64, 48))
+    with pytest.raises(RunFolderError, match=r"level 1 would be 32x24 pixels, the run was trained at 28x20"):
+        lapgs("eval", run, "--scene", other)
+
+
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_a_folder_that_is_no_run_is_refused(command: str, tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match="not a run"):
+        lapgs(command, tmp_path)
+
+
+@pytest.mark.parametrize(("option", "value"), [("--views", "validation"), ("--format", "tga")])
+def test_unknown_choices_name_the_known_ones(option: str, value: str, run: Path) -> None:
+    with pytest.raises(UserInputError, match=f"{option} {value}: expected "):
+        lapgs("render", run, option, value)
+
+
+def test_an_interruption_leaves_only_whole_images(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lapgs_plugin import scenes
+
+    write, written = scenes.write_image, []
+
+    def interrupted(path: Path, image: object) -> None:
+        if len(written) == 4:
+            raise KeyboardInterrupt
+        write(path, image)
+        written.append(path)
+
+    monkeypatch.setattr(scenes, "write_image", interrupted)
+    result = CliRunner().invoke(app, ["render", str(run)])
+    assert result.exit_code != 0
+    assert len(files_in(run / "renders")) == 4
+    for path in written:
+        assert cv2.imread(str(path)) is not None

@@ -1,0 +1,183 @@
+"""Runs of the built-in trainer: they learn, they repeat bit for bit, and they continue where they stopped."""
+
+from __future__ import annotations
+
+import math
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, TrainingStoppedError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.plan import Stage
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.interrupt import stop_request
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import ring_scene
+
+SETTINGS = TrainSettings(
+    iterations=60,
+    sh_degree=1,
+    sh_every=10,
+    densification=Densification(start=3, until=45, every=5, reset_every=12),
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ring_scene()
+
+
+def make_archive(path: Path, settings: TrainSettings) -> RunArchive:
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    return RunArchive.create(path, Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest()))
+
+
+def train(path: Path, scene: Scene, settings: TrainSettings = SETTINGS, **options: object) -> RunArchive:
+    with make_archive(path, settings) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer(), **options).run()
+    return RunArchive.open(path)
+
+
+def plys(archive: RunArchive) -> list[bytes]:
+    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+
+
+class StopAt(Monitor):
+    """Asks the run to stop, as Ctrl-C does, when a level reaches an iteration."""
+
+    def __init__(self, level: int, iteration: int) -> None:
+        self._place = (level, iteration)
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == self._place:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path: Path) -> None:
+    calm = Densification(start=20, until=150, every=20, reset_every=10_000)
+    archive = train(tmp_path / "run", scene, replace(SETTINGS, iterations=300, densification=calm))
+    base, composed = [], []
+    renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
+    for view in scene.train:
+        levels = renderer.render(view.camera).composed
+        base.append(psnr(to_full_size(levels[1], view.camera, 1, renderer.pyramid), view.image))
+        composed.append(psnr(levels[0], view.image))
+    assert min(base) > 17.0  # worst 18.1; a black image has 14
+    assert sum(composed) / len(composed) > sum(base) / len(base) + 1.0  # the gain was 4.5 dB
+    assert [record.level for record in archive.manifest.records] == [1, 0]
+    assert archive.manifest.complete
+    assert not archive.field(1).signed
+    assert archive.field(0).signed
+    assert not archive.path("checkpoint.pt").exists()
+
+
+def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Path) -> None:
+    archive = train(tmp_path / "run", scene, replace(SETTINGS, levels=1))
+    (record,) = archive.manifest.records
+    assert (record.level, record.signed, record.iterations) == (0, False, 60)
+    assert record.num_gaussians == len(archive.field(0)) <= record.peak_gaussians
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(scene: Scene, tmp_path: Path) -> None:
+    first = plys(train(tmp_path / "a", scene))
+    assert first == plys(train(tmp_path / "b", scene))
+    assert first != plys(train(tmp_path / "c", scene, replace(SETTINGS, seed=1)))
+
+
+@pytest.fixture(scope="module", params=["xyz", "full"])
+def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
+    """An uninterrupted run."""
+    settings = replace(SETTINGS, inherit=request.param)
+    return train(tmp_path_factory.mktemp("whole") / "run", scene, settings)
+
+
+@pytest.mark.parametrize(("level", "iteration"), [(1, 7), (1, 20), (0, 1), (0, 33)])
+def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
+    scene: Scene, tmp_path: Path, whole: RunArchive, level: int, iteration: int
+) -> None:
+    settings = TrainSettings.from_manifest(whole.manifest)
+    with make_archive(tmp_path / "parts", settings) as archive:
+        trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(level, iteration))
+        with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
+            trainer.run()
+    with RunArchive.open(tmp_path / "parts", resume=True) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
+        assert plys(archive) == plys(whole)
+        places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
+    assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
+
+
+def test_full_inheritance_without_its_checkpoint_says_what_is_missing(scene: Scene, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, inherit="full")
+    with make_archive(tmp_path / "run", settings) as archive:
+        with pytest.raises(TrainingStoppedError):
+            Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(0, 10)).run()
+        archive.path("checkpoint.pt").unlink()
+        with pytest.raises(RunFolderError, match="optimizer state of level 1"):
+            Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"supervision": "online_residual"},
+        {"supervision": "gt_laplacian"},
+        {"levels": 1},
+        {"inherit_ratio": 0.5},
+        {"grid": "even"},
+        {"cache": "disk", "cache_precision": "float16"},
+        {"cache_precision": "uint8"},
+    ],
+)
+def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, object]) -> None:
+    settings = replace(SETTINGS, **changes)
+    archive = train(tmp_path / "run", scene, settings)
+    losses = {entry["level"]: entry["loss"] for entry in archive.history()}
+    assert all(math.isfinite(loss) for loss in losses.values())
+    assert archive.manifest.complete
+    assert not archive.path("cache").exists()
+    assert TrainSettings.from_manifest(archive.manifest) == settings
+
+
+def test_an_inherited_share_starts_smaller(scene: Scene, tmp_path: Path) -> None:
+    quiet = Densification(start=1000, until=1, every=1000, reset_every=1000)
+    settings = replace(SETTINGS, iterations=30, inherit_ratio=0.25, densification=quiet)
+    archive = train(tmp_path / "run", scene, settings)
+    base, residual = archive.manifest.records
+    assert residual.num_gaussians == round(0.25 * base.num_gaussians)
+
+
+def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, tmp_path: Path) -> None:
+    class Poison(StageHook):
+        def compose(self, context: StageContext, image: torch.Tensor) -> torch.Tensor:
+            return image * math.nan if (context.stage.level, context.iteration) == (0, 23) else image
+
+    with make_archive(tmp_path / "run", SETTINGS) as archive:
+        trainer = Trainer(scene, SETTINGS, archive, CpuRasterizer(), user_hooks=[Poison()], checkpoint_every=10)
+        with pytest.raises(TrainingDivergedError, match="level 0, iteration 23: the loss is nan"):
+            trainer.run()
+    archive = RunArchive.open(tmp_path / "run")
+    assert archive.available_levels == (1,)
+    checkpoint = archive.load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["progress"]["iteration"] == 20
+
+
+def test_stop_requests_are_honoured_once_and_handlers_restored() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with stop_request() as request:
+        signal.raise_signal(signal.SIGTERM)
+        assert request.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before

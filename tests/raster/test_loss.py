@@ -1,0 +1,205 @@
+"""The fused photometric loss against PyTorch convolutions, finite differences, closed forms and kornia."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import kornia
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.reference_raster.loss import C1, RADIUS, photometric_loss_cpu, ssim_cpu, ssim_map_cpu
+
+
+@pytest.fixture
+def restored_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def conv_ssim_map(p: Tensor, t: Tensor) -> Tensor:
+    """SSIM by its definition: five moments, each a dense 11x11 convolution with zeros around the image."""
+    offsets = torch.arange(-5, 6, dtype=p.dtype)
+    squared_radius = offsets[:, None] ** 2 + offsets[None, :] ** 2  # (11, 11)
+    window = torch.exp(-squared_radius / (2 * 1.5**2))
+    window = (window / window.sum())[None, None]
+
+    def mean(x: Tensor) -> Tensor:
+        return F.conv2d(x[:, None], window, padding=5)[:, 0]
+
+    mu_p, mu_t = mean(p), mean(t)
+    var_p, var_t, cov = mean(p * p) - mu_p**2, mean(t * t) - mu_t**2, mean(p * t) - mu_p * mu_t
+    luminance = (2 * mu_p * mu_t + 0.01**2) / (mu_p**2 + mu_t**2 + 0.01**2)
+    return luminance * (2 * cov + 0.03**2) / (var_p + var_t + 0.03**2)
+
+
+def conv_loss(p: Tensor, t: Tensor, weight: float) -> Tensor:
+    return (1 - weight) * F.l1_loss(p, t) + weight * (1 - conv_ssim_map(p, t).mean())
+
+
+def images(shape: tuple[int, int, int], seed: int = 0, low: float = 0.0, high: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Two related images of values in [low, high], float64."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(shape, generator=generator, dtype=torch.float64)
+    noise = torch.rand(shape, generator=generator, dtype=torch.float64)
+    prediction = 0.7 * target + 0.3 * noise
+    return (prediction * (high - low) + low).requires_grad_(), target * (high - low) + low
+
+
+def loss_and_gradient(p: Tensor, t: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    p = p.detach().clone().requires_grad_()
+    loss = photometric_loss_cpu(p, t, weight)
+    loss.backward()
+    assert p.grad is not None
+    return loss.detach(), p.grad
+
+
+def assert_matches_convolutions(p: Tensor, t: Tensor, weight: float) -> None:
+    loss, gradient = loss_and_gradient(p, t, weight)
+    expected = conv_loss(p, t, weight)
+    (expected_gradient,) = torch.autograd.grad(expected, p)
+    # Worst seen in 500 random cases: 4e-16, 7e-14 (the gradient in units of one pixel's share of the loss), 1.3e-14.
+    torch.testing.assert_close(loss, expected.detach(), rtol=0, atol=1e-14)
+    torch.testing.assert_close(gradient * p.numel(), expected_gradient * p.numel(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(ssim_map_cpu(p, t), conv_ssim_map(p, t).detach(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        (1, 1, 1),
+        (3, 1, 40),
+        (3, 40, 1),
+        (3, 5, 7),
+        (3, 11, 11),
+        (3, 10, 12),
+        (3, 63, 65),
+        (2, 131, 17),  # two strips of rows
+        (1, 9, 803),  # three blocks of columns
+        (1, 131, 411),
+    ],
+    ids=lambda shape: "x".join(map(str, shape)),
+)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_equals_convolutions_at_any_size(shape: tuple[int, int, int], weight: float) -> None:
+    assert_matches_convolutions(*images(shape), weight)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    shape=st.tuples(st.integers(1, 4), st.integers(1, 26), st.integers(1, 40)),
+    low=st.floats(-2, 0),
+    high=st.floats(0.5, 3),
+    weight=st.floats(0, 1),
+    seed=st.integers(0, 1000),
+)
+def test_equals_convolutions_for_values_below_zero_and_above_one(
+    shape: tuple[int, int, int], low: float, high: float, weight: float, seed: int
+) -> None:
+    assert_matches_convolutions(*images(shape, seed, low, high), weight)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 4, 3), (1, 13, 6)])
+def test_gradient_equals_finite_differences(shape: tuple[int, int, int]) -> None:
+    p, t = images(shape)
+    assert torch.autograd.gradcheck(lambda x: photometric_loss_cpu(x, t, 0.2), p, eps=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-0.5, 0.5), (-1.0, 2.0)])
+def test_float32_stays_close_to_float64(low: float, high: float) -> None:
+    p, t = images((3, 131, 411), low=low, high=high)
+    loss, gradient = loss_and_gradient(p.float(), t.float(), 0.2)
+    exact, exact_gradient = loss_and_gradient(p.float().double(), t.float().double(), 0.2)
+    assert loss.dtype == gradient.dtype == torch.float32
+    assert abs(loss.double() - exact) < 1e-7  # worst seen: 1.1e-8
+    # In units of one pixel's share of the loss, whose gradients are about 1; worst seen: 5.6e-6.
+    assert (gradient.double() - exact_gradient).abs().max() * p.numel() < 5e-5
+
+
+def test_loss_and_gradient_vanish_for_equal_images() -> None:
+    _, t = images((3, 30, 50))
+    loss, gradient = loss_and_gradient(t, t, 0.2)
+    assert abs(loss) < 1e-14  # worst seen: 0
+    assert gradient.abs().max() * t.numel() < 1e-12  # worst seen: 9e-16
+
+
+def test_ssim_of_constant_images_is_its_luminance_term() -> None:
+    a, b = 0.3, 0.8
+    p, t = torch.full((1, 30, 30), a, dtype=torch.float64), torch.full((1, 30, 30), b, dtype=torch.float64)
+    interior = ssim_map_cpu(p, t)[:, RADIUS:-RADIUS, RADIUS:-RADIUS]
+    torch.testing.assert_close(interior, torch.full_like(interior, (2 * a * b + C1) / (a * a + b * b + C1)))
+
+
+def test_ssim_equals_kornia_away_from_the_border() -> None:
+    p, t = images((3, 40, 60))
+    expected = kornia.metrics.ssim(p.detach()[None], t[None], window_size=11)[0]  # reflects at the border; we pad zeros
+    inside = (slice(None), slice(RADIUS, -RADIUS), slice(RADIUS, -RADIUS))
+    # Worst seen: 4e-11, from the 1e-12 that kornia adds to the denominator.
+    torch.testing.assert_close(ssim_map_cpu(p, t)[inside], expected[inside], rtol=0, atol=1e-9)
+
+
+def test_ssim_is_the_mean_of_its_map_symmetric_and_one_for_equal_images() -> None:
+    p, t = images((3, 40, 60))
+    assert ssim_cpu(p, t) == ssim_map_cpu(p, t).mean()
+    torch.testing.assert_close(ssim_cpu(p, t), ssim_cpu(t, p), rtol=0, atol=1e-15)
+    torch.testing.assert_close(ssim_map_cpu(t, t), torch.ones_like(t))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.usefixtures("restored_threads")
+def test_same_bits_for_any_number_of_threads_and_from_run_to_run(dtype: torch.dtype) -> None:
+    p, t = images((3, 300, 450))
+    results = []
+    for threads in (1, 2, 3, 2):
+        torch.set_num_threads(threads)
+        results.append(loss_and_gradient(p.to(dtype), t.to(dtype), 0.2))
+    for loss, gradient in results[1:]:
+        assert torch.equal(loss, results[0][0])
+        assert torch.equal(gradient, results[0][1])
+
+
+def test_gradient_scales_with_what_comes_back() -> None:
+    p, t = images((3, 20, 20))
+    _, gradient = loss_and_gradient(p, t, 0.2)
+    (scaled,) = torch.autograd.grad(3 * photometric_loss_cpu(p, t), p)
+    torch.testing.assert_close(scaled, 3 * gradient)
+
+
+def test_images_need_not_be_contiguous() -> None:
+    p, t = images((3, 20, 30))
+    loss, gradient = loss_and_gradient(p, t, 0.2)
+    rows_last = p.detach().permute(2, 1, 0).contiguous().permute(2, 1, 0).requires_grad_()
+    strided = photometric_loss_cpu(rows_last, t.permute(1, 2, 0).contiguous().permute(2, 0, 1))
+    assert torch.equal(strided, loss)
+    assert torch.equal(torch.autograd.grad(strided, rows_last)[0], gradient)
+
+
+def test_nan_in_the_prediction_reaches_the_loss() -> None:
+    p, t = images((3, 200, 30))
+    p = p.detach()
+    p[1, 150, 7] = torch.nan
+    assert photometric_loss_cpu(p, t).isnan()
+
+
+@pytest.mark.parametrize(
+    ("p", "t", "weight", "message"),
+    [
+        (torch.zeros(3, 4, 5), torch.zeros(3, 5, 4), 0.2, r"prediction \(3, 4, 5\) and target \(3, 5, 4\)"),
+        (torch.zeros(4, 5), torch.zeros(4, 5), 0.2, r"expected two images of one shape \(channels, height, width\)"),
+        (torch.zeros(3, 0, 5), torch.zeros(3, 0, 5), 0.2, r"prediction \(3, 0, 5\)"),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5).double(), 0.2, "torch.float32 and target of torch.float64"),
+        (torch.zeros(3, 4, 5).half(), torch.zeros(3, 4, 5).half(), 0.2, "expected float32 or float64"),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, requires_grad=True), 0.2, "pass target.detach()"),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5), 1.5, "ssim_weight 1.5: expected a number from 0 to 1"),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, device="meta"), 0.2, "target on meta: expected the CPU"),
+    ],
+)
+def test_refuses_what_it_cannot_compare(p: Tensor, t: Tensor, weight: float, message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        photometric_loss_cpu(p, t, weight)

@@ -1,0 +1,633 @@
+"""Run folders under crashes, full disks, damage and two writers; the prediction cache."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from torch import Tensor
+
+from lapgs_plugin.archive import (
+    FORMAT_VERSION,
+    LevelRecord,
+    Manifest,
+    PredictionCache,
+    RunArchive,
+    SceneReference,
+)
+from lapgs_plugin.errors import FieldError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.field import GaussianField
+
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
+
+
+def manifest(levels: int = 2) -> Manifest:
+    return Manifest(
+        scene=SceneReference("/data/garden", "1/4", True, (0.0, 0.5, 1.0), "colmap"),
+        levels=levels,
+        grid="camera",
+        supervision="reconstructed",
+        inherit="xyz",
+        sh_degree=1,
+        rasterizer="cpu",
+        seed=7,
+        settings={"iterations": 30, "split": ["1/3", "2/3"], "learning_rates": {"means": 1.6e-4}, "sh_every": None},
+    )
+
+
+def level_field(level: int, levels: int = 2) -> GaussianField:
+    n, generator = 4 + level, torch.Generator().manual_seed(level)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return GaussianField(draw(n, 3), draw(n, 4), draw(n, 3), draw(n), draw(n, 4, 3), signed=level != levels - 1)
+
+
+def record(level: int, levels: int = 2) -> LevelRecord:
+    return LevelRecord(
+        level=level,
+        signed=level != levels - 1,
+        iterations=10,
+        num_gaussians=4 + level,
+        peak_gaussians=9,
+        train_seconds=1.5,
+        overhead_seconds={"pyramid": 0.25},
+        image_size=(32, 24),
+    )
+
+
+def finish(archive: RunArchive, level: int) -> None:
+    levels = archive.manifest.levels
+    archive.finish_level(record(level, levels), level_field(level, levels))
+
+
+def assert_level_is_whole(archive: RunArchive, level: int) -> None:
+    loaded, expected = archive.field(level), level_field(level, archive.manifest.levels)
+    assert loaded.signed == expected.signed
+    assert all(torch.equal(loaded.parameters[name], tensor) for name, tensor in expected.parameters.items())
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_run_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path / "deep" / "run", manifest()) as archive:
+        assert (archive.available_levels, archive.manifest.complete, archive.manifest.next_level) == ((), False, 1)
+        finish(archive, 1)
+        finish(archive, 0)
+        archive.write_metrics({"psnr": 30.5, "views": {"a.jpg": 30.5}})
+    again = RunArchive.open(tmp_path / "deep" / "run")
+    assert again.manifest == replace(manifest(), records=(record(1), record(0)), created=again.manifest.created)
+    assert (again.available_levels, again.manifest.complete, again.manifest.next_level) == ((1, 0), True, None)
+    assert_level_is_whole(again, 1)
+    assert_level_is_whole(again, 0)
+    assert again.metrics() == {"psnr": 30.5, "views": {"a.jpg": 30.5}}
+    assert again.path("renders", "x.png") == tmp_path / "deep" / "run" / "renders" / "x.png"
+    layout = {"manifest.json", "metrics.json", ".lock", "level_0/point_cloud.ply", "level_1/point_cloud.ply"}
+    assert set(snapshot(again.path())) == layout
+    json.loads((again.path() / "manifest.json").read_text())
+
+
+def test_a_run_without_measurements_has_none(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        assert archive.metrics() is None
+        assert archive.history() == []
+        assert archive.load_checkpoint() is None
+
+
+def test_a_level_that_is_not_finished_is_named(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        finish(archive, 1)
+        with pytest.raises(RunFolderError, match=r"level 0 is not in this run \(finished: 1 of 2\).*--resume"):
+            archive.field(0)
+
+
+def test_a_field_with_nan_is_not_archived(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        before = snapshot(tmp_path)
+        field = level_field(1)
+        field.means[2, 1] = torch.nan
+        with pytest.raises(FieldError, match="y is NaN"):
+            archive.finish_level(record(1), field)
+        assert snapshot(tmp_path) == before
+
+
+# Starting where something is already
+
+
+def test_an_existing_run_is_refused_and_unharmed(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        finish(archive, 1)
+    before = snapshot(tmp_path)
+    with pytest.raises(RunFolderError, match=r"already holds a run.*--resume.*--overwrite"):
+        RunArchive.create(tmp_path, manifest())
+    with pytest.raises(RunFolderError, match="already holds a run"):
+        RunArchive.require_room(tmp_path)
+    assert snapshot(tmp_path) == before
+
+
+def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        archive.finish_level(record(1), level_field(1), {"x": 1})
+        archive.append_history({"level": 0, "iteration": 1})
+        archive.save_checkpoint({"x": 1})
+        archive.write_metrics({"psnr": 1.0})
+    for name in ("renders/test/a.png", "report.html", "cache/train/000000.bin", "level_1/.point_cloud.ply.9.tmp"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"ours")
+    mine = {"notes.txt": b"mine", "level_1/edited.ply": b"mine", "paper/figure.png": b"mine"}
+    for name, contents in mine.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(contents)
+    RunArchive.create(tmp_path, manifest(levels=3), overwrite=True).close()
+    left = snapshot(tmp_path)
+    assert RunArchive.open(tmp_path).manifest.levels == 3
+    assert {name: left[name] for name in set(left) - {"manifest.json", ".lock"}} == mine
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["photo.jpg", "manifest.json"])
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, name: str, overwrite: bool) -> None:
+    (tmp_path / name).write_text('{"name": "somebody else\'s web app"}')
+    before = snapshot(tmp_path)
+    for refuses in (RunArchive.require_room, lambda path, overwrite: RunArchive.create(path, manifest(), overwrite)):
+        with pytest.raises(RunFolderError, match=f"not empty and not a run .it holds {name}"):
+            refuses(tmp_path, overwrite)
+    assert snapshot(tmp_path) == before
+
+
+def test_a_file_in_the_runs_place_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("x")
+    with pytest.raises(RunFolderError, match="is a file, expected a folder"):
+        RunArchive.create(tmp_path / "run", manifest(), overwrite=True)
+
+
+@posix_only
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_one_line(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(RunFolderError, match="Permission denied"):
+        RunArchive.create(tmp_path / "run", manifest())
+
+
+# Opening what is damaged
+
+
+def complete_run(folder: Path) -> None:
+    with RunArchive.create(folder, manifest()) as archive:
+        finish(archive, 1)
+        finish(archive, 0)
+
+
+def edit_manifest(folder: Path, **changes: Any) -> None:
+    values = json.loads((folder / "manifest.json").read_text())
+    values.update(changes)
+    (folder / "manifest.json").write_text(json.dumps({k: v for k, v in values.items() if v is not ...}, default=str))
+
+
+def test_opening_what_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match="does not exist"):
+        RunArchive.open(tmp_path / "nowhere")
+    with pytest.raises(RunFolderError, match=r"has no manifest\.json"):
+        RunArchive.open(tmp_path)
+
+
+def test_opening_damaged_manifests(tmp_path: Path) -> None:
+    complete_run(tmp_path)
+    whole = (tmp_path / "manifest.json").read_text()
+    values = json.loads(whole)
+    for contents, message in [
+        (whole[: len(whole) // 2], "not readable as JSON"),
+        ("", "not readable as JSON"),
+        ("[]", "holds a JSON list"),
+        (b"\xff\xfe\x00".decode("latin-1"), "not readable as JSON"),
+        (
+            json.dumps({**values, "format_version": 99}),
+            f"format_version 99, this version of lapgs reads {FORMAT_VERSION}",
+        ),
+        (json.dumps({k: v for k, v in values.items() if k != "grid"}), "Manifest lacks grid"),
+        (json.dumps({**values, "flavour": 1}), "Manifest has unknown flavour"),
+        (json.dumps({**values, "scene": None}), "SceneReference lacks background, eval"),
+        (json.dumps({**values, "records": [{}]}), "LevelRecord lacks image_size, iterations"),
+        (json.dumps({**values, "records": values["records"][1:]}), r"finished levels \[0\], expected \[1\] of 2"),
+        (json.dumps({**values, "levels": "two"}), "is damaged"),
+    ]:
+        (tmp_path / "manifest.json").write_text(contents)
+        with pytest.raises(RunFolderError, match=message) as caught:
+            RunArchive.open(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_opening_with_damaged_levels(tmp_path: Path, resume: bool) -> None:
+    complete_run(tmp_path)
+    ply = tmp_path / "level_0" / "point_cloud.ply"
+    whole = ply.read_bytes()
+    level_field(1).save_ply(ply)
+    with pytest.raises(RunFolderError, match=r"level 0 of .* holds 5 Gaussians, the manifest says 4"):
+        RunArchive.open(tmp_path, resume=resume)
+    ply.write_bytes(whole[:-5])
+    with pytest.raises(RunFolderError, match=r"level 0 of .* is damaged: .*cut short or damaged after 3 of 4"):
+        RunArchive.open(tmp_path, resume=resume)
+    ply.unlink()
+    with pytest.raises(RunFolderError, match=r"level 0 of .* is missing"):
+        RunArchive.open(tmp_path, resume=resume)
+    ply.write_bytes(whole)
+    RunArchive.open(tmp_path, resume=resume).close()  # a failed open kept no hold of the folder
+
+
+def test_values_damaged_after_opening_are_found_on_reading(tmp_path: Path) -> None:
+    complete_run(tmp_path)
+    archive = RunArchive.open(tmp_path)
+    ply = tmp_path / "level_1" / "point_cloud.ply"
+    contents = ply.read_bytes()
+    ply.write_bytes(contents[:-4] + np.float32(np.nan).tobytes())
+    with pytest.raises(RunFolderError, match=r"level 1 of .* is damaged: .* rot_3 is NaN"):
+        archive.field(1)
+
+
+# Crashes
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+class MortalProcess:
+    """Dies at a chosen fsync or rename; once dead nothing is cleaned up, as after SIGKILL."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls_left = sys.maxsize
+        real_fsync, real_replace, real_unlink = os.fsync, Path.replace, Path.unlink
+
+        def fsync(descriptor: int) -> None:
+            self._use_call()
+            real_fsync(descriptor)
+
+        def rename(path: Path, target: Path) -> Path:
+            self._use_call()
+            return real_replace(path, target)
+
+        def unlink(path: Path, missing_ok: bool = False) -> None:
+            if self.calls_left >= 0:
+                real_unlink(path, missing_ok=missing_ok)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        monkeypatch.setattr(Path, "replace", rename)
+        monkeypatch.setattr(Path, "unlink", unlink)
+
+    def _use_call(self) -> None:
+        self.calls_left -= 1
+        if self.calls_left < 0:
+            raise Killed
+
+
+def test_a_run_killed_at_any_write_opens_with_what_was_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = MortalProcess(monkeypatch)
+    outcomes: list[int | None] = []
+    while outcomes[-1:] != [2]:
+        folder, finished = tmp_path / str(len(outcomes)), None
+        process.calls_left = len(outcomes)
+        with contextlib.suppress(Killed), RunArchive.create(folder, manifest()) as archive:
+            finished = 0
+            for level in (1, 0):
+                archive.save_checkpoint({"of": level})
+                finish(archive, level)
+                finished += 1
+        outcomes.append(finished)
+        process.calls_left = sys.maxsize
+        if not (folder / "manifest.json").exists():
+            assert finished is None
+            RunArchive.create(folder, manifest()).close()  # what is left there is no obstacle
+        with RunArchive.open(folder, resume=True) as again:
+            # the manifest may be in place already when the kill comes before finish_level returns
+            assert len(again.available_levels) - (finished or 0) in (0, 1)
+            for level in again.available_levels:
+                assert_level_is_whole(again, level)
+            assert again.load_checkpoint() in (None, {"of": again.manifest.next_level})
+            assert not list(folder.rglob("*.tmp"))
+            while again.manifest.next_level is not None:
+                finish(again, again.manifest.next_level)
+            assert again.available_levels == (1, 0)
+    assert set(outcomes) == {None, 0, 1, 2}
+
+
+@posix_only
+def test_a_killed_writer_leaves_no_lock(tmp_path: Path) -> None:
+    script = f"""
+import sys, time
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from tests.unit.test_archive import *
+archive = RunArchive.create({str(tmp_path)!r}, manifest())
+finish(archive, 1)
+print("writing", flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "writing\n"
+        assert RunArchive.open(tmp_path).available_levels == (1,)  # reading is always possible
+        with pytest.raises(RunFolderError, match=f"is being written by process {writer.pid} on "):
+            RunArchive.open(tmp_path, resume=True)
+        with pytest.raises(RunFolderError, match=f"is being written by process {writer.pid} on "):
+            RunArchive.create(tmp_path, manifest(), overwrite=True)
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.wait()
+    assert (tmp_path / ".lock").read_text().startswith(f"process {writer.pid}")
+    with RunArchive.open(tmp_path, resume=True) as archive:
+        finish(archive, 0)
+
+
+def test_two_writers_in_one_process_are_refused(tmp_path: Path) -> None:
+    archive = RunArchive.create(tmp_path, manifest())
+    with pytest.raises(RunFolderError, match=f"is being written by process {os.getpid()}"):
+        RunArchive.open(tmp_path, resume=True)
+    archive.close()
+    RunArchive.open(tmp_path, resume=True).close()
+
+
+def test_writing_needs_the_hold(tmp_path: Path) -> None:
+    complete_run(tmp_path)
+    archive = RunArchive.open(tmp_path)
+    with pytest.raises(AssertionError, match="resume=True"):
+        archive.append_history({"level": 0, "iteration": 1})
+    archive.write_metrics({"psnr": 1.0})  # `lapgs eval` needs none
+
+
+# A full disk
+
+
+def no_space(_: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        finish(archive, 1)
+        archive.save_checkpoint({"iteration": 3})
+        archive.write_metrics({"psnr": 1.0})
+        archive.append_history({"level": 0, "iteration": 1})
+        before = snapshot(tmp_path)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", no_space)
+            for write in (
+                lambda: finish(archive, 0),
+                lambda: archive.save_checkpoint({"iteration": 4}),
+                lambda: archive.write_metrics({"psnr": 2.0}),
+                lambda: archive.rewind_history(0, 0),
+            ):
+                with pytest.raises(
+                    RunFolderError, match=r"cannot be written: No space left.*free some space.*--resume"
+                ):
+                    write()
+        assert snapshot(tmp_path) == before
+        finish(archive, 0)
+    assert RunArchive.open(tmp_path).available_levels == (1, 0)
+
+
+@posix_only
+def test_a_disk_that_fills_in_the_middle_of_a_file(tmp_path: Path) -> None:
+    """A limit on the size of files makes the kernel itself refuse, with half of the bytes written."""
+    script = f"""
+import resource, sys
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from tests.unit.test_archive import *
+archive = RunArchive.create({str(tmp_path)!r}, manifest())
+finish(archive, 1)
+archive.save_checkpoint({{"x": torch.zeros(10)}})
+before = snapshot(archive.path())
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+big = {{name: tensor.repeat(100, *[1] * (tensor.ndim - 1)) for name, tensor in level_field(0).parameters.items()}}
+big_record = replace(record(0), num_gaussians=400)
+cache = PredictionCache("disk", folder=archive.path("cache", "train"))
+for write in (
+    lambda: archive.finish_level(big_record, GaussianField(**big, signed=True)),
+    lambda: archive.save_checkpoint({{"x": torch.zeros(10_000)}}),
+    lambda: cache.put("a", torch.rand(3, 40, 40)),
+):
+    try:
+        write()
+    except RunFolderError as error:
+        assert "File too large" in str(error) and "\\n" not in str(error), error
+    else:
+        raise SystemExit("no error")
+cache.close()
+assert {{k: v for k, v in snapshot(archive.path()).items()}} == before
+assert archive.load_checkpoint()["x"].shape == (10,)
+"""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# History
+
+
+def test_history_survives_a_torn_line(tmp_path: Path) -> None:
+    entries = [{"level": 1, "iteration": i, "loss": 0.1 / i, "name": "Fuß"} for i in range(1, 4)]
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        for entry in entries:
+            archive.append_history(entry)
+    whole = (tmp_path / "history.jsonl").read_bytes()
+    ends = [i for i, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in range(len(whole) + 1):
+        (tmp_path / "history.jsonl").write_bytes(whole[:cut])
+        kept = entries[: sum(end < cut for end in ends)]
+        assert RunArchive.open(tmp_path).history() == kept
+        if cut % 40 == 1:
+            with RunArchive.open(tmp_path, resume=True) as archive:
+                archive.append_history({"level": 1, "iteration": 9})
+                assert archive.history() == [*kept, {"level": 1, "iteration": 9}]
+
+
+def test_a_damaged_line_of_history_is_numbered(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        for i in range(3):
+            archive.append_history({"level": 1, "iteration": i})
+        lines = (tmp_path / "history.jsonl").read_text().splitlines()
+        (tmp_path / "history.jsonl").write_text("\n".join([lines[0], lines[1][:5], lines[2], ""]))
+        with pytest.raises(RunFolderError, match="line 2 is not JSON"):
+            archive.history()
+
+
+def test_rewinding_drops_what_comes_later_in_training(tmp_path: Path) -> None:
+    order = [(2, 5), (2, 10), (1, 5), (1, 10), (0, 5), (0, 10)]  # (level, iteration) as training visits them
+    for place, (level, iteration) in enumerate(order):
+        with RunArchive.create(tmp_path / str(place), manifest(3)) as archive:
+            for entry in order:
+                archive.append_history({"level": entry[0], "iteration": entry[1]})
+            archive.rewind_history(level, iteration)
+            assert [(e["level"], e["iteration"]) for e in archive.history()] == order[: place + 1]
+            archive.rewind_history(level, iteration - 1)
+            assert [(e["level"], e["iteration"]) for e in archive.history()] == order[:place]
+
+
+def test_history_and_metrics_are_strict_json(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        for write in (
+            lambda: archive.append_history({"level": 0, "iteration": 1, "loss": float("nan")}),
+            lambda: archive.write_metrics({"psnr": float("inf")}),
+        ):
+            with pytest.raises(ValueError, match="JSON compliant"):
+                write()
+        assert archive.history() == []
+        assert archive.metrics() is None
+
+
+# Checkpoints
+
+
+def test_checkpoints_keep_tensors_and_belong_to_a_level(tmp_path: Path) -> None:
+    state = {"params": {"means": torch.randn(5, 3)}, "random": torch.get_rng_state(), "loss": float("nan"), "n": [1, 2]}
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        archive.save_checkpoint({"old": True})
+        archive.save_checkpoint(state)
+        loaded = archive.load_checkpoint()
+        assert loaded is not None
+        assert torch.equal(loaded["params"]["means"], state["params"]["means"])
+        assert torch.equal(loaded["random"], state["random"])
+        assert loaded["n"] == [1, 2]
+        old = (tmp_path / "checkpoint.pt").read_bytes()
+        finish(archive, 1)
+        assert not (tmp_path / "checkpoint.pt").exists()
+        (tmp_path / "checkpoint.pt").write_bytes(old)  # as a kill between manifest and clean-up leaves it
+        assert archive.load_checkpoint() is None
+        (tmp_path / "checkpoint.pt").write_bytes(old[: len(old) // 2])
+        with pytest.raises(RunFolderError, match=r"checkpoint\.pt cannot be read .*; delete it"):
+            archive.load_checkpoint()
+
+
+def test_optimizer_state_waits_for_the_next_level(tmp_path: Path) -> None:
+    moments = {"means": {"step": torch.tensor(9.0), "exp_avg": torch.randn(6, 3)}}
+    with RunArchive.create(tmp_path, manifest(3)) as archive:
+        archive.finish_level(record(2, 3), level_field(2, 3), moments)
+    with RunArchive.open(tmp_path, resume=True) as archive:  # a kill in between loses nothing
+        assert torch.equal(archive.optimizer_state(2)["means"]["exp_avg"], moments["means"]["exp_avg"])
+        finish(archive, 1)
+        for level in (2, 1):
+            with pytest.raises(RunFolderError, match=r"optimizer\.pt does not exist, and --inherit full needs it"):
+                archive.optimizer_state(level)
+        assert_level_is_whole(archive, 2)
+
+
+def test_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        torch.save({"level": 1, "state": Path("x")}, tmp_path / "checkpoint.pt")
+        with pytest.raises(RunFolderError, match="cannot be read"):
+            archive.load_checkpoint()
+
+
+# Manifest
+
+
+def test_manifest_survives_json() -> None:
+    before = replace(manifest(), records=(record(1),))
+    assert Manifest.from_json(json.loads(json.dumps(asdict(before)))) == before
+    assert before.record(1) == record(1)
+
+
+@pytest.mark.parametrize("records", [(0,), (1, 1), (0, 1), (1, 0, 0)])
+def test_records_out_of_order_are_refused(records: tuple[int, ...]) -> None:
+    with pytest.raises(UserInputError, match="coarsest first"):
+        replace(manifest(), records=tuple(record(level) for level in records))
+
+
+# Prediction cache
+
+
+def cache(tmp_path: Path, where: str, precision: str) -> PredictionCache:
+    return PredictionCache(where, precision, tmp_path / "cache" if where == "disk" else None)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+@pytest.mark.parametrize("precision", ["float32", "float16", "uint8"])
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=arrays(np.float32, array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.floats(-3, 3, width=32)))
+def test_cached_predictions_come_back_within_their_precision(
+    tmp_path: Path, where: str, precision: str, values: np.ndarray
+) -> None:
+    with cache(tmp_path, where, precision) as kept:
+        kept.put("dir/view 1.jpg", torch.from_numpy(values))
+        got = kept.get("dir/view 1.jpg")
+        assert got.dtype == torch.float32
+        assert kept.size_bytes == values.size * {"float32": 4, "float16": 2, "uint8": 1}[precision]
+        if precision == "float32":
+            assert torch.equal(got, torch.from_numpy(values))
+        elif precision == "float16":  # half a unit in the last of 11 bits, or half a subnormal step
+            np.testing.assert_allclose(got.numpy(), values, rtol=2**-11, atol=2**-25)
+        else:  # half of one of 255 steps over the image's own range, and float32 rounding of values up to 3
+            assert np.abs(got.numpy() - values).max() <= np.ptp(values) / 510 + 1e-6
+
+
+@pytest.mark.parametrize("precision", ["float32", "float16", "uint8"])
+def test_a_constant_image_is_exact(tmp_path: Path, precision: str) -> None:
+    with cache(tmp_path, "memory", precision) as kept:
+        kept.put("a", torch.full((3, 4, 5), -0.25))
+        assert torch.equal(kept.get("a"), torch.full((3, 4, 5), -0.25))
+
+
+def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path) -> None:
+    for where in ("memory", "disk"):
+        with cache(tmp_path, where, "float32") as kept:
+            image = torch.ones(3, 2, 2, requires_grad=True)
+            kept.put("a", image)
+            image.data.zero_()
+            assert torch.equal(kept.get("a"), torch.ones(3, 2, 2))
+            kept.put("a", torch.full((3, 3, 1), 2.0, dtype=torch.float64))
+            assert torch.equal(kept.get("a"), torch.full((3, 3, 1), 2.0))
+            assert (len(kept), kept.size_bytes) == (1, 36)
+
+
+def test_prefetching_changes_nothing_but_when_it_is_read(tmp_path: Path) -> None:
+    images = {f"{i}": torch.rand(3, 6, 5) for i in range(8)}
+    with cache(tmp_path, "disk", "float32") as kept:
+        for name, image in images.items():
+            kept.put(name, image)
+        kept.prefetch("3")
+        kept.prefetch("3")
+        assert torch.equal(kept.get("3"), images["3"])
+        assert torch.equal(kept.get("3"), images["3"])
+        for name, following in zip(images, [*list(images)[1:], "0"], strict=True):
+            kept.prefetch(following)
+            assert torch.equal(kept.get(name), images[name])
+        kept.prefetch("5")
+        for file in (tmp_path / "cache").iterdir():
+            if file.name == "000001.bin":
+                file.unlink()
+        with pytest.raises(RunFolderError, match=r"000001\.bin cannot be read"):
+            kept.get("1")
+    assert not (tmp_path / "cache").exists()
+    with pytest.raises(KeyError):
+        kept.get("3")
+
+
+def test_predictions_that_diverged_are_refused(tmp_path: Path) -> None:
+    with cache(tmp_path, "memory", "uint8") as kept:
+        for bad in (torch.nan, torch.inf):
+            with pytest.raises(TrainingDivergedError, match=r"view a\.jpg holds NaN or inf"):
+                kept.put("a.jpg", torch.tensor([0.0, bad]).view(1, 1, 2))
+        assert len(kept) == 0
+
+
+def test_unknown_places_and_precisions_are_named() -> None:
+    with pytest.raises(UserInputError, match="--cache tape: expected memory or disk"):
+        PredictionCache("tape")
+    with pytest.raises(UserInputError, match="--cache-precision int4: expected float32, float16, uint8"):
+        PredictionCache("memory", "int4")

@@ -1,0 +1,139 @@
+"""Composition against the formula written out, and against constant images whose sum is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.reference_raster.oracle import OracleRasterizer
+from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
+
+BACKGROUND = (0.2, 0.5, 0.9)
+CAMERA = Camera(45, 30, fx=40.0, fy=41.0, cx=21.0, cy=16.0, world_to_camera=torch.eye(4))
+
+
+def blobs(seed: int, signed: bool) -> GaussianField:
+    generator = torch.Generator().manual_seed(seed)
+    n = 40
+    means = torch.randn((n, 3), generator=generator) * torch.tensor([1.0, 0.7, 0.5]) + torch.tensor([0.0, 0.0, 4.0])
+    return GaussianField(
+        means=means,
+        quaternions=torch.randn((n, 4), generator=generator),
+        log_scales=-1.7 + 0.3 * torch.randn((n, 3), generator=generator),
+        opacity_logits=torch.randn(n, generator=generator),
+        sh=torch.randn((n, 4, 3), generator=generator) * (0.4 if signed else 1.0),
+        signed=signed,
+    )
+
+
+class Constant:
+    """Renders the first SH value of a field's first Gaussian everywhere, and remembers what it was asked."""
+
+    name = "constant"
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[bool, tuple[int, int], list[float]]] = []
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        self.calls.append((field.signed, (camera.width, camera.height), background.tolist()))
+        image = field.sh[0, 0].view(3, 1, 1).expand(3, camera.height, camera.width)
+        nothing = torch.zeros(len(field))
+        return RenderResult(image, image[0], nothing.int(), torch.zeros(len(field), 2))
+
+
+def constant_field(value: float, signed: bool) -> GaussianField:
+    return replace(blobs(0, signed), sh=torch.full((40, 1, 3), value))
+
+
+def test_three_levels_by_the_formula() -> None:
+    fields = {2: blobs(2, False), 1: blobs(1, True), 0: blobs(0, True)}
+    oracle, pyramid = OracleRasterizer(), Pyramid("camera")
+    composition = HierarchyRenderer(fields, 3, pyramid, oracle, BACKGROUND).render(CAMERA)
+
+    background, zero = torch.tensor(BACKGROUND), torch.zeros(3)
+    base = oracle(fields[2], CAMERA.resized(12, 8), background=background).image
+    residual_1 = oracle(fields[1], CAMERA.resized(23, 15), background=zero).image
+    residual_0 = oracle(fields[0], CAMERA, background=zero).image
+    composed_1 = pyramid.up(base, (15, 23)) + residual_1
+    composed_0 = pyramid.up(composed_1, (30, 45)) + residual_0
+
+    torch.testing.assert_close(composition.base, base, rtol=0, atol=0)
+    torch.testing.assert_close(composition.residuals, {1: residual_1, 0: residual_0}, rtol=0, atol=0)
+    torch.testing.assert_close(composition.composed, {2: base, 1: composed_1, 0: composed_0}, rtol=0, atol=0)
+    assert residual_0.abs().max() > 0.05  # the scene shows something
+    assert residual_0.min() < 0
+
+
+def test_one_level_is_the_plain_render() -> None:
+    field, oracle = blobs(3, False), OracleRasterizer()
+    composition = HierarchyRenderer({0: field}, 1, Pyramid(), oracle, BACKGROUND).render(CAMERA)
+    plain = oracle(field, CAMERA, background=torch.tensor(BACKGROUND)).image
+    assert composition.residuals == {}
+    torch.testing.assert_close(composition.composed, {0: plain}, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("grid", ["camera", "even"])
+def test_nothing_is_clamped_between_levels_and_residuals_lie_over_zero(grid: str) -> None:
+    rasterizer = Constant()
+    fields = {2: constant_field(1.5, False), 1: constant_field(-1.9, True), 0: constant_field(0.7, True)}
+    composition = HierarchyRenderer(fields, 3, Pyramid(grid), rasterizer, BACKGROUND).render(CAMERA)
+    for level, value in {2: 1.5, 1: -0.4, 0: 0.3}.items():
+        composed = composition.composed[level]
+        # Up keeps constants but for rounding; worst seen 2.4e-7
+        torch.testing.assert_close(composed, torch.full_like(composed, value), rtol=0, atol=1e-6)
+    assert rasterizer.calls == [
+        (False, (12, 8), pytest.approx(list(BACKGROUND))),
+        (True, (23, 15), [0.0, 0.0, 0.0]),
+        (True, (45, 30), [0.0, 0.0, 0.0]),
+    ]
+
+
+def test_a_coarser_level_stops_early() -> None:
+    fields = {1: constant_field(0.5, False), 0: constant_field(0.1, True)}
+    rasterizer = Constant()
+    composition = HierarchyRenderer(fields, 2, Pyramid(), rasterizer).render(CAMERA, level=1)
+    assert set(composition.composed) == {1}
+    assert len(rasterizer.calls) == 1
+    full = to_full_size(composition.composed[1], CAMERA, 1, Pyramid())
+    assert full.shape == (3, 30, 45)
+
+
+def test_level_cameras_keep_the_field_of_view() -> None:
+    camera = level_camera(CAMERA, 2)
+    assert (camera.width, camera.height) == (12, 8)
+    assert camera.tan_half_fov == pytest.approx(CAMERA.tan_half_fov)
+    # A point seen at a quarter of the width stays at a quarter of the width.
+    assert camera.cx / camera.width == pytest.approx(CAMERA.cx / CAMERA.width)
+
+
+def test_an_unfinished_hierarchy_renders_what_it_has() -> None:
+    renderer = HierarchyRenderer({2: blobs(2, False), 1: blobs(1, True)}, 3, Pyramid(), OracleRasterizer())
+    assert renderer.finest == 1
+    assert set(renderer.render(CAMERA, level=1).composed) == {2, 1}
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 2"):
+        renderer.render(CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, r"fields of levels \[\]"),
+        ({1: blobs(0, False)}, r"expected 2, \.\.\., 0"),
+        ({2: blobs(0, False), 0: blobs(1, True)}, "without gaps"),
+        ({2: blobs(0, True)}, "level 2 is signed"),
+        ({2: blobs(0, False), 1: blobs(1, False)}, "level 1 is unsigned"),
+    ],
+)
+def test_fields_that_make_no_hierarchy_are_refused(fields: dict[int, GaussianField], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer())

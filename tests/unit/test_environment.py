@@ -1,0 +1,169 @@
+"""What the doctor concludes from what its probes find; the probes themselves against broken modules."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin import environment
+from lapgs_plugin.adapters.known import recognise_checkout
+from lapgs_plugin.environment import Finding, Probe, Requirement
+
+GPU = "NVIDIA H100, 80 GiB, compute capability 9.0"
+
+
+def torch_probe(cuda: str | None = None, gpus: tuple[str, ...] = (), complaint: str = "") -> Probe:
+    return Probe({"version": "2.6.0", "cuda": cuda, "gpus": list(gpus), "complaint": complaint})
+
+
+def status(findings: list[Finding]) -> dict[str, str]:
+    return {finding.name: finding.status for finding in findings}
+
+
+def test_no_gpu_is_no_problem() -> None:
+    assert status(environment.torch_findings(torch_probe(), driver="")) == {"PyTorch": "ok", "GPU": "absent"}
+
+
+def test_a_usable_gpu_is_named_with_its_driver() -> None:
+    found = environment.torch_findings(torch_probe("12.4", (GPU, GPU)), driver="550.54")
+    assert [finding.detail for finding in found] == ["2.6.0, built for CUDA 12.4", *[f"{GPU}, driver 550.54"] * 2]
+
+
+@pytest.mark.parametrize(
+    ("probe", "advice"),
+    [
+        (torch_probe(), "install PyTorch for CUDA"),
+        (torch_probe("12.4", complaint="The NVIDIA driver on your system is too old"), "update the NVIDIA driver"),
+    ],
+)
+def test_a_gpu_that_pytorch_cannot_use_is_a_problem_with_advice(probe: Probe, advice: str) -> None:
+    gpu = environment.torch_findings(probe, driver="470.1")[1]
+    assert gpu.status == "problem"
+    assert "470.1" in gpu.detail
+    assert probe.facts["complaint"] in gpu.detail
+    assert advice in gpu.advice
+
+
+def test_broken_pytorch_is_reported_with_its_error() -> None:
+    (found,) = environment.torch_findings(Probe({}, "ImportError: libtorch.so"), driver="")
+    assert (found.status, found.detail) == ("problem", "ImportError: libtorch.so")
+
+
+def test_a_toolkit_of_another_cuda_major_version_is_a_problem(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text("#!/bin/sh\necho 'Cuda compilation tools, release 13.0, V13.0.88'\n")
+    nvcc.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    assert environment.compiler_findings("12.4")[0].status == "problem"
+    assert environment.compiler_findings("13.1")[0] == Finding("CUDA toolkit", "ok", f"13.0 ({nvcc})")
+    assert environment.compiler_findings(None)[0].status == "ok"
+    nvcc.unlink()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CUDA_HOME", raising=False)
+    monkeypatch.delenv("CXX", raising=False)
+    assert status(environment.compiler_findings("12.4")) == {"CUDA toolkit": "absent", "C++ compiler": "absent"}
+
+
+def test_kernel_cache_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
+    facts = {"numba": "0.60", "threads": 4, "cache": str(tmp_path)}
+    assert "empty" in environment.numba_findings(Probe(facts))[1].detail
+    (tmp_path / "loss.kernel-1.py311.nbi").touch()
+    assert "1 compiled kernels" in environment.numba_findings(Probe(facts))[1].detail
+    unwritable = environment.numba_findings(Probe({**facts, "cache": None}))[1]
+    assert unwritable.status == "problem"
+    assert "NUMBA_CACHE_DIR" in unwritable.advice
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert environment.numba_findings(Probe(facts))[0].status == "problem"
+
+
+def test_packages_missing_old_and_broken() -> None:
+    wanted = [
+        Requirement("torch", "torch>=2.4", "2.4", ""),
+        Requirement("numpy", "numpy>=999.1", "999.1", ""),
+        Requirement("no-such-package", "no-such-package>=1", "1", ""),
+        Requirement("rich", "rich", "", ""),
+        Requirement("pytest", "pytest>=8", "8", "dev"),
+    ]
+    found = environment.package_findings(wanted, {"rich": Probe({}, "ImportError: boom")})
+    assert status(found) == {"torch": "ok", "numpy": "problem", "no-such-package": "problem", "rich": "problem"}
+    assert found[2].advice == "python -m pip install 'no-such-package>=1'"
+    assert "boom" in found[3].detail
+
+
+def test_extras_are_whole_or_absent() -> None:
+    wanted = [
+        Requirement("numpy", "numpy", "", "viewer"),
+        Requirement("no-such-package", "no-such-package", "", "lpips"),
+        Requirement("numpy", "numpy", "", "lpips"),
+        Requirement("pytest", "pytest", "", "dev"),
+    ]
+    lpips, viewer = environment.extra_findings(wanted)
+    assert (lpips.name, lpips.status, lpips.detail) == ("[lpips]", "absent", "lacks no-such-package")
+    assert lpips.advice == "python -m pip install 'lapgs_plugin[lpips]'"
+    assert (viewer.name, viewer.status) == ("[viewer]", "ok")
+
+
+def test_own_requirements_are_read_with_their_bounds() -> None:
+    by_name = {each.name: each for each in environment.own_requirements()}
+    assert by_name["torch"] == Requirement("torch", "torch>=2.4", "2.4", "")
+    assert by_name["pytest"].extra == "dev"
+
+
+def test_gsplat_needs_a_gpu_for_its_cuda_part() -> None:
+    assert environment.gsplat_finding(torch_probe(), nvcc=True).status == "absent"
+    with_gpu = torch_probe("12.4", (GPU,))
+    assert environment.gsplat_finding(with_gpu, nvcc=True).status == "ok"
+
+
+@pytest.fixture
+def broken_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lapgs_crashing.py").write_text("import os\nos.abort()\n")
+    (tmp_path / "lapgs_other_abi.py").write_text("raise ImportError('undefined symbol: _ZN3c10\\nmore')\n")
+    (tmp_path / "lapgs_exiting.py").write_text("raise SystemExit(3)\n")
+    (tmp_path / "lapgs_loud.py").write_text("print('hello from an import')\n")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+
+
+@pytest.mark.usefixtures("broken_modules")
+@pytest.mark.parametrize(
+    ("module", "error"),
+    [
+        ("lapgs_crashing", "crashed (Aborted)"),
+        ("lapgs_other_abi", "ImportError: undefined symbol: _ZN3c10"),
+        ("lapgs_exiting", "SystemExit: 3"),
+        ("lapgs_loud", ""),
+        ("lapgs_not_there", "ModuleNotFoundError: No module named 'lapgs_not_there'"),
+    ],
+)
+def test_a_probe_survives_whatever_an_import_does(module: str, error: str) -> None:
+    assert environment.run_probe("import", module) == Probe({}, error)
+
+
+def test_an_extension_that_is_not_installed_is_absent_and_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "run_probe", None)
+    found = environment.extension_finding("lapgs_not_there._C", "rasterizer of a test")
+    assert found == Finding("lapgs_not_there._C", "absent", "not installed (rasterizer of a test)")
+
+
+GRAPHDECO = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
+
+
+@pytest.mark.parametrize(
+    ("files", "name"),
+    [
+        (GRAPHDECO, "graphdeco 3DGS or a fork of it"),
+        ((*GRAPHDECO, "utils/taming_utils.py"), "Taming-3DGS"),
+        ((*GRAPHDECO, "utils/taming_utils.py", "utils/fast_utils.py"), "FastGS"),
+        (("gsplat/rendering.py", "examples/simple_trainer.py"), "gsplat"),
+        (("train.py",), None),
+    ],
+)
+def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_path: Path) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    found = recognise_checkout(tmp_path)
+    assert (found.name if found else None) == name

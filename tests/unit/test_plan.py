@@ -1,0 +1,90 @@
+"""Plans: every split covers the iterations exactly, every mistake is named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import DEFAULT_SPLITS, MIN_LEVEL_SIDE, Stage, StagePlan, level_size, parse_split
+
+
+@given(st.integers(16, 5000), st.integers(16, 5000), st.integers(0, 8))
+def test_level_size_is_the_ceiling_of_repeated_halving(width: int, height: int, level: int) -> None:
+    expected = (-(-width // 2**level), -(-height // 2**level))  # ceil(ceil(n/2)/2) = ceil(n/4)
+    assert level_size((width, height), level) == expected
+
+
+@pytest.mark.parametrize(
+    ("levels", "counts"),
+    [(1, [30000]), (2, [10000, 20000]), (3, [10000, 5000, 15000]), (4, [10000, 5000, 5000, 10000])],
+)
+def test_default_splits_are_the_papers(levels: int, counts: list[int]) -> None:
+    plan = StagePlan.create((1600, 1066), 30_000, levels)
+    assert [stage.iterations for stage in plan] == counts
+    assert [stage.level for stage in plan] == list(range(levels - 1, -1, -1))
+    assert [stage.signed for stage in plan] == [False] + [True] * (levels - 1)
+
+
+def test_stages_are_found_by_level() -> None:
+    plan = StagePlan.create((101, 67), 100, 2)
+    assert plan[0] == Stage(level=0, image_size=(101, 67), iterations=67, signed=True)
+    assert plan[1] == Stage(level=1, image_size=(51, 34), iterations=33, signed=False)
+
+
+@given(
+    st.integers(1, 6).flatmap(lambda n: st.lists(st.integers(1, 50), min_size=n, max_size=n)), st.integers(400, 100_000)
+)
+def test_any_split_covers_the_iterations(weights: list[int], iterations: int) -> None:
+    split = [Fraction(w, sum(weights)) for w in weights]
+    plan = StagePlan.create((1024, 1024), iterations, len(split), split)
+    assert plan.iterations == iterations
+    for stage, share in zip(plan, split, strict=True):
+        assert abs(stage.iterations - iterations * share) <= 1
+
+
+@pytest.mark.parametrize("levels", range(1, 7))
+def test_every_default_split_sums_to_one(levels: int) -> None:
+    plan = StagePlan.create((4096, 4096), 30_000, levels)
+    assert plan.iterations == 30_000
+    assert levels not in DEFAULT_SPLITS or sum(DEFAULT_SPLITS[levels]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"levels": 0}, "--levels 0"),
+        ({"levels": 6}, f"at least {MIN_LEVEL_SIDE}"),
+        ({"levels": 2, "split": [Fraction(1)]}, "--split has 1 shares, expected 2"),
+        ({"levels": 2, "split": [Fraction(1, 2), Fraction(1, 3)]}, "sum to 1"),
+        ({"levels": 2, "split": [Fraction(3, 2), Fraction(-1, 2)]}, "positive shares"),
+        ({"levels": 3, "iterations": 2}, "--iterations 2"),
+        ({"levels": 2, "split": [Fraction(1, 10**6), 1 - Fraction(1, 10**6)]}, "level 1 would train for 0 iterations"),
+    ],
+)
+def test_bad_plans_say_what_is_wrong(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        StagePlan.create(**{"image_size": (400, 300), "iterations": 1000, **arguments})
+
+
+def test_gaps_are_refused() -> None:
+    with pytest.raises(UserInputError, match="without gaps"):
+        StagePlan((Stage(2, (100, 100), 10, False), Stage(0, (400, 400), 10, True)))
+
+
+def test_parse_split() -> None:
+    assert parse_split("1/3, 2/3") == (Fraction(1, 3), Fraction(2, 3))
+    assert parse_split("0.25,0.75") == (Fraction(1, 4), Fraction(3, 4))
+    for text in ("", "a,b", "1/0", "1/3;2/3"):
+        with pytest.raises(UserInputError, match="--split"):
+            parse_split(text)
+
+
+def test_importing_the_package_and_the_plan_pulls_in_no_torch() -> None:
+    code = "import sys, lapgs_plugin, lapgs_plugin.plan, lapgs_plugin.cli; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

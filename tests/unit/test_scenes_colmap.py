@@ -1,0 +1,496 @@
+"""COLMAP scenes: cameras against pycolmap's own projection, images against where the cameras see things."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.scenes import Scene, load_scene
+from lapgs_plugin.scenes.colmap import find_model, read_colmap
+
+POINTS = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 3))
+COLORS = np.random.default_rng(4).integers(0, 256, (40, 3))
+
+
+@dataclass
+class Model:
+    """A COLMAP model to write as text, the format's plain definition; cameras on an arc looking at the origin."""
+
+    names: Sequence[str] = tuple(f"{i:02d}.png" for i in range(10))
+    cameras: dict[int, str] = field(default_factory=lambda: {1: "PINHOLE 96 64 80 82 47.3 33.1"})
+    camera_of: dict[str, int] = field(default_factory=dict)  # 1 unless named
+    points: NDArray[np.float64] = field(default_factory=lambda: POINTS)
+
+    def pose(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotation vector and translation, world to camera."""
+        turn = cv2.Rodrigues(np.array([0.1, 0.25 * index - 1.0, 0.05 * index]))[0]
+        return cv2.Rodrigues(turn)[0][:, 0], np.array([0.02 * index, -0.03, 4.0 + 0.1 * index])
+
+    def write(self, folder: Path, binary: bool = True) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        lines = [f"{key} {text}" for key, text in self.cameras.items()]
+        (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+        lines = []
+        for index, name in enumerate(self.names):
+            vector, translation = self.pose(index)
+            angle = float(np.linalg.norm(vector))
+            quaternion = [np.cos(angle / 2), *(np.sin(angle / 2) * vector / angle)]
+            numbers = " ".join(repr(float(x)) for x in (*quaternion, *translation))
+            # Ids run against name order, as they may in real models.
+            lines += [f"{len(self.names) - index} {numbers} {self.camera_of.get(name, 1)} {name}", ""]
+        (folder / "images.txt").write_text("\n".join(lines) + "\n")
+        rows = zip(self.points.tolist(), COLORS.tolist(), strict=False)
+        lines = [f"{i + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0.5" for i, ((x, y, z), (r, g, b)) in enumerate(rows)]
+        (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
+        if binary:
+            pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+            for text in folder.glob("*.txt"):
+                text.unlink()
+
+
+def write_images(folder: Path, sizes: dict[str, tuple[int, int]]) -> None:
+    for name, (width, height) in sizes.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        value = sum(name.encode()) % 256
+        cv2.imwrite(str(folder / name), np.full((height, width, 3), value, np.uint8))
+
+
+def make_scene(path: Path, model: Model | None = None, size: tuple[int, int] = (96, 64), binary: bool = True) -> Path:
+    model = model or Model()
+    model.write(path / "sparse" / "0", binary)
+    write_images(path / "images", dict.fromkeys(model.names, size))
+    return path
+
+
+def load(path: Path, **options: Any) -> Scene:
+    return load_scene(path, progress=False, **options)
+
+
+def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixel coordinates (n, 2) in float64 from the camera as it is stored."""
+    pose = camera.world_to_camera.double().numpy()
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+
+
+def assert_one_line(caught: pytest.ExceptionInfo[Exception]) -> None:
+    assert "\n" not in str(caught.value)
+
+
+# Cameras
+
+
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        "PINHOLE 96 64 80 82 47.3 33.1",
+        "SIMPLE_PINHOLE 96 64 81 48 32",
+        "SIMPLE_RADIAL 96 64 81 48 32 0",
+        "OPENCV 96 64 80 82 47.3 33.1 0 0 0 0",
+        "FULL_OPENCV 96 64 80 82 47.3 33.1 0 0 0 0 0 0 0 0",
+    ],
+)
+def test_projection_is_pycolmaps(tmp_path: Path, camera: str, binary: bool) -> None:
+    path = make_scene(tmp_path, Model(cameras={1: camera}), binary=binary)
+    scene = load(path)
+    reconstruction = pycolmap.Reconstruction(str(path / "sparse" / "0"))
+    by_name = {image.name: image for image in reconstruction.images.values()}
+    assert [view.name for view in scene.train] == sorted(by_name)
+    for view in scene.train:
+        image = by_name[view.name]
+        expected = np.array([image.project_point(point) for point in POINTS])
+        assert (view.camera.width, view.camera.height) == (96, 64)
+        assert view.camera.world_to_camera.dtype == torch.float32
+        # In pixels; float32 poses, seen 1.5e-6.
+        np.testing.assert_allclose(project(view.camera, POINTS), expected, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(view.camera.position.numpy(), image.projection_center(), rtol=0, atol=2e-6)
+
+
+def blob_image(center: NDArray[np.float64], size: tuple[int, int], sigma: float) -> NDArray[np.uint16]:
+    """A Gaussian blob whose centre is at `center` where pixel (j, i) covers [j, j+1) x [i, i+1)."""
+    x, y = np.arange(size[0]) + 0.5, np.arange(size[1])[:, None] + 0.5
+    blob = np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * sigma**2))
+    return np.repeat((blob * 65535)[..., None], 3, axis=2).round().astype(np.uint16)
+
+
+def centroid(image: Tensor) -> NDArray[np.float64]:
+    weight = image[0].double().numpy()
+    y, x = np.mgrid[0 : weight.shape[0], 0 : weight.shape[1]] + 0.5
+    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize("resolution", ["full", "1/2", "1/4", "0.3", "100", "77"])
+@pytest.mark.parametrize("file_scale", [1, 2], ids=["images", "images_2"])
+def test_images_and_cameras_stay_aligned(tmp_path: Path, resolution: str, file_scale: int) -> None:
+    """A point's picture is where the camera sees the point, at every size of file and of training."""
+    width, height = 384 // file_scale, 256 // file_scale
+    model = Model(names=["a.png", "b.png", "c.png"], cameras={1: "PINHOLE 384 256 300 310 180.5 133.25"})
+    path = make_scene(tmp_path, model)
+    point = np.array([[0.05, -0.1, 0.08]])
+    (path / f"images_{file_scale}").mkdir()
+    for view in load(path, images="images").train:
+        center = project(view.camera.resized(width, height), point)[0]
+        cv2.imwrite(str(path / f"images_{file_scale}" / view.name), blob_image(center, (width, height), sigma=9.0))
+    scene = load(path, images=f"images_{file_scale}", resolution=resolution)
+    for view in scene.train:
+        assert view.image.shape == (3, view.camera.height, view.camera.width)
+        # In pixels of the resized image; seen 0.0002, and a shifted grid would be 0.25 or more off.
+        np.testing.assert_allclose(centroid(view.image), project(view.camera, point)[0], rtol=0, atol=0.002)
+
+
+@pytest.mark.parametrize("size", [(47, 31), (48, 32), (48, 31), (32, 21), (192, 128), (12, 8)])
+def test_pre_resized_photos_rescale_the_camera(tmp_path: Path, size: tuple[int, int]) -> None:
+    scene = load(make_scene(tmp_path, size=size))
+    camera = scene.train[0].camera
+    sx, sy = size[0] / 96, size[1] / 64
+    assert (camera.width, camera.height) == size
+    assert (camera.fx, camera.fy) == pytest.approx((80 * sx, 82 * sy), rel=1e-12)
+    assert (camera.cx, camera.cy) == pytest.approx((47.3 * sx, 33.1 * sy), rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [(96, 60), (64, 96), (64, 64), (90, 64)])
+def test_size_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = make_scene(tmp_path)
+    write_images(path / "images", {"03.png": size})
+    with pytest.raises(
+        SceneError, match=rf"03\.png: the image is {size[0]}x{size[1]} pixels, its camera 96x64"
+    ) as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+def test_views_may_differ_in_size(tmp_path: Path) -> None:
+    model = Model(
+        cameras={1: "PINHOLE 96 64 80 80 48 32", 7: "SIMPLE_PINHOLE 50 70 60 25 35"},
+        camera_of={"02.png": 7, "05.png": 7},
+    )
+    path = make_scene(tmp_path, model)
+    write_images(path / "images", {"02.png": (50, 70), "05.png": (50, 70)})
+    scene = load(path)
+    assert [view.image.shape[1:] for view in scene.train[1:4]] == [(64, 96), (70, 50), (64, 96)]
+    assert scene.smallest_size == (50, 64)
+
+
+# What a scene holds
+
+
+def test_points_colors_and_extent(tmp_path: Path) -> None:
+    scene = load(make_scene(tmp_path), eval=True)
+    order = np.lexsort(scene.points.numpy().T)
+    expected = np.lexsort(POINTS.T)
+    np.testing.assert_allclose(scene.points.numpy()[order], POINTS[expected], atol=1e-6)
+    np.testing.assert_allclose(scene.colors.numpy()[order], COLORS[expected] / 255, atol=1e-6)
+    assert scene.points.dtype == scene.colors.dtype == torch.float32
+    reconstruction = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    names = {view.name for view in scene.train}
+    centers = np.array([i.projection_center() for i in reconstruction.images.values() if i.name in names])
+    radius = max(float(np.linalg.norm(center - centers.mean(axis=0))) for center in centers)
+    assert scene.extent == pytest.approx(1.1 * radius, rel=1e-9)
+    assert (scene.kind, scene.path, scene.background) == ("colmap", tmp_path, (0.0, 0.0, 0.0))
+
+
+def test_every_eighth_image_in_name_order_is_held_out(tmp_path: Path) -> None:
+    names = [f"{folder}/{i}.png" for folder in ("b", "a") for i in (10, 9, 1, 2, 33, 5, 4, 6, 7)]
+    path = make_scene(tmp_path, Model(names=names))
+    ordered = sorted(names)
+    scene = load(path, eval=True)
+    assert [view.name for view in scene.test] == [ordered[0], ordered[8], ordered[16]]
+    assert [view.name for view in scene.train] == [name for i, name in enumerate(ordered) if i % 8 != 0]
+    for view in (*scene.train, *scene.test):
+        assert float(view.image[0, 0, 0] * 255) == pytest.approx(sum(view.name.encode()) % 256)
+    everything = load(path)
+    assert [view.name for view in everything.train] == ordered
+    assert everything.test == ()
+
+
+def test_model_directly_in_sparse(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    shutil.move(path / "sparse" / "0", path / "model")
+    (path / "sparse").rmdir()
+    shutil.move(path / "model", path / "sparse")
+    assert len(load(path).train) == 10
+
+
+def test_photos_that_are_not_in_the_model_are_left_out(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    (path / "images" / "unregistered.png").write_bytes(b"not even an image")
+    assert len(load(path).train) == 10
+
+
+def test_background_shows_through_alpha(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    clear = np.zeros((64, 96, 4), np.uint8)
+    cv2.imwrite(str(path / "images" / "00.png"), clear)
+    image = load(path, background=(0.25, 0.5, 1.0)).train[0].image
+    assert image[:, 5, 5].tolist() == [0.25, 0.5, 1.0]
+
+
+# Progress and threads
+
+
+def test_progress_callback_counts_every_image(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    load_scene(make_scene(tmp_path), progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(i, 10) for i in range(1, 11)]
+
+
+def test_progress_bar_goes_to_stderr(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    load_scene(make_scene(tmp_path))
+    output = capfd.readouterr()
+    assert output.out == ""
+    assert re.search(r"Reading images.*10/10.*(images/s|s/images)", output.err)
+    load(tmp_path)
+    assert capfd.readouterr().err == ""
+
+
+def test_loading_twice_gives_the_same_and_leaves_torch_alone(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    threads = torch.get_num_threads()
+    first, second = load(path, resolution="1/2"), load(path, resolution="1/2")
+    assert torch.get_num_threads() == threads
+    for one, other in zip(first.train, second.train, strict=True):
+        assert torch.equal(one.image, other.image)
+
+
+def test_too_large_a_resolution_is_a_note(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        scene = load(make_scene(tmp_path), resolution="1k")
+    assert scene.smallest_size == (96, 64)
+    assert [record.getMessage() for record in caplog.records] == [
+        "--resolution 1k: 10 of 10 images are only 96 pixels wide or less and keep their size, images only shrink"
+    ]
+
+
+# Bad input
+
+
+def overwrite(file: Path, old: float, new: float) -> None:
+    """Replace the one float64 of a binary file that is `old`."""
+    content = file.read_bytes()
+    assert content.count(struct.pack("<d", old)) == 1
+    file.write_bytes(content.replace(struct.pack("<d", old), struct.pack("<d", new)))
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ("SIMPLE_RADIAL 96 64 81 48 32 0.01", r"camera 1 is distorted \(SIMPLE_RADIAL with parameters 0.01\)"),
+        ("OPENCV 96 64 80 82 47.3 33.1 0 0 0 1e-5", r"\(OPENCV with parameters 0, 0, 0, 1e-05\)"),
+        ("OPENCV_FISHEYE 96 64 80 82 47.3 33.1 0 0 0 0", r"\(OPENCV_FISHEYE with parameters 0, 0, 0, 0\)"),
+        ("FOV 96 64 80 82 47.3 33.1 0", r"\(FOV with parameters 0\)"),
+    ],
+)
+def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: str) -> None:
+    path = make_scene(tmp_path, Model(cameras={1: camera}))
+    with pytest.raises(SceneError, match=message + ".*`lapgs prepare") as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+def test_distorted_camera_that_no_image_uses_does_not_matter(tmp_path: Path) -> None:
+    cameras = {1: "PINHOLE 96 64 80 82 47.3 33.1", 2: "SIMPLE_RADIAL 96 64 81 48 32 0.01"}
+    assert len(load(make_scene(tmp_path, Model(cameras=cameras))).train) == 10
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "none", tmp_path / "file"):
+        with pytest.raises(SceneError, match=f"{path.name}: no such scene folder"):
+            load(path)
+
+
+def test_neither_model_nor_transforms(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"neither a COLMAP model .* nor transforms\.json.*`lapgs prepare") as caught:
+        load(tmp_path)
+    assert_one_line(caught)
+
+
+def test_wrong_resolution_comes_first(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="--resolution"):
+        load(tmp_path / "none", resolution="huge")
+
+
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_incomplete_model(tmp_path: Path, name: str, binary: bool) -> None:
+    path = make_scene(tmp_path, binary=binary)
+    (path / "sparse" / "0" / f"{name}.{'bin' if binary else 'txt'}").unlink()
+    with pytest.raises(SceneError, match="the sparse model is incomplete, it has only") as caught:
+        load(path)
+    assert name not in str(caught.value).split("it has only")[1].split(";")[0]
+    assert_one_line(caught)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_binary_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
+    cameras = {1: "PINHOLE 96 64 80 80 48 32", 2: "SIMPLE_RADIAL 50 70 60 25 35 0"}
+    model = Model(names=["a.png", "b.png"], cameras=cameras, camera_of={"b.png": 2}, points=POINTS[:4])
+    path = make_scene(tmp_path, model)
+    folder = find_model(path)
+    assert folder is not None
+    file = folder / f"{name}.bin"
+    if not file.is_file():
+        pytest.skip(f"pycolmap {pycolmap.__version__} writes no {file.name}")
+    content = file.read_bytes()
+    for length in range(len(content)):
+        file.write_bytes(content[:length])
+        with pytest.raises(SceneError) as caught:
+            read_colmap(path, folder, "images", evaluate=False)
+        assert file.name in str(caught.value)
+        assert_one_line(caught)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images"])
+def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
+    path = make_scene(tmp_path, binary=False)
+    (path / "sparse" / "0" / f"{name}.txt").write_text("these are not numbers\n\n" * 3)
+    with pytest.raises(SceneError, match="the sparse model cannot be read") as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+def test_model_without_points(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(points=np.empty((0, 3))))
+    with pytest.raises(SceneError, match="the model has no 3D points"):
+        load(path)
+
+
+def test_points_with_nan(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    overwrite(path / "sparse" / "0" / "points3D.bin", POINTS[3, 1], np.nan)
+    with pytest.raises(SceneError, match="the sparse points are none or hold NaN or inf"):
+        load(path)
+
+
+def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    with pytest.raises(SceneError, match="images_4: no such folder of images; choose images with --images"):
+        load(path, images="images_4")
+    shutil.rmtree(path / "images")
+    with pytest.raises(SceneError, match="images: no such folder of images; put the photos"):
+        load(path)
+
+
+@pytest.mark.parametrize("how", ["missing", "empty", "cut"])
+def test_image_that_cannot_be_read_is_named(tmp_path: Path, how: str) -> None:
+    path = make_scene(tmp_path)
+    file = path / "images" / "06.png"
+    content = file.read_bytes()
+    file.unlink()
+    if how != "missing":
+        file.write_bytes(content[: len(content) - 20] if how == "cut" else b"")
+    with pytest.raises(SceneError, match=r"images/06\.png: ") as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+def test_first_of_several_broken_images_is_the_one_named(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    for name in ("08.png", "04.png", "05.png"):
+        file = path / "images" / name
+        file.write_bytes(file.read_bytes()[:-20])  # the header is whole: found when the pixels are read
+    with pytest.raises(SceneError, match=r"images/04\.png: the image is damaged or cut short"):
+        load(path)
+
+
+def test_fewer_than_two_training_views(tmp_path: Path) -> None:
+    one = make_scene(tmp_path / "one", Model(names=["a.png"]))
+    with pytest.raises(SceneError, match="1 training views, expected at least 2; add photos"):
+        load(one)
+    two = make_scene(tmp_path / "two", Model(names=["a.png", "b.png"]))
+    assert len(load(two).train) == 2
+    with pytest.raises(
+        SceneError, match="1 training views besides 1 held out, expected at least 2; train without --eval"
+    ):
+        load(two, eval=True)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_nan_pose(tmp_path: Path, value: float) -> None:
+    path = make_scene(tmp_path)
+    for file in ("images.bin", "frames.bin"):  # models with frames keep the poses twice
+        overwrite(path / "sparse" / "0" / file, Model().pose(4)[1][2], value)
+    with pytest.raises(SceneError, match=r"the camera of 04\.png has NaN or inf in it"):
+        load(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, -5.0])
+def test_focal_length_that_is_no_positive_number(tmp_path: Path, value: float) -> None:
+    path = make_scene(tmp_path)
+    overwrite(path / "sparse" / "0" / "cameras.bin", 82.0, value)
+    with pytest.raises(SceneError, match=r"the camera of 00\.png|the sparse model cannot be read"):
+        load(path)
+
+
+def test_all_cameras_at_one_point(tmp_path: Path) -> None:
+    class Turning(Model):
+        def pose(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            vector = np.array([0.0, 0.1 * index + 0.1, 0.0])
+            return vector, -cv2.Rodrigues(vector)[0] @ np.array([1.0, 2.0, 3.0])
+
+    with pytest.raises(SceneError, match="all 10 training cameras stand at the same point"):
+        load(make_scene(tmp_path, Turning()))
+
+
+def test_same_name_twice(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, binary=False)
+    file = path / "sparse" / "0" / "images.txt"
+    file.write_text(file.read_text().replace("07.png", "06.png"))
+    with pytest.raises(SceneError, match=r"06\.png is listed twice|cannot be read"):
+        load(path)
+
+
+@pytest.mark.parametrize("name", ["../beside.png", "/tmp/elsewhere.png"])
+def test_names_that_lead_out_of_the_scene(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "scene"
+    Model(names=["a.png", "b.png", name]).write(path / "sparse" / "0")
+    write_images(path / "images", {"a.png": (96, 64), "b.png": (96, 64)})
+    with pytest.raises(SceneError, match="is named by a path outside the scene"):
+        load(path)
+
+
+# A real scene
+
+
+@pytest.mark.shared
+def test_fox(shared_data: Path) -> None:
+    scene = load(shared_data / "fox", resolution="1/4", eval=True)
+    assert (len(scene.train), len(scene.test)) == (43, 7)
+    assert scene.smallest_size == (266, 474)
+    assert scene.points.shape == (12540, 3)
+    reconstruction = pycolmap.Reconstruction(str(shared_data / "fox" / "sparse" / "0"))
+    by_name = {image.name: image for image in reconstruction.images.values()}
+    points = scene.points.double().numpy()
+    inside = np.zeros(len(points), int)
+    for view in (*scene.train, *scene.test):
+        pixels = project(view.camera, points)
+        pose = view.camera.world_to_camera.double().numpy()
+        in_front = points @ pose[2, :3] + pose[2, 3] > 0
+        inside += in_front & (pixels > 0).all(axis=1) & (pixels < (266, 474)).all(axis=1)
+        # pycolmap projects into the full image of 1062x1894.
+        for index in range(0, len(points), 997):
+            expected = by_name[view.name].project_point(points[index])
+            if expected is not None:
+                scaled = np.asarray(expected) * (266 / 1062, 474 / 1894)
+                # In pixels, relative where points far outside project far away; seen 6e-5.
+                np.testing.assert_allclose(pixels[index], scaled, rtol=1e-4, atol=1e-3)
+    # Every point was triangulated from two or more photos; a few lie within rounding of an image's edge.
+    assert inside.min() >= 1
+    assert (inside >= 2).mean() > 0.999

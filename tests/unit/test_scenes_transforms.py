@@ -1,0 +1,363 @@
+"""Transforms scenes: axes, intrinsics and points of the Blender, instant-ngp and nerfstudio layouts."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes import Scene, load_scene
+
+FOV = 0.6911112070083618  # camera_angle_x of NeRF's Blender scenes
+NERF_RADIUS = 4.031128874
+
+
+def look_at(eye: NDArray[np.float64], target: tuple[float, ...] = (0.0, 0.0, 0.0)) -> NDArray[np.float64]:
+    """(4, 4) camera to world in OpenGL axes: columns are right, up, backwards and the eye; z is up in the world."""
+    back = eye - np.array(target)
+    back /= np.linalg.norm(back)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    return matrix
+
+
+def eyes(count: int, radius: float = NERF_RADIUS) -> NDArray[np.float64]:
+    """Camera centres on the upper half of a sphere, as NeRF's Blender scenes have them."""
+    rng = np.random.default_rng(5)
+    directions = rng.normal(size=(count, 3))
+    directions[:, 2] = np.abs(directions[:, 2]) + 0.2
+    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def frame(name: str, matrix: NDArray[np.float64], **values: object) -> dict[str, object]:
+    return {"file_path": name, "transform_matrix": matrix.tolist(), **values}
+
+
+def write_json(path: Path, frames: list[dict[str, object]], **values: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**values, "frames": frames}))
+
+
+def write_images(path: Path, names: list[str], size: tuple[int, int]) -> None:
+    for name in names:
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path / name), np.full((size[1], size[0], 3), 100, np.uint8))
+
+
+def nerf_scene(path: Path, train: int = 9, test: int = 3, size: tuple[int, int] = (80, 80)) -> Path:
+    """The layout of NeRF's synthetic scenes."""
+    places = eyes(train + test)
+    for part, chosen in (("train", places[:train]), ("test", places[train:])):
+        frames = [frame(f"./{part}/r_{i}", look_at(eye), rotation=0.01) for i, eye in enumerate(chosen)]
+        write_json(path / f"transforms_{part}.json", frames, camera_angle_x=FOV)
+        write_images(path, [f"{part}/r_{i}.png" for i in range(len(chosen))], size)
+    return path
+
+
+def capture(path: Path, count: int = 10, values: dict[str, object] | None = None) -> Path:
+    """The layout of instant-ngp and nerfstudio."""
+    values = values if values is not None else {"fl_x": 70.0, "fl_y": 72.0, "cx": 41.0, "cy": 29.5, "w": 80, "h": 60}
+    names = [f"images/frame_{i:03d}.png" for i in range(count)]
+    write_json(
+        path / "transforms.json", [frame(n, look_at(e)) for n, e in zip(names, eyes(count), strict=True)], **values
+    )
+    write_images(path, names, (80, 60))
+    return path
+
+
+def load(path: Path, **options: Any) -> Scene:
+    return load_scene(path, progress=False, **options)
+
+
+def edit(path: Path, change: dict[str, object], in_frame: int | None = None) -> None:
+    """Change values of a scene's transforms.json, or those of one of its frames."""
+    values = json.loads((path / "transforms.json").read_text())
+    target = values if in_frame is None else values["frames"][in_frame]
+    target.update(change)
+    for key in [key for key, value in target.items() if value is None]:
+        del target[key]
+    (path / "transforms.json").write_text(json.dumps(values))
+
+
+# Cameras
+
+
+def test_a_known_point_in_opengl_axes(tmp_path: Path) -> None:
+    """A camera on the y axis looking along -y with z up: world x is to its left."""
+    path = capture(tmp_path, 2)
+    edit(path, {"transform_matrix": look_at(np.array([0.0, 5.0, 0.0])).tolist()}, in_frame=0)
+    camera = load(path).train[0].camera
+    point = camera.world_to_camera @ torch.tensor([1.0, 1.0, 0.5, 1.0])
+    # 4 in front, 1 to the left, 0.5 above: OpenCV's y points down.
+    torch.testing.assert_close(point, torch.tensor([-1.0, -0.5, 4.0, 1.0]))
+    assert camera.position.tolist() == pytest.approx([0.0, 5.0, 0.0])
+
+
+@pytest.mark.parametrize("resolution", ["full", "1/2", "30"])
+def test_projection_is_the_opengl_cameras(tmp_path: Path, resolution: str) -> None:
+    """Against the definition: components along the matrix's right, up and backward columns, in float64."""
+    path = nerf_scene(tmp_path, size=(90, 60))
+    scene = load(path, resolution=resolution, eval=True)
+    points = np.random.default_rng(6).uniform(-1, 1, (30, 3))
+    matrices = {f"train/r_{i}.png": look_at(eye) for i, eye in enumerate(eyes(12)[:9])}
+    for view in scene.train:
+        right, up, back, eye = matrices[view.name][:3].T
+        along = (points - eye) @ -back
+        scale = view.camera.width / 2 / math.tan(FOV / 2)
+        x = view.camera.width / 2 + scale * ((points - eye) @ right) / along
+        y = view.camera.height / 2 - scale * ((points - eye) @ up) / along
+        pose = view.camera.world_to_camera.double().numpy()
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        camera = view.camera
+        # In pixels; float32 poses, seen 4e-6.
+        np.testing.assert_allclose(camera.fx * local[:, 0] / local[:, 2] + camera.cx, x, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(camera.fy * local[:, 1] / local[:, 2] + camera.cy, y, rtol=0, atol=1e-4)
+
+
+def test_intrinsics_for_the_file_or_each_frame(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    edit(path, {"fl_x": 55.0, "cx": 20.0, "w": 40, "h": 30}, in_frame=3)
+    first, fourth = (load(path).train[i].camera for i in (0, 3))
+    assert (first.fx, first.fy, first.cx, first.cy) == (70.0, 72.0, 41.0, 29.5)
+    assert (first.width, first.height) == (80, 60)
+    # The file of the fourth has twice the size that its frame says.
+    assert (fourth.fx, fourth.fy, fourth.cx, fourth.cy) == (110.0, 144.0, 40.0, 59.0)
+    assert (fourth.width, fourth.height) == (80, 60)
+
+
+def test_missing_intrinsics_have_the_usual_meaning(tmp_path: Path) -> None:
+    plain = load(capture(tmp_path / "a", values={"fl_x": 70.0})).train[0].camera
+    assert (plain.width, plain.height, plain.fx, plain.fy, plain.cx, plain.cy) == (80, 60, 70.0, 70.0, 40.0, 30.0)
+    angles = load(capture(tmp_path / "b", values={"camera_angle_x": 1.0, "camera_angle_y": 0.5})).train[0].camera
+    assert math.atan(40 / angles.fx) == pytest.approx(0.5)
+    assert math.atan(30 / angles.fy) == pytest.approx(0.25)
+
+
+def test_zero_distortion_is_no_distortion(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    edit(path, {"k1": 0.0, "k2": 0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "is_fisheye": False})
+    assert len(load(path).train) == 10
+
+
+def test_matrices_with_few_digits_or_three_rows(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    exact = look_at(eyes(10)[0])
+    edit(path, {"transform_matrix": exact[:3].round(3).tolist()}, in_frame=0)
+    pose = load(path).train[0].camera.world_to_camera.double().numpy()
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], exact[:3, 3], atol=1e-3)
+
+
+# Views
+
+
+def test_blender_pair_holds_out_its_test_file(tmp_path: Path) -> None:
+    path = nerf_scene(tmp_path)
+    scene = load(path, eval=True)
+    assert [view.name for view in scene.train] == [f"train/r_{i}.png" for i in range(9)]
+    assert [view.name for view in scene.test] == [f"test/r_{i}.png" for i in range(3)]
+    assert scene.kind == "transforms"
+    everything = load(path)
+    assert (len(everything.train), len(everything.test)) == (12, 0)
+
+
+def test_single_file_holds_out_every_eighth(tmp_path: Path) -> None:
+    scene = load(capture(tmp_path), eval=True)
+    assert [view.name for view in scene.test] == ["images/frame_000.png", "images/frame_008.png"]
+    assert len(scene.train) == 8
+    centers = eyes(10)[[1, 2, 3, 4, 5, 6, 7, 9]]
+    radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    assert scene.extent == pytest.approx(1.1 * radius, rel=1e-9)
+
+
+def test_transparent_background(tmp_path: Path) -> None:
+    path = nerf_scene(tmp_path)
+    rgba = np.zeros((80, 80, 4), np.uint8)
+    rgba[..., 3], rgba[..., 2] = 128, 255  # half transparent red
+    cv2.imwrite(str(path / "train" / "r_0.png"), rgba)
+    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        pixel = load(path, background=background).train[3].image[:, 0, 0]  # after the three of test/
+        expected = [128 / 255 + 127 / 255 * background[0], 127 / 255 * background[1], 127 / 255 * background[2]]
+        assert pixel.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_images_folder_replaces_the_one_of_the_frames(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    write_images(path, [f"images_2/frame_{i:03d}.png" for i in range(10)], (40, 30))
+    scene = load(path, images="images_2")
+    assert scene.smallest_size == (40, 30)
+    assert scene.train[0].camera.fx == 35.0
+    assert scene.train[0].name == "images_2/frame_000.png"
+
+
+@pytest.mark.parametrize("name", ["images\\frame_000.png", "./images/frame_000", "images/frame_000"])
+def test_ways_to_write_a_path(tmp_path: Path, name: str) -> None:
+    path = capture(tmp_path)
+    edit(path, {"file_path": name}, in_frame=0)
+    assert load(path).train[0].name == "images/frame_000.png"
+
+
+def test_photos_beside_the_scene(tmp_path: Path) -> None:
+    path = capture(tmp_path / "scene")
+    write_images(tmp_path, ["photos/a.png"], (80, 60))
+    edit(path, {"file_path": "../photos/a.png"}, in_frame=0)
+    assert load(path).train[0].name == "a.png"
+
+
+# Points
+
+
+def write_ply(file: Path, points: NDArray[np.float64], colors: NDArray[np.generic] | None) -> None:
+    kind = [(axis, "f4") for axis in "xyz"]
+    if colors is not None:
+        kind += [(channel, colors.dtype.str[1:]) for channel in ("red", "green", "blue")]
+    rows = np.concatenate([points] if colors is None else [points, colors], axis=1)
+    vertices = np.array([tuple(row) for row in rows.tolist()], dtype=kind)
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(file))
+
+
+@pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply"])
+def test_points_of_a_ply(tmp_path: Path, name: str) -> None:
+    path = capture(tmp_path)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    colors = np.random.default_rng(1).integers(0, 256, (20, 3)).astype(np.uint8)
+    write_ply(path / name, points, colors)
+    if name == "sparse_pc.ply":
+        edit(path, {"ply_file_path": name})
+    scene = load(path)
+    np.testing.assert_allclose(scene.points.numpy(), points, atol=1e-6)
+    np.testing.assert_allclose(scene.colors.numpy(), colors / 255, atol=1e-7)
+
+
+def test_points_with_float_colors_or_none(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    colors = np.random.default_rng(1).random((5, 3)).astype(np.float32)
+    write_ply(path / "points3d.ply", points, colors)
+    np.testing.assert_allclose(load(path).colors.numpy(), colors, atol=1e-7)
+    write_ply(path / "points3d.ply", points, None)
+    assert bool((load(path).colors == 0.5).all())
+
+
+def test_random_points_of_a_blender_scene_fill_3dgs_cube(tmp_path: Path) -> None:
+    """3DGS puts 100,000 points into the cube of +-1.3 around the origin, made for cameras at NeRF's distance."""
+    scene = load(nerf_scene(tmp_path))
+    assert scene.points.shape == scene.colors.shape == (100_000, 3)
+    torch.testing.assert_close(scene.points.amax(dim=0), torch.full((3,), 1.3), rtol=0, atol=2e-3)
+    torch.testing.assert_close(scene.points.amin(dim=0), torch.full((3,), -1.3), rtol=0, atol=2e-3)
+    assert torch.equal(scene.points, load(tmp_path).points)
+    assert bool((scene.colors == 0.5).all())
+
+
+def test_random_points_follow_the_capture(tmp_path: Path) -> None:
+    """They reach the cameras, wherever the scene stands and however large it is."""
+    path = capture(tmp_path)
+    for index, eye in enumerate(eyes(10, radius=50.0)):
+        shifted = eye + np.array([100.0, -20.0, 7.0])
+        edit(path, {"transform_matrix": look_at(shifted, target=(100.0, -20.0, 7.0)).tolist()}, in_frame=index)
+    scene = load(path)
+    middle = (scene.points.amax(dim=0) + scene.points.amin(dim=0)) / 2
+    torch.testing.assert_close(middle, torch.tensor([100.0, -20.0, 7.0]), rtol=0, atol=0.1)
+    assert float((scene.points.amax(dim=0) - middle).min()) == pytest.approx(50.0, rel=0.01)
+
+
+def test_random_points_with_parallel_cameras(tmp_path: Path) -> None:
+    """Parallel axes meet nowhere; the points then surround the cameras."""
+    path = capture(tmp_path, 4)
+    for index in range(4):
+        eye = np.array([float(index), 3.0, 1.0])
+        edit(path, {"transform_matrix": look_at(eye, target=(float(index), 0.0, 1.0)).tolist()}, in_frame=index)
+    scene = load(path)
+    torch.testing.assert_close(scene.points.mean(dim=0), torch.tensor([1.5, 3.0, 1.0]), rtol=0, atol=0.02)
+    assert float(scene.points.std()) > 0.1
+
+
+# Bad input
+
+
+def refused(path: Path, message: str, **options: Any) -> None:
+    with pytest.raises(SceneError, match=message) as caught:
+        load(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"k1": 0.02, "p2": -1e-4}, r"distorted camera \(OPENCV, k1 = 0.02, p2 = -0.0001\).*`lapgs prepare"),
+        ({"camera_model": "OPENCV_FISHEYE"}, r"distorted camera \(OPENCV_FISHEYE\).*`lapgs prepare"),
+        ({"is_fisheye": True}, r"distorted camera \(OPENCV\).*`lapgs prepare"),
+        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
+        ({"fl_x": "wide"}, "intrinsics that are no numbers"),
+        ({"fl_x": -3.0}, "focal lengths -3"),
+        ({"fl_x": float("nan")}, "NaN or inf"),
+        ({"w": 0}, "expected positive numbers"),
+        ({"w": 60}, r"the image is 80x60 pixels, its camera 60x60"),
+        ({"frames": []}, "no list of frames"),
+        ({"frames": [{"transform_matrix": [[1]]}]}, "frame 0 has no file_path"),
+        ({"ply_file_path": "none.ply"}, r"none\.ply: not readable as a PLY"),
+    ],
+)
+def test_wrong_values_of_the_file(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    path = capture(tmp_path)
+    edit(path, change)
+    refused(path, message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"file_path": "images/none.png"}, r"images/none\.png: no such image"),
+        ({"file_path": "images/frame_003.png"}, r"frame_003\.png is listed twice"),
+        ({"transform_matrix": None}, "frame 4 .* has no transform_matrix"),
+        ({"transform_matrix": [[1, 2], [3]]}, "frame 4 .* has no transform_matrix"),
+        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "frame 4 .* has no transform_matrix"),
+        ({"transform_matrix": np.diag([2.0, 2.0, 2.0, 1.0]).tolist()}, "no rotation and translation"),
+        ({"transform_matrix": np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()}, "no rotation and translation"),
+    ],
+)
+def test_wrong_values_of_a_frame(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    path = capture(tmp_path)
+    edit(path, change, in_frame=4)
+    refused(path, message)
+
+
+def test_files_that_are_not_what_they_say(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    (path / "points3d.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n")
+    refused(path, r"points3d\.ply: not readable as a PLY")
+    for text in ("", "{", "[1, 2]", "\x80"):
+        (path / "transforms.json").write_text(text, encoding="latin-1")
+        refused(path, r"transforms\.json: (not readable as JSON|no list of frames)")
+
+
+def test_ply_cut_anywhere_is_refused(tmp_path: Path) -> None:
+    path = capture(tmp_path, 2)
+    file = path / "points3d.ply"
+    write_ply(file, eyes(3), np.full((3, 3), 9, np.uint8))
+    content = file.read_bytes()
+    for length in range(len(content)):
+        file.write_bytes(content[:length])
+        refused(path, r"points3d\.ply: not readable as a PLY|sparse points are none")
+
+
+def test_pair_without_its_test_file(tmp_path: Path) -> None:
+    path = nerf_scene(tmp_path)
+    (path / "transforms_test.json").unlink()
+    refused(path, r"transforms_test\.json: no such file.*without --eval", eval=True)
+    assert len(load(path).train) == 9
+
+
+def test_too_few_views(tmp_path: Path) -> None:
+    refused(capture(tmp_path, 1), "1 training views, expected at least 2")

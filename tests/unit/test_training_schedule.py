@@ -1,0 +1,75 @@
+"""Schedules of the built-in trainer: closed forms of 3DGS's published constants."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import StagePlan
+from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from lapgs_plugin.training.views import view_index
+
+
+def schedules(settings: TrainSettings) -> list[StageSchedule]:
+    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels)
+    return [StageSchedule.create(settings, stage) for stage in plan]
+
+
+def test_a_single_stage_of_30000_has_the_published_constants() -> None:
+    (schedule,) = schedules(TrainSettings(levels=1))
+    assert (schedule.densify_start, schedule.densify_until) == (500, 15_000)
+    assert (schedule.densify_every, schedule.reset_every, schedule.sh_every) == (100, 3000, 1000)
+    assert schedule.means_learning_rate(0) == pytest.approx(1.6e-4)
+    assert schedule.means_learning_rate(15_000) == pytest.approx(1.6e-5)  # log-linear: the geometric mean half way
+    assert schedule.means_learning_rate(30_000) == pytest.approx(1.6e-6)
+    assert [schedule.active_sh_degree(i) for i in (1, 999, 1000, 2999, 3000, 30_000)] == [0, 0, 1, 2, 3, 3]
+
+
+def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
+    base, residual = schedules(TrainSettings(levels=2))
+    assert (base.densify_until, residual.densify_until) == (5000, 10_000)
+    for schedule in (base, residual):
+        assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
+        assert schedule.means_learning_rate(schedule.iterations) == pytest.approx(1.6e-6)
+
+
+def test_given_constants_are_kept_in_short_runs() -> None:
+    chosen = Densification(start=7, until=600, every=11, reset_every=13)
+    base, residual = schedules(TrainSettings(iterations=900, densification=chosen, sh_every=5))
+    assert (base.densify_until, residual.densify_until) == (200, 400)
+    for schedule in (base, residual):
+        assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (7, 11, 13)
+        assert schedule.active_sh_degree(14) == 2
+
+
+@given(st.integers(1, 400), st.integers(0, 10), st.integers(0, 3), st.integers(0, 5))
+def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epoch: int) -> None:
+    seen = Counter(view_index(epoch * count + i + 1, count, seed, level) for i in range(count))
+    assert seen == Counter(range(count))
+
+
+def test_epochs_levels_and_seeds_differ_in_order() -> None:
+    def order(seed: int, level: int, epoch: int) -> list[int]:
+        return [view_index(epoch * 50 + i + 1, 50, seed, level) for i in range(50)]
+
+    orders = [order(0, 0, 0), order(1, 0, 0), order(0, 1, 0), order(0, 0, 1)]
+    assert all(orders[i] != orders[j] for i in range(4) for j in range(i))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"sh_degree": 4}, "--sh-degree 4"),
+        ({"inherit_ratio": 0.0}, "above 0 and at most 1"),
+        ({"inherit_ratio": 1.5}, "above 0 and at most 1"),
+        ({"inherit_ratio": math.nan}, "above 0 and at most 1"),
+    ],
+)
+def test_bad_settings_say_what_is_expected(values: dict[str, float], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        TrainSettings(**values)
