@@ -1,11 +1,12 @@
 """The CPU rasterizer on plain arrays: what `fast` wraps for autograd and stand-ins for CUDA modules can wrap otherwise.
 
-    project_kernels.project -> ordering_kernels -> tile_kernels.blend
-    tile_kernels.blend_backward -> projection_kernels.project_backward
+project_kernels.project -> ordering_kernels -> tile_kernels.blend
+tile_kernels.blend_backward -> projection_kernels.project_backward
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -86,11 +87,13 @@ class Rendering:
     transmittance: Floats
     radii: NDArray[np.int32]
     centres: Floats
-    _kept: _Kept | None
+    kept: Kept | None
 
 
 @dataclass(frozen=True)
-class _Kept:
+class Kept:
+    """What the blending kernels left for those that come after; see `tile_kernels.blend` for shapes."""
+
     splats: Floats
     background: Floats
     first_pair: NDArray[np.int64]
@@ -117,12 +120,25 @@ class Gradients:
     absolute_centres: Floats
 
 
-def render(gaussians: Gaussians, view: View, background: Floats, *, keep: bool) -> Rendering:
+TileLists = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]
+"""first_pair (n + 1,), places (pairs,), tile_start (tiles + 1,), members (pairs,); see `ordering_kernels`."""
+
+
+def render(
+    gaussians: Gaussians,
+    view: View,
+    background: Floats,
+    *,
+    keep: bool,
+    assign: Callable[[Floats, NDArray[np.int32]], TileLists] | None = None,
+) -> Rendering:
     """Render n Gaussians.
 
     Args:
         background: (3,) in the Gaussians' float type.
         keep: whether `gradients` will be asked for.
+        assign: from the splats and the radii, which it may change, to the tiles' lists; None for the tiles of the
+            three-sigma rectangle, as everywhere but in FastGS.
     """
     n, kind = len(gaussians.means), gaussians.means.dtype
     padded = -(-n // WIDTH) * WIDTH
@@ -133,7 +149,10 @@ def render(gaussians: Gaussians, view: View, background: Floats, *, keep: bool) 
         projection_kernels.project, n, *_arrays(gaussians), gaussians.raw, gaussians.signed, gaussians.sh_degree,
         view.camera, tiles_x, tiles_y, splats, boxes, radii, depths, centres,
     )  # fmt: skip
-    first_pair, places, tile_start, members = _order(n, boxes, depths, tiles_x, tiles_x * tiles_y)
+    if assign is None:
+        first_pair, places, tile_start, members = _order(n, boxes, depths, tiles_x, tiles_x * tiles_y)
+    else:
+        first_pair, places, tile_start, members = assign(splats, radii[:n])
 
     pairs, tiles, pixels = len(members), tiles_x * tiles_y, view.width * view.height
     image, transmittance = empty(3 * pixels, kind), empty(pixels, kind)
@@ -141,10 +160,10 @@ def render(gaussians: Gaussians, view: View, background: Floats, *, keep: bool) 
     hits = empty(pairs if keep else 0, np.uint16)
     final = empty(tiles * tile_kernels.FINAL if keep else 0, kind)
     parallel(
-        tile_kernels.blend, view.width, view.height, tiles_x, tile_start, members, splats, background, _offsets(kind),
+        tile_kernels.blend, view.width, view.height, tiles_x, tile_start, members, splats, background, offsets(kind),
         image, transmittance, keep, hits, reached, final,
     )  # fmt: skip
-    kept = _Kept(splats, background, first_pair, places, tile_start, members, hits, reached, final) if keep else None
+    kept = Kept(splats, background, first_pair, places, tile_start, members, hits, reached, final) if keep else None
     return Rendering(
         image.reshape(3, view.height, view.width),
         transmittance.reshape(view.height, view.width),
@@ -163,7 +182,7 @@ def gradients(
         grad_image: (3, height, width) derivative of the loss by the image.
         grad_transmittance: (height, width) that by the transmittance, or None if the loss does not depend on it.
     """
-    kept = rendering._kept
+    kept = rendering.kept
     assert kept is not None, "rendered without keep=True"
     n, kind = len(gaussians.means), gaussians.means.dtype
     padded = -(-n // WIDTH) * WIDTH
@@ -171,7 +190,7 @@ def gradients(
     nothing = np.empty(0, kind)
     parallel(
         tile_kernels.blend_backward, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
-        kept.background, _offsets(kind), kept.hits, kept.reached, kept.final, grad_image.reshape(-1),
+        kept.background, offsets(kind), kept.hits, kept.reached, kept.final, grad_image.reshape(-1),
         nothing if grad_transmittance is None else grad_transmittance.reshape(-1), slots,
     )  # fmt: skip
     means, quats, scales, opacities, centres, absolute_centres = (
@@ -222,9 +241,7 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Float
     return means, quats, scales, gaussians.opacities, sh, colors, gaussians.columns
 
 
-def _order(
-    n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
+def _order(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int) -> TileLists:
     """The tiles' lists of splats, front to back; see `ordering_kernels`."""
     first_pair = empty(n + 1, np.int64)
     shown = ordering_kernels.count_pairs(n, boxes, first_pair)
@@ -244,5 +261,6 @@ def _order(
 
 
 @lru_cache
-def _offsets(kind: Any) -> Floats:
+def offsets(kind: Any) -> Floats:
+    """`tile_kernels.pixel_offsets` of a float type."""
     return tile_kernels.pixel_offsets(kind)

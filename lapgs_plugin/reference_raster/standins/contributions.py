@@ -1,0 +1,140 @@
+"""How much each Gaussian adds to an image: the sums over pixels that Taming-3DGS and FastGS score Gaussians by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.reference_raster._jit import jit
+from lapgs_plugin.reference_raster.buffers import empty
+from lapgs_plugin.reference_raster.lanes import (
+    WIDTH,
+    Floats,
+    at,
+    broadcast,
+    exp2,
+    fetch_add,
+    fma,
+    load,
+    lowest_bit,
+    minimum,
+    select,
+    splat,
+    sqrt,
+    store,
+    store_sums,
+)
+from lapgs_plugin.reference_raster.layout import (
+    BLOCK,
+    BLOCKS,
+    CENTRE_X,
+    CENTRE_Y,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    LOG2_MIN_ALPHA,
+    LOG2_OPACITY,
+    MAX_ALPHA,
+    SLOT,
+    SPLAT,
+    TILE,
+    TILE_PIXELS,
+)
+from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
+from lapgs_plugin.reference_raster.threads import parallel
+
+_FINAL = 2 * TILE_PIXELS  # `tile_kernels.FINAL`; kernels see constants of `layout` and their own module change only
+
+
+@dataclass(frozen=True)
+class Contributions:
+    """Sums over the pixels in which a Gaussian is blended.
+
+    Attributes:
+        weights: (n,) float64 of the pixels' weights.
+        counts: (n,) int32 of 1.
+        blending: (n,) float64 of transmittance times alpha, the Gaussian's share of the pixel.
+        distances: (n,) float64 of the distance of the pixel from the projected centre, in pixels.
+    """
+
+    weights: NDArray[np.float64]
+    counts: NDArray[np.int32]
+    blending: NDArray[np.float64]
+    distances: NDArray[np.float64]
+
+
+def contributions(n: int, view: View, kept: Kept, weights: Floats) -> Contributions:
+    """Walk through the pixels of an image that `pipeline.render` made of n Gaussians, asked to keep.
+
+    Args:
+        weights: (height * width,) float32 weight of each pixel.
+    """
+    slots = empty(len(kept.members) * SLOT, np.float32)
+    parallel(
+        _accumulate, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
+        offsets(np.dtype(np.float32)), kept.hits, kept.reached, kept.final, weights, slots,
+    )  # fmt: skip
+    weighted, counts, blending, distances = (np.bincount(kept.members, slots[column::SLOT], n) for column in range(4))
+    return Contributions(weighted, counts.astype(np.int32), blending, distances)
+
+
+@jit
+def _accumulate(
+    counter: NDArray[np.int64],  # (1,) zero
+    width: int,
+    height: int,
+    tiles_x: int,
+    tile_start: NDArray[np.int64],  # (tiles + 1,)
+    members: NDArray[np.int32],  # (pairs,)
+    splats: Floats,  # (m * SPLAT,)
+    offsets: Floats,  # see `tile_kernels.pixel_offsets`
+    hits: NDArray[np.uint16],  # (pairs,)
+    reached: NDArray[np.int64],  # (tiles,)
+    final: Floats,  # (tiles * _FINAL,)
+    weights: Floats,  # (height * width,)
+    slots: Floats,  # (pairs * SLOT,) filled: sums of weights, of 1, of shares, of distances
+) -> None:
+    """Sums of each splat in each tile. Alpha is evaluated as `tile_kernels.blend` does, bit by bit."""
+    transmittance, weight = np.empty(TILE_PIXELS, splats.dtype), np.zeros(TILE_PIXELS, splats.dtype)
+    none, one = splat(splats, 0.0), splat(splats, 1.0)
+    while True:
+        tile = fetch_add(counter, 1)
+        if tile >= reached.size:
+            break
+        tile_y, tile_x = divmod(tile, tiles_x)
+        for block in range(BLOCKS):
+            store(transmittance, block * WIDTH, one)
+            block_y, block_x = divmod(block, TILE // BLOCK)
+            first_x, first_y = tile_x * TILE + block_x * BLOCK, tile_y * TILE + block_y * BLOCK
+            for row in range(min(BLOCK, height - first_y)):
+                for column in range(min(BLOCK, width - first_x)):
+                    pixel = (first_y + row) * width + first_x + column
+                    weight[block * WIDTH + row * BLOCK + column] = at(weights, pixel)
+        start = at(tile_start, tile)
+        for pair in range(start + at(reached, tile), at(tile_start, tile + 1)):
+            store(slots, pair * SLOT, none)
+        for pair in range(start, start + at(reached, tile)):
+            s = np.int64(at(members, pair)) * SPLAT
+            position = splat(splats, np.float64(pair - start + 1))
+            sum_weight, sum_one, sum_share, sum_distance = none, none, none, none
+            blocks = np.int64(at(hits, pair))
+            while blocks != 0:
+                block = lowest_bit(blocks)
+                blocks &= blocks - 1
+                dx = load(offsets, 2 * block * WIDTH) + tile_x * TILE - broadcast(splats, s + CENTRE_X)
+                dy = load(offsets, (2 * block + 1) * WIDTH) + tile_y * TILE - broadcast(splats, s + CENTRE_Y)
+                u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
+                v = dy * broadcast(splats, s + FACTOR_YY)
+                exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+                alpha = minimum(exp2(exponent), MAX_ALPHA)
+                last = load(final, tile * _FINAL + (2 * block + 1) * WIDTH)
+                blended = (exponent >= LOG2_MIN_ALPHA) & (last >= position)
+                t = load(transmittance, block * WIDTH)
+                store(transmittance, block * WIDTH, select(blended, fma(-alpha, t, t), t))
+                sum_weight = sum_weight + select(blended, load(weight, block * WIDTH), 0.0)
+                sum_one = sum_one + select(blended, one, 0.0)
+                sum_share = sum_share + select(blended, alpha * t, 0.0)
+                sum_distance = sum_distance + select(blended, sqrt(fma(dx, dx, dy * dy)), 0.0)
+            store_sums(slots, pair * SLOT, sum_weight, sum_one, sum_share, sum_distance)

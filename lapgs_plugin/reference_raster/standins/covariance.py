@@ -1,0 +1,157 @@
+"""Covariances in PyTorch, for two options of the CUDA rasterizers that the CPU kernels do not have: covariances given by
+the caller, and antialiasing. Their gradients are those of the CUDA code; DEPARTURE marks where these are not textbook.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.reference_raster import pipeline, tile_kernels
+from lapgs_plugin.reference_raster.lanes import Floats
+from lapgs_plugin.reference_raster.layout import (
+    FACTOR_SCALE,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    FOCAL_X,
+    FOCAL_Y,
+    LIMIT_X,
+    LIMIT_Y,
+    NEAR_DEPTH,
+    PIXEL_VARIANCE,
+    ROTATION,
+    SLOT,
+    SPLAT,
+    SUM_UU,
+    SUM_UV,
+    SUM_VV,
+    TRANSLATION,
+)
+from lapgs_plugin.reference_raster.pipeline import Kept, View
+from lapgs_plugin.reference_raster.threads import parallel
+
+MIN_SHARE = 2.5e-5
+"""Lower bound of the determinant without the 0.3 px^2 over that with it, in antialiasing."""
+
+
+def matrices(covariances: Tensor) -> Tensor:
+    """(n, 3, 3) symmetric matrices from their entries (n, 6): xx, xy, xz, yy, yz, zz."""
+    return covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations (n, 3) and rotations (n, 4), wxyz, of Gaussians with these covariances (n, 6).
+
+    Not differentiable: the axes of a covariance with equal eigenvalues are not functions of it.
+    """
+    variances, axes = torch.linalg.eigh(matrices(covariances.detach().double()))  # (n, 3), (n, 3, 3)
+    axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]  # no reflections
+    xyzw = Rotation.from_matrix(axes.numpy()).as_quat() if len(axes) else np.zeros((0, 4))  # (n, 4)
+    quats = torch.from_numpy(np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]]))
+    return variances.clamp_min(0).sqrt().to(covariances.dtype), quats.to(covariances.dtype)
+
+
+def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
+    """(n, 6) covariances of Gaussians with standard deviations (n, 3) and quaternions (n, 4), used as they are."""
+    w, x, y, z = quats.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    root = torch.stack(rows, 1).reshape(-1, 3, 3) * scales[:, None, :]
+    return (root @ root.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+
+
+def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor:
+    """(n, 3) entries xx, xy, yy of the 2D covariances in px^2, without the 0.3 px^2; made up behind the camera.
+
+    Args:
+        means: (n, 3) in world coordinates.
+        covariances: (n, 6) in world coordinates.
+    """
+    camera = torch.from_numpy(view.camera).to(means)
+    rotation = camera[ROTATION : ROTATION + 9].reshape(3, 3)
+    x, y, depth = (means @ rotation.T + camera[TRANSLATION : TRANSLATION + 3]).unbind(1)
+    depth = torch.where(depth > NEAR_DEPTH, depth, 1.0)
+    # DEPARTURE: where x / z or y / z is clamped, the clamped coordinate is a constant, although it still follows z.
+    x, y = (_clamped(t, depth, float(view.camera[limit])) for t, limit in ((x, LIMIT_X), (y, LIMIT_Y)))
+    none = torch.zeros_like(depth)
+    x_scale, y_scale = camera[FOCAL_X] / depth, camera[FOCAL_Y] / depth
+    jacobian = torch.stack([x_scale, none, -x_scale * x / depth, none, y_scale, -y_scale * y / depth], 1)
+    root = jacobian.reshape(-1, 2, 3) @ rotation  # (n, 2, 3)
+    return (root @ matrices(covariances) @ root.mT).reshape(-1, 4)[:, [0, 1, 3]]
+
+
+def _clamped(value: Tensor, depth: Tensor, limit: float) -> Tensor:
+    bounded = (value / depth).clamp(-limit, limit) * depth
+    return torch.where((value / depth).abs() > limit, bounded.detach(), value)
+
+
+class _Antialiasing(torch.autograd.Function):
+    """(n, 3) 2D covariances without the 0.3 px^2 -> (n,) factors of the opacities."""
+
+    @staticmethod
+    def forward(ctx: Any, covariances: Tensor) -> Tensor:
+        xx, xy, yy = covariances.unbind(1)
+        wide = covariances + covariances.new_tensor([PIXEL_VARIANCE, 0, PIXEL_VARIANCE])
+        share = (xx * yy - xy * xy) / (wide[:, 0] * wide[:, 2] - xy * xy)
+        factors = share.clamp_min(MIN_SHARE).sqrt()
+        ctx.save_for_backward(wide, share, factors)
+        return factors
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    def backward(ctx: Any, grad_factors: Tensor) -> Tensor:
+        wide, share, factors = ctx.saved_tensors
+        x, z, y = wide.unbind(1)
+        w = PIXEL_VARIANCE
+        # DEPARTURE: the derivative of the share is taken where the CUDA code takes it, at covariances that already have
+        # the 0.3 px^2, and not at those that the share is computed from.
+        d_share = torch.where(share <= MIN_SHARE, 0.0, grad_factors / (2 * factors))
+        common = w * d_share / ((x + w) * (y + w) - z * z) ** 2
+        return torch.stack([(w * y + y * y + z * z) * common, -2 * z * (w + x + y) * common,
+                            (w * x + x * x + z * z) * common], 1)  # fmt: skip
+
+
+def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tensor:
+    """(n, 1) what the antialiasing option multiplies opacities by: sqrt(|Sigma| / |Sigma + 0.3 px^2|).
+
+    In float64, because the determinant of a long Gaussian is a small difference of large products.
+    """
+    on_screen = screen_covariances(means.double(), covariances.double(), view)
+    factors: Tensor = _Antialiasing.apply(on_screen)  # type: ignore[no-untyped-call]  # torch's
+    return factors[:, None].to(means.dtype)
+
+
+def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, grad_image: Floats) -> Tensor:
+    """(n, 6) derivative of the loss by covariances given by the caller.
+
+    Runs the tiles' backward pass once more: this option is for experiments, and the kernels stay as they are.
+    """
+    slots = np.empty(len(kept.members) * SLOT, np.float32)
+    parallel(
+        tile_kernels.blend_backward, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
+        kept.background, pipeline.offsets(np.dtype(np.float32)), kept.hits, kept.reached, kept.final,
+        grad_image.reshape(-1), np.empty(0, np.float32), slots,
+    )  # fmt: skip
+    n = len(means)
+    uu, uv, vv = (torch.from_numpy(np.bincount(kept.members, slots[i::SLOT], n)) for i in (SUM_UU, SUM_UV, SUM_VV))
+    seen = torch.from_numpy(np.diff(kept.first_pair) > 0)
+    splats = torch.from_numpy(kept.splats.reshape(-1, SPLAT)[:n]).double()
+    # With the inverse covariance L^T L the derivative is L^T ((uu, uv), (uv, vv)) L / 2; off the diagonal, both entries'.
+    l_xx, l_xy, l_yy = (splats[:, i] / FACTOR_SCALE for i in (FACTOR_XX, FACTOR_XY, FACTOR_YY))
+    mixed = l_xy * uu + l_yy * uv
+    entries = torch.stack([l_xx * l_xx * uu / 2, l_xx * mixed, (l_xy * mixed + l_yy * (l_xy * uv + l_yy * vv)) / 2], 1)
+    by_screen = torch.where(seen[:, None], entries / FACTOR_SCALE**2, 0.0)
+    leaf = covariances.detach().double().requires_grad_(True)
+    with torch.enable_grad():
+        on_screen = screen_covariances(means.detach().double(), leaf, view)
+    (gradient,) = torch.autograd.grad(on_screen, leaf, by_screen)
+    return gradient.to(covariances.dtype)

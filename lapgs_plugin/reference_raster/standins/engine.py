@@ -1,0 +1,361 @@
+"""One differentiable call behind all rasterizer stand-ins: the arguments of the CUDA bindings, onto `pipeline`.
+
+As in the CUDA code: no Gaussians at all give a black image, whatever the background; the gradient by `means2D` is in
+units of half the image's sides; the gradient by the scales leaves out `scale_modifier`, which multiplied them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.reference_raster import pipeline
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION
+from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
+from lapgs_plugin.reference_raster.standins.contributions import Contributions, contributions
+from lapgs_plugin.reference_raster.standins.covariance import (
+    antialiasing_factors,
+    covariance_gradients,
+    covariances_of,
+    principal_axes,
+)
+from lapgs_plugin.reference_raster.standins.snug_tiles import snug_tiles
+from lapgs_plugin.signed_color import SIGNED_COLOR_BIT
+
+FOCAL_TOLERANCE = 1e-3
+"""How far, relatively, the focal lengths in `projmatrix` may be from those that the fields of view say."""
+
+
+class Settings(Protocol):
+    """What all `GaussianRasterizationSettings` have, in the CUDA bindings' names."""
+
+    @property
+    def image_height(self) -> int: ...
+    @property
+    def image_width(self) -> int: ...
+    @property
+    def tanfovx(self) -> float: ...
+    @property
+    def tanfovy(self) -> float: ...
+    @property
+    def bg(self) -> Tensor: ...
+    @property
+    def scale_modifier(self) -> float: ...
+    @property
+    def viewmatrix(self) -> Tensor: ...
+    @property
+    def projmatrix(self) -> Tensor: ...
+    @property
+    def sh_degree(self) -> int: ...
+    @property
+    def campos(self) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The tensors of a call; n Gaussians, float32. None stands for what is not given.
+
+    Attributes:
+        means: (n, 3).
+        means2d: (n, 3), or (n, 4) for sums of absolute values in the last two columns; only its gradient matters.
+        opacities: (n, 1).
+        sh: (n, k, 3), or None if there are colours.
+        colors: (n, 3), or None.
+        scales, quats: (n, 3) and (n, 4), or None if there are covariances.
+        covariances: (n, 6), or None.
+    """
+
+    means: Tensor
+    means2d: Tensor
+    opacities: Tensor
+    sh: Tensor | None
+    colors: Tensor | None
+    scales: Tensor | None
+    quats: Tensor | None
+    covariances: Tensor | None
+
+    def tensors(self) -> tuple[Tensor | None, ...]:
+        return (
+            self.means, self.means2d, self.opacities, self.sh, self.colors, self.scales, self.quats, self.covariances
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Options:
+    """What one rasterizer offers and others do not.
+
+    Attributes:
+        mult: FastGS's compact box, or None for three-sigma squares.
+        antialiasing: dim Gaussians that are smaller than a pixel.
+        inverse_depth: also blend 1 / depth.
+        pixel_weights: (height * width,) float32 to sum up for each Gaussian, or None.
+    """
+
+    mult: float | None = None
+    antialiasing: bool = False
+    inverse_depth: bool = False
+    pixel_weights: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a call gives.
+
+    Attributes:
+        image: (3, height, width).
+        radii: (n,) int32, 0 where culled.
+        inverse_depths: (1, height, width), or None if not asked for.
+        centres: (n, 2) pixels, 0 where culled.
+        depths: (n,) camera-space z, 0 where culled.
+        contributions: None without pixel weights.
+    """
+
+    image: Tensor
+    radii: Tensor
+    inverse_depths: Tensor | None
+    centres: Tensor
+    depths: Tensor
+    contributions: Contributions | None
+
+
+def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
+    """Render, differentiably by all tensors of `inputs`.
+
+    Raises:
+        UserInputError: tensors that do not fit each other, or a projection that does not fit the field of view.
+    """
+    _check(settings, inputs)
+    view = view_of(settings)
+    if options.antialiasing:
+        covariances = inputs.covariances
+        if covariances is None:
+            assert inputs.scales is not None
+            assert inputs.quats is not None
+            covariances = covariances_of(inputs.scales * settings.scale_modifier, inputs.quats)
+        factors = antialiasing_factors(inputs.means, covariances, view)
+        inputs = replace(inputs, opacities=inputs.opacities * factors)
+    tensors = inputs.tensors()
+    call = _Call(
+        settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    )
+    image, inverse_depths, radii = _Rasterize.apply(call, *tensors)  # type: ignore[no-untyped-call]  # torch's
+    assert call.centres is not None
+    assert call.depths is not None
+    return Output(
+        image, radii, inverse_depths if options.inverse_depth else None, call.centres, call.depths, call.contributions
+    )
+
+
+def view_of(settings: Settings) -> View:
+    """The camera, from transposed matrices as the CUDA code takes them.
+
+    Raises:
+        UserInputError: the projection is not one along the z axis with the focal lengths of the fields of view.
+    """
+    width, height = int(settings.image_width), int(settings.image_height)
+    world_to_camera = settings.viewmatrix.detach().to("cpu", torch.float64).T.numpy()
+    full = settings.projmatrix.detach().to("cpu", torch.float64).T.numpy()
+    projection = full[:, :3] @ np.linalg.inv(world_to_camera[:3, :3])  # (4, 3)
+    focal = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+    found = projection[0, 0] * width / 2, projection[1, 1] * height / 2
+    if not np.allclose(found, focal, rtol=FOCAL_TOLERANCE) or not np.allclose(projection[3], (0, 0, 1), atol=1e-3):
+        raise UserInputError(
+            f"projmatrix has focal lengths {found[0]:.6g}, {found[1]:.6g} px, but tanfovx and tanfovy say "
+            f"{focal[0]:.6g}, {focal[1]:.6g}; pass the transposed projection times viewmatrix for this image size"
+        )
+    principal = (1 + projection[0, 2]) * width / 2, (1 + projection[1, 2]) * height / 2
+    view = pipeline.make_view(width, height, world_to_camera.astype(np.float32), focal, principal)
+    view.camera[POSITION : POSITION + 3] = settings.campos.detach().cpu().numpy().ravel()
+    return view
+
+
+def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
+    """(n,) bool: whether points (n, 3) are in front of the near plane; the CUDA code asks no more."""
+    return _depths(positions.detach(), settings.viewmatrix) > NEAR_DEPTH
+
+
+class _Call:
+    """What a call hands to its autograd function beside tensors, and what it brings back beside differentiable ones."""
+
+    def __init__(self, settings: Settings, view: View, options: Options, keep: bool) -> None:
+        self.settings, self.view, self.options, self.keep = settings, view, options, keep
+        self.background = settings.bg.detach().to("cpu", torch.float32).contiguous().numpy()
+        self.centres: Tensor | None = None
+        self.depths: Tensor | None = None
+        self.contributions: Contributions | None = None
+
+    def gaussians(self, tensors: tuple[Tensor | None, ...]) -> Gaussians:
+        """The tensors as the kernels take them."""
+        means, _, opacities, sh, colors, scales, quats, covariances = (
+            None if t is None else t.detach().contiguous() for t in tensors
+        )
+        if covariances is not None:
+            scales, quats = principal_axes(covariances)
+        else:
+            assert scales is not None
+            scales = scales * self.settings.scale_modifier if self.settings.scale_modifier != 1 else scales
+        assert means is not None
+        assert opacities is not None
+        assert quats is not None
+        degree = int(self.settings.sh_degree)
+        return Gaussians(
+            means.numpy(), quats.numpy(), scales.numpy(), opacities.reshape(-1).numpy(),
+            None if sh is None else sh.numpy(), None if colors is None else colors.numpy(),
+            raw=False, signed=degree < 0, sh_degree=degree & ~SIGNED_COLOR_BIT,
+        )  # fmt: skip
+
+    def render(self, gaussians: Gaussians, background: Any, keep: bool) -> Rendering:
+        """Render with the tiles that the options ask for."""
+        assign = None
+        if self.options.mult is not None:
+            depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
+            assign = snug_tiles(depths, self.options.mult, *self.view.tiles)
+        return pipeline.render(gaussians, self.view, background, keep=keep, assign=assign)
+
+    def shaded_by_depth(self, gaussians: Gaussians) -> Gaussians:
+        """The same Gaussians with 1 / depth for their first colour."""
+        depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
+        colors = np.zeros((len(depths), 3), np.float32)
+        np.divide(1, depths, out=colors[:, 0], where=depths > 0)
+        return replace(gaussians, sh=None, colors=colors)
+
+
+class _Rasterize(torch.autograd.Function):
+    """(call, *tensors of Inputs) -> image, inverse depths (empty if not asked for), radii."""
+
+    @staticmethod
+    def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        gaussians = call.gaussians(tensors)
+        weights = call.options.pixel_weights
+        n = len(gaussians.means)
+        rendering = call.render(gaussians, call.background, call.keep or weights is not None)
+        image, radii, call.centres = (
+            torch.from_numpy(array) for array in (rendering.image, rendering.radii, rendering.centres)
+        )
+        if n == 0:
+            image = torch.zeros_like(image)
+        depths = _depths(torch.from_numpy(gaussians.means), call.settings.viewmatrix)
+        call.depths = torch.where(radii > 0, depths, 0.0)
+        if weights is not None:
+            assert rendering.kept is not None
+            flat = weights.detach().to("cpu", torch.float32).contiguous().reshape(-1).numpy()
+            call.contributions = contributions(n, call.view, rendering.kept, flat)
+        inverse_depths = torch.empty(0)
+        if call.options.inverse_depth:
+            behind = call.render(call.shaded_by_depth(gaussians), np.zeros(3, np.float32), False)
+            inverse_depths = torch.from_numpy(behind.image[:1].copy())
+        if call.keep:
+            ctx.call, ctx.rendering = call, rendering
+            ctx.save_for_backward(*tensors)
+            ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        return image, inverse_depths, radii
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
+        call: _Call = ctx.call
+        tensors: tuple[Tensor | None, ...] = ctx.saved_tensors
+        total: list[Tensor | None] = [None] * len(tensors)
+        grad_image, grad_depth = from_above[0], from_above[1]
+        if grad_image is not None:
+            total = _add(total, _gradients(call, tensors, call.gaussians(tensors), ctx.rendering, grad_image))
+        if grad_depth is not None and call.options.inverse_depth:
+            # The CUDA code blends 1 / depth beside the colours; as a colour of its own it has the same gradients.
+            shaded = call.shaded_by_depth(call.gaussians(tensors))
+            rendering = call.render(shaded, np.zeros(3, np.float32), True)
+            grad = torch.cat([grad_depth, torch.zeros(2, *grad_depth.shape[1:])])
+            found = _gradients(call, tensors, shaded, rendering, grad)
+            by_inverse, found[3], found[4] = found[4], None, None
+            assert by_inverse is not None
+            assert found[0] is not None
+            axis = call.settings.viewmatrix.detach().cpu()[:3, 2]
+            inverse = torch.from_numpy(shaded.colors)[:, :1]  # (n, 1)
+            found[0] = found[0] - by_inverse[:, :1] * inverse**2 * axis
+            total = _add(total, found)
+        return (None, *total)
+
+
+def _gradients(
+    call: _Call, tensors: tuple[Tensor | None, ...], gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
+) -> list[Tensor | None]:
+    """Gradients in the order of `Inputs.tensors`, but that by colours is there whenever Gaussians have colours."""
+    above = grad_image.contiguous().numpy()
+    found = pipeline.gradients(gaussians, call.view, rendering, above, None)
+    means, means2d, opacities, _, _, _, _, covariances = tensors
+    assert means is not None
+    assert means2d is not None
+    assert opacities is not None
+    by_covariances = None
+    if covariances is not None:
+        assert rendering.kept is not None
+        by_covariances = covariance_gradients(means, covariances, call.view, rendering.kept, above)
+    return [
+        torch.from_numpy(found.means),
+        _screen_gradient(call.view, found, means2d),
+        torch.from_numpy(found.opacities).reshape(opacities.shape),
+        None if found.sh is None else torch.from_numpy(found.sh),
+        None if found.colors is None else torch.from_numpy(found.colors),
+        None if covariances is not None else torch.from_numpy(found.scales),
+        None if covariances is not None else torch.from_numpy(found.quats),
+        by_covariances,
+    ]
+
+
+def _screen_gradient(view: View, found: Gradients, means2d: Tensor) -> Tensor:
+    """Gradient by the centres in units of half the image: signed, then, in four columns, of absolute values."""
+    half = np.array([view.width / 2, view.height / 2], np.float32)
+    gradient = torch.zeros_like(means2d)
+    gradient[:, :2] = torch.from_numpy(found.centres * half)
+    if means2d.shape[1] == 4:
+        gradient[:, 2:] = torch.from_numpy(found.absolute_centres * half)
+    return gradient
+
+
+def _add(a: list[Tensor | None], b: list[Tensor | None]) -> list[Tensor | None]:
+    return [y if x is None else x if y is None else x + y for x, y in zip(a, b, strict=True)]
+
+
+def _depths(means: Tensor, viewmatrix: Tensor) -> Tensor:
+    """(n,) camera-space z."""
+    matrix = viewmatrix.detach().to("cpu", torch.float32)
+    return means @ matrix[:3, 2] + matrix[3, 2]
+
+
+def _check(settings: Settings, inputs: Inputs) -> None:
+    """Refuse what CUDA code would read out of bounds."""
+    n = len(inputs.means)
+    wanted = {
+        "means3D": (inputs.means, (n, 3)),
+        "opacities": (inputs.opacities, (n, 1)),
+        "colors_precomp": (inputs.colors, (n, 3)),
+        "scales": (inputs.scales, (n, 3)),
+        "rotations": (inputs.quats, (n, 4)),
+        "cov3D_precomp": (inputs.covariances, (n, 6)),
+    }
+    for name, (tensor, shape) in wanted.items():
+        if tensor is not None and (
+            tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu"
+        ):
+            raise UserInputError(
+                f"{name} is {tuple(tensor.shape)}, {tensor.dtype}, on {tensor.device}: "
+                f"expected {shape}, torch.float32, on the CPU"
+            )
+    degree = int(settings.sh_degree) & ~SIGNED_COLOR_BIT
+    if inputs.sh is not None and not (
+        0 <= degree <= 3
+        and inputs.sh.shape[:1] == (n,)
+        and inputs.sh.shape[2:] == (3,)
+        and inputs.sh.shape[1] in (1, 4, 9, 16)
+        and inputs.sh.shape[1] >= (degree + 1) ** 2
+    ):
+        raise UserInputError(
+            f"SH coefficients are {tuple(inputs.sh.shape)} at sh_degree {degree}: expected ({n}, k, 3), k of 1, 4, 9 "
+            "or 16 and at least (degree + 1)^2, dc included"
+        )

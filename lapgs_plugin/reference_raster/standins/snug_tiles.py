@@ -1,0 +1,174 @@
+"""Tiles as FastGS assigns them: those that an ellipse of constant alpha meets, instead of a three-sigma square.
+
+A Gaussian of opacity o reaches alpha = 1/255 where its squared Mahalanobis distance is 2 ln(255 o). FastGS multiplies
+that by `mult` ("compact box", 0.5 in its options) and blends the Gaussian in the tiles that this ellipse meets, in all
+of their pixels: with mult < 1 this is part of the image. Source: the FastGS paper, and Speedy-Splat, whose exact
+ellipse-tile test it takes over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.reference_raster import ordering_kernels
+from lapgs_plugin.reference_raster._jit import inline, jit
+from lapgs_plugin.reference_raster.lanes import Floats
+from lapgs_plugin.reference_raster.layout import (
+    CENTRE_X,
+    CENTRE_Y,
+    FACTOR_SCALE,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    LOG2_MIN_ALPHA,
+    LOG2_OPACITY,
+    NEAR_DEPTH,
+    SPLAT,
+    TILE,
+)
+from lapgs_plugin.reference_raster.pipeline import TileLists
+from lapgs_plugin.reference_raster.projection_kernels import HUGE, MIN_ROOT, RADIUS_SIGMAS
+
+Assign = Callable[[Floats, NDArray[np.int32]], TileLists]
+
+
+def snug_tiles(depths: Floats, mult: float, tiles_x: int, tiles_y: int) -> Assign:
+    """What `pipeline.render` takes to assign tiles as FastGS does.
+
+    Args:
+        depths: (n,) float32 camera-space z.
+        mult: share of the squared distance at which alpha reaches 1/255.
+    """
+
+    def assign(splats: Floats, radii: NDArray[np.int32]) -> TileLists:
+        n = len(radii)
+        # A Gaussian that its three-sigma square puts outside of the image may still reach it, if it is nearly opaque;
+        # those at the near plane itself are left to the projection, which decided with other rounding.
+        candidates = (radii > 0) | (depths > NEAR_DEPTH * (1 + 1e-5))
+        first_pair = np.empty(n + 1, np.int64)
+        starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
+        shown = _count(n, splats, candidates, float(mult), tiles_x, tiles_y, radii, first_pair, starts)
+        keys = np.ascontiguousarray(depths).view(np.uint32)
+        order, spare = np.empty(shown, np.int32), np.empty(shown, np.int32)
+        sorted_keys, spare_keys = np.empty(shown, np.uint32), np.empty(shown, np.uint32)
+        ordering_kernels.sort_by_depth(first_pair, keys, order, spare, sorted_keys, spare_keys)
+        members, places = np.empty(first_pair[n], np.int32), np.empty(first_pair[n], np.int32)
+        _deal(order, splats, float(mult), tiles_x, tiles_y, first_pair, starts.copy(), members, places)
+        return first_pair, places, starts, members
+
+    return assign
+
+
+@inline
+def _clip(value: float, last: int) -> int:
+    return int(min(max(math.floor(value), 0.0), float(last)))
+
+
+@inline
+def _rows(splats: Floats, s: int, mult: float, tiles_y: int) -> tuple[float, float, int, int]:
+    """Squared size of the ellipse in the splat's units, half its height in pixels, its first tile row and the one past
+    its last."""
+    reach = mult * (splats[s + LOG2_OPACITY] - LOG2_MIN_ALPHA)
+    if not (reach > 0.0 and splats[s + FACTOR_XX] > 0.0 and splats[s + FACTOR_YY] > 0.0):
+        return 0.0, 0.0, 0, 0
+    if not (abs(splats[s + CENTRE_X]) < HUGE and abs(splats[s + CENTRE_Y]) < HUGE):
+        return 0.0, 0.0, 0, 0
+    half, centre = math.sqrt(reach) / splats[s + FACTOR_YY], splats[s + CENTRE_Y]
+    return reach, half, _clip((centre - half) / TILE, tiles_y), _clip((centre + half) / TILE + 1.0, tiles_y)
+
+
+@inline
+def _span(splats: Floats, s: int, reach: float, half: float, row: int, tiles_x: int) -> tuple[int, int]:
+    """First tile that the ellipse meets in a row of tiles, and one past the last.
+
+    The ellipse is u^2 + v^2 <= reach with u = xx dx + xy dy, v = yy dy. Its border on either side is monotone in dy but
+    for the leftmost and the rightmost point, which mirror each other.
+    """
+    xx, xy, yy = float(splats[s + FACTOR_XX]), float(splats[s + FACTOR_XY]), float(splats[s + FACTOR_YY])
+    top = min(max(row * TILE - splats[s + CENTRE_Y], -half), half)
+    bottom = min(max((row + 1) * TILE - splats[s + CENTRE_Y], -half), half)
+    widest = math.sqrt(reach * (xy * xy + yy * yy)) / (xx * yy)
+    extreme = -xy * widest * xx / (xy * xy + yy * yy)  # dy of the rightmost point
+    slope = -xy / xx
+    half_top = math.sqrt(max(reach - (yy * top) ** 2, 0.0)) / xx
+    half_bottom = math.sqrt(max(reach - (yy * bottom) ** 2, 0.0)) / xx
+    right = widest if top <= extreme <= bottom else max(slope * top + half_top, slope * bottom + half_bottom)
+    left = -widest if top <= -extreme <= bottom else min(slope * top - half_top, slope * bottom - half_bottom)
+    centre = splats[s + CENTRE_X]
+    return _clip((centre + left) / TILE, tiles_x), _clip((centre + right) / TILE + 1.0, tiles_x)
+
+
+@inline
+def _radius(splats: Floats, s: int) -> int:
+    """The three-sigma radius in pixels, from the inverse covariance."""
+    xx, xy, yy = (float(splats[s + i]) / FACTOR_SCALE for i in (FACTOR_XX, FACTOR_XY, FACTOR_YY))
+    scale = 1.0 / (xx * yy) ** 2
+    middle = 0.5 * (xy * xy + yy * yy + xx * xx) * scale
+    root = math.sqrt(max(middle * middle - scale, MIN_ROOT))
+    return math.ceil(RADIUS_SIGMAS * math.sqrt(middle + root))
+
+
+@jit
+def _count(
+    n: int,
+    splats: Floats,  # (m * SPLAT,)
+    candidates: NDArray[np.bool_],  # (n,)
+    mult: float,
+    tiles_x: int,
+    tiles_y: int,
+    radii: NDArray[np.int32],  # (n,) set to 0 where no tile is met
+    first_pair: NDArray[np.int64],  # (n + 1,) filled: see `ordering_kernels.count_pairs`
+    starts: NDArray[np.int64],  # (tiles + 1,) zero, filled with where the tiles' lists begin
+) -> int:
+    """Count pairs of a Gaussian and a tile; returns the Gaussians that have any."""
+    total, shown = 0, 0
+    for i in range(n):
+        first_pair[i] = total
+        s = i * SPLAT
+        reach, half, first, end = _rows(splats, s, mult, tiles_y) if candidates[i] else (0.0, 0.0, 0, 0)
+        for row in range(first, end):
+            left, right = _span(splats, s, reach, half, row, tiles_x)
+            for column in range(left, right):
+                starts[row * tiles_x + column] += 1
+            total += max(right - left, 0)
+        if total == first_pair[i]:
+            radii[i] = 0
+        else:
+            shown += 1
+            if radii[i] == 0:
+                radii[i] = _radius(splats, s)
+    first_pair[n] = total
+    before = 0
+    for tile in range(starts.size):
+        before, starts[tile] = before + starts[tile], before
+    return shown
+
+
+@jit
+def _deal(
+    order: NDArray[np.int32],  # (shown,) nearest first
+    splats: Floats,
+    mult: float,
+    tiles_x: int,
+    tiles_y: int,
+    first_pair: NDArray[np.int64],
+    starts: NDArray[np.int64],  # (tiles + 1,) used up
+    members: NDArray[np.int32],  # (pairs,) filled: see `ordering_kernels.deal_to_tiles`
+    places: NDArray[np.int32],  # (pairs,) filled: as above
+) -> None:
+    """Put each pair into its tile's list."""
+    for i in order:
+        pair = first_pair[i]
+        reach, half, first, end = _rows(splats, i * SPLAT, mult, tiles_y)
+        for row in range(first, end):
+            left, right = _span(splats, i * SPLAT, reach, half, row, tiles_x)
+            for column in range(left, right):
+                place = starts[row * tiles_x + column]
+                starts[row * tiles_x + column] = place + 1
+                members[place] = i
+                places[pair] = place
+                pair += 1
