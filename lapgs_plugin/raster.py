@@ -33,6 +33,20 @@ class RenderResult:
     absgrad2d: Tensor | None = None
 
 
+@dataclass(frozen=True)
+class Semantics:
+    """Where a rasterizer departs by design from what `reference_raster.oracle` states, and correctly so.
+
+    Attributes:
+        three_sigma_cut: False where a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one
+            that is blended in no pixel may then have radius 0.
+        note: the departures in words, for reports.
+    """
+
+    three_sigma_cut: bool = True
+    note: str = ""
+
+
 class Rasterizer(Protocol):
     """Renders a field from a camera."""
 

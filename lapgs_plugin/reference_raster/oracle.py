@@ -95,7 +95,14 @@ class OracleRasterizer:
     """Reference rasterizer in plain PyTorch: any device, float32 or float64, as the field's tensors are.
 
     Each tile is computed again in the backward pass, so that memory holds the intermediates of one tile at a time.
+
+    Args:
+        three_sigma_cut: False for rasterizers that blend a Gaussian wherever alpha reaches 1/255: every Gaussian in
+            front of the camera is then in every tile, and has a radius.
     """
+
+    def __init__(self, *, three_sigma_cut: bool = True) -> None:
+        self._three_sigma_cut = three_sigma_cut
 
     @property
     def name(self) -> str:
@@ -118,7 +125,7 @@ class OracleRasterizer:
         background = background.to(field.means)  # (3,)
 
         n = len(field)
-        seen = project(field, camera)
+        seen = project(field, camera, three_sigma_cut=self._three_sigma_cut)
         means2d = field.means.new_zeros(n, 2).index_put((seen.ids,), seen.means2d)  # (n, 2)
         if means2d.requires_grad:
             means2d.retain_grad()
@@ -144,23 +151,24 @@ class OracleRasterizer:
         return RenderResult(image, transmittance, radii, means2d, absgrad2d)
 
 
-def project(field: GaussianField, camera: Camera) -> Projection:
+def project(field: GaussianField, camera: Camera, *, three_sigma_cut: bool = True) -> Projection:
     """EWA projection of the Gaussians that reach the image.
 
     Args:
         field: n Gaussians.
         camera: with its pose on the field's device and in its precision.
+        three_sigma_cut: False puts all in front of the camera in all tiles.
     """
     # Found without gradients first: a Gaussian divided by a depth or determinant of zero must not enter the graph,
     # where its zero gradient times infinity would be NaN.
     with torch.no_grad():
-        everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device))
+        everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device), three_sigma_cut)
         first, last = everyone.rectangles[:, :2], everyone.rectangles[:, 2:]  # (n, 2) each
         seen = (everyone.depths > NEAR_DEPTH) & (everyone.determinants != 0) & (first < last).all(dim=1)  # (n,)
-    return _project_all(field, camera, everyone.ids[seen])
+    return _project_all(field, camera, everyone.ids[seen], three_sigma_cut)
 
 
-def _project_all(field: GaussianField, camera: Camera, ids: Tensor) -> Projection:
+def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_cut: bool) -> Projection:
     """EWA projection of the Gaussians `ids`, whether they reach the image or not."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
     points = field.means[ids] @ rotation.T + translation  # (v, 3) in camera coordinates
@@ -180,7 +188,8 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor) -> Projectio
 
     with torch.no_grad():
         radii = footprint_radii(xx, yy, determinants)  # (v,)
-        rectangles = tile_rectangles(means2d, radii, camera)  # (v, 4)
+        reach = radii if three_sigma_cut else torch.full_like(radii, math.inf)  # (v,)
+        rectangles = tile_rectangles(means2d, reach, camera)  # (v, 4)
     return Projection(ids, depths, means2d, determinants, conics, radii, rectangles)
 
 

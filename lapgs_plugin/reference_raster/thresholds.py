@@ -23,6 +23,7 @@ Gradients mix pixels; compare those of a loss whose weights vanish on the masked
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -102,7 +103,12 @@ class _Bounded:
 
 @torch.no_grad()
 def threshold_mask(
-    field: GaussianField, camera: Camera, *, sh_degree: int | None = None, tolerance: float | None = None
+    field: GaussianField,
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    tolerance: float | None = None,
+    three_sigma_cut: bool = True,
 ) -> ThresholdMask:
     """Pixels and Gaussians whose rendering hangs on rounding.
 
@@ -111,17 +117,19 @@ def threshold_mask(
         camera: the view.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
+        three_sigma_cut: as in `OracleRasterizer`.
     """
     if tolerance is None:
         tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
     field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
-    bounded = _project(field, camera, field.sh_degree if sh_degree is None else sh_degree, tolerance)
+    degree = field.sh_degree if sh_degree is None else sh_degree
+    bounded = _project(field, camera, degree, tolerance, three_sigma_cut)
     radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
     radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
     return ThresholdMask(_open_pixels(bounded, camera, tolerance), radii, kinks)
 
 
-def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float) -> _Bounded:
+def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float, three_sigma_cut: bool) -> _Bounded:
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
     points = field.means @ rotation.T + translation  # (n, 3)
     errors = tolerance * (field.means.abs() @ rotation.abs().T + translation.abs())  # (n, 3)
@@ -138,7 +146,7 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
     relative = tolerance + 4 * errors.norm(dim=1) / depths  # (v,) error of the Jacobian, twice in the covariance
     shapes = _shapes(field, ids, points, camera, relative, tolerance)
     may_be_culled = (depths - NEAR_DEPTH <= errors[:, 2] + tolerance) | shapes.degenerate  # (v,)
-    surely, possibly = _tiles(means2d, mean_errors, shapes, camera)  # (v, 4) each
+    surely, possibly = _tiles(means2d, mean_errors, shapes, camera, three_sigma_cut)  # (v, 4) each
     surely = surely * (~may_be_culled)[:, None]  # (v, 4)
     touched, surely_touched = _area(possibly) > 0, _area(surely) > 0  # (v,) each
     open_radii = touched & ((shapes.smallest_radii != shapes.largest_radii) | ~surely_touched)  # (v,)
@@ -217,8 +225,13 @@ def _shapes(
     )
 
 
-def _tiles(means2d: Tensor, errors: Tensor, shapes: _Shapes, camera: Camera) -> tuple[Tensor, Tensor]:
+def _tiles(
+    means2d: Tensor, errors: Tensor, shapes: _Shapes, camera: Camera, three_sigma_cut: bool
+) -> tuple[Tensor, Tensor]:
     """(v, 4) tiles that each Gaussian touches whatever the (v, 2) errors of its centre are, and those it may touch."""
+    if not three_sigma_cut:
+        everywhere = tile_rectangles(means2d, torch.full_like(means2d[:, 0], math.inf), camera)  # (v, 4)
+        return everywhere, everywhere
     extremes = torch.stack(
         [
             tile_rectangles(means2d + side * errors, radii, camera)

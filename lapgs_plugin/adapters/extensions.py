@@ -1,0 +1,266 @@
+"""CUDA rasterizers of the 3DGS family behind the one interface `lapgs_plugin.raster.Rasterizer`.
+
+They are forks of one another with the same Python face, so one wrapper serves all. What a build takes is read off the
+fields of its settings and the arguments of its rasterizer, never off a version: several forks share one module name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import RenderResult, Semantics
+
+SEMANTICS = {
+    "diff_gaussian_rasterization": Semantics(
+        note="some builds leave out tiles where alpha stays under 1/255, which no image shows"
+    ),
+    "diff_gaussian_rasterization_fastgs": Semantics(
+        three_sigma_cut=False, note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma"
+    ),
+}
+"""The modules, and where each departs from the oracle by design."""
+
+CONSTANTS: dict[str, Any] = {
+    "scale_modifier": 1.0,
+    "prefiltered": False,
+    "debug": False,
+    "antialiasing": False,  # another image than the paper's, and not what residuals were trained for
+    "mult": 1.0,  # the ellipse alpha = 1/255 whole: less cuts off visible borders of Gaussians
+    "get_flag": False,
+    "pixel_weights": None,
+}
+"""Settings that are the same in every call."""
+VARYING = (
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
+    "metric_map",
+)  # fmt: skip
+"""Settings that each call sets."""
+NEAR, FAR = 0.01, 100.0
+"""Clipping planes of the projection matrix; the kernels use its other rows only."""
+SH_REST_COUNT = 15
+"""Coefficients above the first at degree 3."""
+
+
+def installed_extensions() -> list[str]:
+    """Modules of `SEMANTICS` that can be imported, found without importing them."""
+    return [name for name in SEMANTICS if importlib.util.find_spec(name) is not None]
+
+
+class CudaExtension:
+    """One installed extension; see `lapgs_plugin.signed_color.Extension`.
+
+    Args:
+        name: of its module, one of `SEMANTICS`.
+        device: where it renders; a stand-in for the CPU renders there.
+
+    Raises:
+        MissingExtraError: it is not installed, or was built for another PyTorch.
+        UserInputError: its settings have a field that is not known.
+    """
+
+    def __init__(self, name: str, device: torch.device | str = "cuda") -> None:
+        try:
+            module = importlib.import_module(name)
+        except ImportError as error:
+            raise MissingExtraError(
+                f"{name} cannot be imported ({error}); install it as the README of its backbone says"
+            ) from error
+        self._name = name
+        self._device = torch.device(device)
+        self._settings = _known_settings(module)
+        self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
+        # One that also sums absolute gradients puts them behind the ordinary ones.
+        self._absolute = "metric_map" in self._settings
+        self._module = module
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    @property
+    def semantics(self) -> Semantics:
+        """Where it departs from the oracle."""
+        return SEMANTICS[self._name]
+
+    def render(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
+    ) -> RenderResult:
+        """Render without looking at `field.signed`; see `lapgs_plugin.signed_color.Extension`.
+
+        The extension does not return the transmittance: a second forward pass, of black Gaussians before white, does.
+        It has no gradient.
+
+        Raises:
+            UserInputError: a tensor is not float32, or not on `device`.
+        """
+        self._check(field, background)
+        n = len(field)
+        absgrad2d = field.means.new_zeros(n, 2) if self._absolute else None
+        means2d = field.means.new_zeros(n, 2).requires_grad_(torch.is_grad_enabled())  # (n, 2)
+        image, radii = self._rasterize(field, camera, background, sh_degree, colors, means2d, absgrad2d)
+        with torch.no_grad():
+            black, white = torch.zeros_like(field.means), torch.ones_like(background)
+            unseen = torch.zeros_like(means2d)
+            transmittance = self._rasterize(field, camera, white, 0, black, unseen, None)[0][0]  # (h, w)
+            means2d.copy_(_centres(field, camera) * (radii > 0)[:, None])
+        return RenderResult(image, transmittance, radii, means2d, absgrad2d)
+
+    def _rasterize(
+        self,
+        field: GaussianField,
+        camera: Camera,
+        background: Tensor,
+        sh_degree: int,
+        colors: Tensor | None,
+        means2d: Tensor,
+        absgrad2d: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """(3, h, w) image and (n,) radii."""
+        n, height, width = len(field), camera.height, camera.width
+        inputs = {
+            "means3D": field.means,
+            "means2D": _Screen.apply(means2d, width, height, 4 if self._absolute else 3, absgrad2d),
+            "opacities": torch.sigmoid(field.opacity_logits)[:, None],  # (n, 1)
+            "scales": torch.exp(field.log_scales),
+            "rotations": torch.nn.functional.normalize(
+                field.quaternions, dim=-1
+            ),  # the kernels leave that to the caller
+            **(self._sh_inputs(field.sh) if colors is None else {"colors_precomp": colors}),
+        }
+        if n > 0:
+            rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
+            image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
+            if _blends_something(image):
+                return image, radii
+        # Without Gaussians the kernels leave out the background, and without any in view some launch an empty grid.
+        empty = background[:, None, None].expand(3, height, width)
+        radii = torch.zeros(n, dtype=torch.int32, device=field.means.device)
+        return _Untouched.apply(empty, *inputs.values()), radii
+
+    def _check(self, field: GaussianField, background: Tensor) -> None:
+        for name, tensor in {**field.parameters, "background": background}.items():
+            if tensor.device.type != self._device.type or tensor.dtype != torch.float32:
+                raise UserInputError(
+                    f"{name} is {tensor.dtype} on {tensor.device}, expected float32 on {self._device}; use .to()"
+                )
+
+    def _sh_inputs(self, sh: Tensor) -> dict[str, Tensor]:
+        if not self._takes_dc:
+            return {"shs": sh}
+        rest = sh[:, 1:]
+        if rest.shape[1] == 0:
+            # A tensor without elements has no address, and without one their backward pass skips the first too.
+            rest = sh.new_zeros(len(sh), SH_REST_COUNT, 3)
+        return {"dc": sh[:, :1], "shs": rest}
+
+    def _make_settings(self, camera: Camera, background: Tensor, sh_degree: int) -> Any:
+        tan_x, tan_y = camera.tan_half_fov
+        view, projection = _matrices(camera, background.device)
+        values = {
+            "image_height": camera.height,
+            "image_width": camera.width,
+            "tanfovx": tan_x,
+            "tanfovy": tan_y,
+            "bg": background.contiguous(),
+            "viewmatrix": view,
+            "projmatrix": projection,
+            "sh_degree": sh_degree,
+            "campos": camera.position.to(background).contiguous(),
+            **CONSTANTS,
+        }
+        if "metric_map" in self._settings:
+            values["metric_map"] = torch.zeros(
+                camera.height * camera.width, dtype=torch.int32, device=background.device
+            )
+        return self._module.GaussianRasterizationSettings(**{name: values[name] for name in self._settings})
+
+
+class _Screen(torch.autograd.Function):
+    """(n, 2) centres in pixels -> (n, columns) zeros that the extension takes for its screen-space points.
+
+    Its gradient for them is by normalised device coordinates, of which the image is 2 wide and high.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor, width: int, height: int, columns: int, absgrad2d: Tensor | None) -> Tensor:
+        ctx.pixel, ctx.absgrad2d = means2d.new_tensor([2 / width, 2 / height]), absgrad2d
+        return means2d.new_zeros(len(means2d), columns)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.absgrad2d is not None:
+            ctx.absgrad2d.copy_(gradient[:, 2:4] * ctx.pixel)
+        return gradient[:, :2] * ctx.pixel, None, None, None, None
+
+
+class _Untouched(torch.autograd.Function):
+    """(image, *inputs) -> the image, with gradients of zero for inputs that are not in it."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, *inputs: Tensor) -> Tensor:
+        ctx.save_for_backward(*inputs)
+        return image.clone()
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        return gradient, *(torch.zeros_like(value) for value in ctx.saved_tensors)
+
+
+def _known_settings(module: ModuleType) -> tuple[str, ...]:
+    """Names of the fields of the extension's settings."""
+    names: tuple[str, ...] = module.GaussianRasterizationSettings._fields
+    unknown = [name for name in names if name not in CONSTANTS and name not in VARYING]
+    if unknown:
+        raise UserInputError(
+            f"{module.__name__}: its settings have {', '.join(unknown)}, expected no more than "
+            f"{', '.join([*VARYING, *CONSTANTS])}; install one of the rasterizers that `lapgs patch` knows"
+        )
+    return names
+
+
+def _blends_something(image: Tensor) -> bool:
+    """Whether any Gaussian was in any tile, as the extension noted it for its backward pass; True if it did not."""
+    return all(getattr(image.grad_fn, name, 1) > 0 for name in ("num_rendered", "num_buckets"))
+
+
+def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """World to camera, and world to clip space, both (4, 4) float32 as the kernels read them: column after column."""
+    world_to_camera = camera.world_to_camera.to("cpu", torch.float64)
+    x, y, width, height = camera.fx, camera.fy, camera.width, camera.height
+    clip = torch.tensor(
+        [
+            [2 * x / width, 0, 2 * camera.cx / width - 1, 0],
+            [0, 2 * y / height, 2 * camera.cy / height - 1, 0],
+            [0, 0, FAR / (FAR - NEAR), -FAR * NEAR / (FAR - NEAR)],
+            [0, 0, 1, 0],
+        ],
+        dtype=torch.float64,
+    )
+    return tuple(  # type: ignore[return-value]  # a tuple of two, which mypy cannot count
+        matrix.T.contiguous().to(device, torch.float32) for matrix in (world_to_camera, clip @ world_to_camera)
+    )
+
+
+def _centres(field: GaussianField, camera: Camera) -> Tensor:
+    """(n, 2) projected centres in pixels, of no meaning behind the camera."""
+    pose = camera.world_to_camera.to(field.means)
+    x, y, depth = (field.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)  # (n,) each
+    centres = torch.stack([camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1)
+    return centres.nan_to_num(0, 0, 0)  # a depth of zero times the zero that culls it would stay not a number

@@ -1,0 +1,139 @@
+"""`lapgs conformance`: every rasterizer that can run on this machine against the float64 oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from lapgs_plugin.evaluation.conformance import Outcome, Subject
+
+COLUMNS = {
+    "image": "image",
+    "transmittance": "transm.",
+    "means2d": "screen",
+    "means": "means",
+    "quaternions": "quats",
+    "log_scales": "scales",
+    "opacity_logits": "opacity",
+    "sh": "SH",
+}
+"""Errors shown in the table, and their titles."""
+
+
+def conformance(
+    rasterizer: Annotated[
+        list[str] | None,
+        typer.Option("--rasterizer", help="Check this one only; may be given several times. Default: all there are."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print every figure as JSON, for scripts.")] = False,
+) -> None:
+    """Prove the rasterizers of this machine right: images, radii and all gradients, clamped and signed colour.
+
+    Each renders the same forty-odd small scenes, most of them built to hurt, and is compared with a float64 reference
+    in plain PyTorch. The table shows the worst error of each scene over both colour maps: of pixels absolute, of
+    gradients relative to the largest. "band" counts pixels that hang on a comparison which rounding can turn; they are
+    checked for plausibility only.
+
+    A CUDA extension is checked on its own signed colour where it has it, and with colours precomputed in PyTorch.
+    The exit code is 1 if anything fails.
+    """
+    import json
+
+    from lapgs_plugin.evaluation.conformance import check, conformance_cases
+
+    subjects = _chosen(rasterizer or [])
+    cases = conformance_cases()
+    found = {subject.name: list(check(subject, cases)) for subject in subjects}
+    failed = any(outcome.problems for outcomes in found.values() for outcome in outcomes)
+    if as_json:
+        print(json.dumps({name: [item.as_dict() for item in outcomes] for name, outcomes in found.items()}, indent=1))
+    else:
+        for subject in subjects:
+            _print(subject, found[subject.name])
+    if failed:
+        raise typer.Exit(1)
+
+
+def reachable() -> dict[str, Callable[[], list[Subject]]]:
+    """What can run on this machine, by the name to ask for it; each entry makes what is checked under that name."""
+    import torch
+
+    from lapgs_plugin.adapters.extensions import installed_extensions
+    from lapgs_plugin.evaluation.conformance import Subject
+    from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
+
+    found: dict[str, Callable[[], list[Subject]]] = {
+        "cpu": lambda: [
+            Subject("cpu", CpuRasterizer()),
+            Subject("cpu, float64", CpuRasterizer(), torch.float64),
+        ],
+        "oracle": lambda: [Subject("oracle, float32", OracleRasterizer())],
+    }
+    if torch.cuda.is_available():
+        for name in installed_extensions():
+            found[name] = lambda name=name: _extension_subjects(name)  # type: ignore[misc]  # mypy reads no default here
+    return found
+
+
+def _extension_subjects(name: str) -> list[Subject]:
+    """An extension on the path it takes by itself and, where that is the native one, on the other too."""
+    from lapgs_plugin.adapters.extensions import CudaExtension
+    from lapgs_plugin.evaluation.conformance import Subject
+    from lapgs_plugin.signed_color import ColorPath, SignedColorRasterizer
+
+    extension = CudaExtension(name)
+    paths = dict.fromkeys([SignedColorRasterizer(extension).path, ColorPath.PRECOMPUTED])
+    return [
+        Subject(
+            f"{name}, {path.value} signed colour",
+            SignedColorRasterizer(extension, path=path),
+            device="cuda",
+            semantics=extension.semantics,
+        )
+        for path in paths
+    ]
+
+
+def _chosen(names: Sequence[str]) -> list[Subject]:
+    from lapgs_plugin.errors import UserInputError
+
+    available = reachable()
+    for name in names:
+        if name not in available:
+            raise UserInputError(
+                f"--rasterizer {name}: expected one that this machine can run: {', '.join(available)}; "
+                "`lapgs doctor` says what is missing"
+            )
+    return [subject for name in names or available for subject in available[name]()]
+
+
+def _print(subject: Subject, outcomes: Sequence[Outcome]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    failed = [outcome for outcome in outcomes if outcome.problems]
+    console = Console()
+    table = Table(title=subject.name, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("case")
+    for title in COLUMNS.values():
+        table.add_column(title, justify="right")
+    table.add_column("band", justify="right")
+    table.add_column("")
+    for case in dict.fromkeys(outcome.case for outcome in outcomes):
+        both = [outcome for outcome in outcomes if outcome.case == case]
+        errors = [max(outcome.errors.get(name, 0.0) for outcome in both) for name in COLUMNS]
+        verdict = "[bold red]FAIL[/bold red]" if any(outcome.problems for outcome in both) else "[green]ok[/green]"
+        band = max(outcome.band_pixels for outcome in both)
+        table.add_row(case, *(f"{error:.0e}" if error else "0" for error in errors), str(band), verdict)
+    console.print(table)
+    for outcome in failed:
+        kind = "signed" if outcome.signed else "clamped"
+        for problem in outcome.problems:
+            console.print(f"  [red]{outcome.case}, {kind}:[/red] {escape(problem)}", highlight=False, soft_wrap=True)
+    if subject.semantics.note:
+        console.print(f"  by design: {subject.semantics.note}", highlight=False, soft_wrap=True)
+    console.print(f"  {len(outcomes) - len(failed)} of {len(outcomes)} passed\n", highlight=False)

@@ -1,0 +1,327 @@
+"""Conformance: any rasterizer against the float64 oracle, case by case.
+
+Image, transmittance, radii, screen-space gradients and the gradients of all parameters have to agree wherever the image
+does not hang on a comparison that rounding can turn. Pixels and Gaussians where it does (`reference_raster.thresholds`)
+form a band: they are counted, and still have to stay within what the decisions can make of them. The gradients are
+those of a loss that leaves the band's pixels out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, pixel_weights, random_case
+from lapgs_plugin.raster import Rasterizer, RenderResult, Semantics
+from lapgs_plugin.reference_raster.oracle import OracleRasterizer
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """How closely a rasterizer has to follow the oracle in everything but the band.
+
+    Attributes:
+        image: largest error of a pixel, of the image or the transmittance, relative to the largest colour or 1.
+        element: largest error of a gradient, relative to its largest element.
+        row: largest error of one Gaussian's gradient relative to its norm, which counts as at least `row_floor` of the
+            largest norm.
+        row_floor: see there.
+        relative_l2: largest distance of the whole gradient relative to its norm.
+        mean2d: largest error of a projected centre in pixels, relative to the larger image side or the coordinate.
+        roundings: width of the band in epsilon of the float type.
+    """
+
+    image: float
+    element: float
+    row: float
+    row_floor: float
+    relative_l2: float
+    mean2d: float
+    roundings: float
+
+
+BOUNDS = {
+    # Worst seen, oracle and CPU rasterizer in float32: image 2e-5, element 4e-5, row 6e-4, L2 2e-5, all by needles.
+    torch.float32: Bounds(
+        image=1e-4, element=3e-4, row=1e-2, row_floor=1e-3, relative_l2=3e-4, mean2d=1e-5, roundings=16
+    ),
+    # Worst seen, CPU rasterizer: image 2e-14, element 7e-14.
+    torch.float64: Bounds(
+        image=1e-12, element=1e-11, row=1e-9, row_floor=1e-3, relative_l2=1e-11, mean2d=1e-13, roundings=16
+    ),
+}
+"""By the rasterizer's float type."""
+
+MAX_BAND = 0.4
+"""Largest share of pixels that may be in the band: only `near_plane` reaches a third."""
+KINK_FACTOR = 2.0
+"""A Gaussian at a kink may have either side's gradient: none longer than this many times the longest of the case."""
+GRADIENTS = ("means2d", "means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A rasterizer to check.
+
+    Attributes:
+        name: how the report calls it.
+        rasterizer: it.
+        dtype: float type of the fields it gets.
+        device: where they are.
+        semantics: where it departs from the oracle by design.
+    """
+
+    name: str
+    rasterizer: Rasterizer
+    dtype: torch.dtype = torch.float32
+    device: str = "cpu"
+    semantics: Semantics = field(default_factory=Semantics)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One rasterizer on one case.
+
+    Attributes:
+        rasterizer, case: their names.
+        signed: the colour map.
+        errors: worst error by quantity, in the measure of `Bounds.image` or `Bounds.element`, outside the band.
+        band_pixels, band_share: pixels in the band, and what share of all they are.
+        band_error: largest error of the image in the band.
+        band_gaussians: Gaussians whose radius or gradient is in the band.
+        problems: what is wrong, one line each; empty when the case passed.
+    """
+
+    rasterizer: str
+    case: str
+    signed: bool
+    errors: dict[str, float] = field(default_factory=dict)
+    band_pixels: int = 0
+    band_share: float = 0.0
+    band_error: float = 0.0
+    band_gaussians: int = 0
+    problems: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """A rendering and the gradients of its loss, in float64 on the CPU."""
+
+    image: Tensor
+    transmittance: Tensor
+    radii: Tensor
+    means2d: Tensor
+    gradients: dict[str, Tensor | None]
+
+
+def conformance_cases() -> list[Case]:
+    """Every case: the adversarial ones, and ordinary scenes of each SH degree before each background."""
+    ordinary = [
+        replace(
+            random_case(60, 45, 37, seed=100 + degree, sh_degree=degree, background=background),
+            name=f"degree_{degree}_{shade}",
+        )
+        for degree in range(4)
+        for shade, background in (("black", BLACK), ("white", WHITE), ("coloured", COLORED))
+    ]
+    return [*(build() for build in ADVERSARIAL.values()), *ordinary]
+
+
+def check(subject: Subject, cases: Sequence[Case]) -> Iterator[Outcome]:
+    """Each case with clamped and with signed colour, in turn; never raises what the rasterizer raises."""
+    for case in cases:
+        for signed in (False, True):
+            yield check_case(subject, replace(case, field=replace(case.field, signed=signed)))
+
+
+def check_case(subject: Subject, case: Case) -> Outcome:
+    """One case as it is; see `check`."""
+    bounds = BOUNDS[subject.dtype]
+    case = case.to(subject.dtype)
+    exact = case.to(torch.float64)
+    cut = subject.semantics.three_sigma_cut
+    mask = threshold_mask(
+        exact.field,
+        exact.camera,
+        sh_degree=case.sh_degree,
+        tolerance=bounds.roundings * torch.finfo(subject.dtype).eps,
+        three_sigma_cut=cut,
+    )
+    weights = pixel_weights(exact) * ~mask.pixels  # (3, h, w)
+    expected = _render(OracleRasterizer(three_sigma_cut=cut), exact, weights, "cpu")
+    outcome = Outcome(
+        subject.name,
+        case.name,
+        case.field.signed,
+        band_pixels=int(mask.pixels.sum()),
+        band_share=float(mask.pixels.double().mean()),
+        band_gaussians=int((mask.radii | mask.kinks).sum()),
+    )
+    try:
+        actual = _render(subject.rasterizer, case, weights, subject.device)
+    except Exception as error:  # whatever a rasterizer raises is a finding about it, and the next case goes on
+        line = (str(error).splitlines() or [""])[0]
+        return replace(outcome, problems=(f"raised {type(error).__name__}: {line}",))
+    problems = list(_shape_problems(actual, expected))
+    if problems:
+        return replace(outcome, problems=tuple(problems))
+    return _compared(outcome, actual, expected, mask, exact, subject)
+
+
+def _render(rasterizer: Rasterizer, case: Case, weights: Tensor, device: str) -> _Rendered:
+    """The case rendered, with the gradients of sum(weights * image)."""
+    case = replace(case, field=case.field.to(device), camera=case.camera.to(device)).with_leaves()
+    result: RenderResult = case.render(rasterizer)
+    if result.image.requires_grad:
+        (result.image * weights.to(result.image)).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+    gradients = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
+    if result.absgrad2d is not None:
+        gradients["absgrad2d"] = result.absgrad2d
+    return _Rendered(
+        image=_exact(result.image),
+        transmittance=_exact(result.transmittance),
+        radii=result.radii.detach().cpu().long(),
+        means2d=_exact(result.means2d),
+        gradients={name: None if value is None else _exact(value) for name, value in gradients.items()},
+    )
+
+
+def _exact(value: Tensor) -> Tensor:
+    return value.detach().to("cpu", torch.float64)
+
+
+def _shape_problems(actual: _Rendered, expected: _Rendered) -> Iterator[str]:
+    """What is missing, of another shape or not finite."""
+    for name in ("image", "transmittance", "radii", "means2d"):
+        yield from _value_problems(name, getattr(actual, name), getattr(expected, name))
+    for name in GRADIENTS:
+        yield from _value_problems(f"gradient of {name}", actual.gradients.get(name), expected.gradients[name])
+
+
+def _value_problems(name: str, actual: Tensor | None, expected: Tensor | None) -> Iterator[str]:
+    assert expected is not None, f"the oracle gives no {name}"
+    if actual is None:
+        yield f"{name} is missing"
+    elif actual.shape != expected.shape:
+        yield f"{name} has shape {tuple(actual.shape)}, expected {tuple(expected.shape)}"
+    elif not bool(torch.isfinite(actual).all()):
+        yield f"{name} has {int((~torch.isfinite(actual)).sum())} values that are not finite"
+
+
+def _compared(
+    outcome: Outcome, actual: _Rendered, expected: _Rendered, mask: ThresholdMask, case: Case, subject: Subject
+) -> Outcome:
+    bounds, problems = BOUNDS[subject.dtype], []
+    errors: dict[str, float] = {}
+    if outcome.band_share > MAX_BAND:
+        problems.append(f"the band has {outcome.band_share:.0%} of the pixels, expected at most {MAX_BAND:.0%}")
+    scale = max(1.0, _largest(expected.image))
+    for name in ("image", "transmittance"):
+        difference = (getattr(actual, name) - getattr(expected, name)).abs() / scale  # (..., h, w)
+        errors[name] = _largest(difference.masked_fill(mask.pixels, 0))
+        if errors[name] > bounds.image:
+            problems.append(f"{name} is off by {errors[name]:.1e}, expected at most {bounds.image:.0e}")
+    band_error = _largest((actual.image - expected.image)[:, mask.pixels])
+    problems += _band_problems(actual, mask, case, bounds.image)
+
+    blended = _blended(expected)
+    culled_freely = ~blended if not subject.semantics.three_sigma_cut else torch.zeros_like(blended)  # (n,)
+    errors["radii"], radius_problems = _compare_radii(actual.radii, expected.radii, mask.radii, culled_freely)
+    problems += radius_problems
+    shown = (actual.radii > 0) & (expected.radii > 0)  # (n,)
+    coordinates = expected.means2d[shown].abs().clamp(min=max(case.camera.width, case.camera.height))
+    errors["centres"] = _largest((actual.means2d - expected.means2d)[shown] / coordinates)
+    if errors["centres"] > bounds.mean2d:
+        problems.append(f"means2d is off by {errors['centres']:.1e}, expected at most {bounds.mean2d:.0e}")
+    for name, wanted in expected.gradients.items():
+        got = actual.gradients.get(name)
+        if got is not None and wanted is not None:  # absgrad2d, which not all offer
+            errors[name], found = _compare_gradients(name, got, wanted, mask.kinks, bounds)
+            problems += found
+    return replace(outcome, errors=errors, band_error=band_error, problems=tuple(problems))
+
+
+def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance: float) -> Iterator[str]:
+    """Whatever was decided, a pixel is a mean of colours and background, weighted by what adds up to one."""
+    transmittance = actual.transmittance[mask.pixels]  # (p,)
+    if bool(((transmittance < -tolerance) | (transmittance > 1 + tolerance)).any()):
+        yield "transmittance in the band is not in [0, 1]"
+    degree = case.field.sh_degree if case.sh_degree is None else case.sh_degree
+    directions = torch.nn.functional.normalize(case.field.means - case.camera.position, dim=-1)  # (n, 3)
+    colors = sh_to_color(case.field.sh, directions, degree, signed=case.field.signed)  # (n, 3)
+    palette = torch.cat([colors, case.background_tensor[None]])  # (n + 1, 3)
+    low, high = (palette.amin(0) - tolerance)[:, None], (palette.amax(0) + tolerance)[:, None]  # (3, 1) each
+    pixels = actual.image[:, mask.pixels]  # (3, p)
+    outside = int(((pixels < low) | (pixels > high)).sum())
+    if outside:
+        yield f"{outside} values in the band are beyond all colours of the scene"
+
+
+def _blended(expected: _Rendered) -> Tensor:
+    """(n,) True for Gaussians that are in some pixel outside the band, as their colour's gradient tells."""
+    gradient = expected.gradients["opacity_logits"]
+    assert gradient is not None
+    return gradient != 0
+
+
+def _compare_radii(
+    actual: Tensor, expected: Tensor, is_open: Tensor, culled_freely: Tensor
+) -> tuple[float, Iterator[str] | list[str]]:
+    """Largest difference of the radii that are not open, and what is wrong with those that are.
+
+    Args:
+        actual, expected: (n,) whole pixels, 0 where culled.
+        is_open: (n,) where rounding decides: a pixel more or less, or culled.
+        culled_freely: (n,) where 0 is as good.
+    """
+    difference = (actual - expected).abs()  # (n,)
+    either_culled = (actual == 0) | (expected == 0)  # (n,)
+    # Float32 cannot tell neighbouring integers above 2^24: the error is then relative.
+    allowed = (difference <= 1) | (difference <= expected * 1e-5) | either_culled
+    fine = (difference == 0) | (culled_freely & (actual == 0)) | (is_open & allowed)  # (n,)
+    wrong = (~fine).nonzero()[:, 0].tolist()
+    if not wrong:
+        return 0.0, []
+    first = wrong[0]
+    return _largest(difference[~fine].double()), [
+        f"{len(wrong)} radii are wrong: Gaussian {first} has {int(actual[first])}, expected {int(expected[first])}"
+    ]
+
+
+def _compare_gradients(
+    name: str, actual: Tensor, expected: Tensor, kinks: Tensor, bounds: Bounds
+) -> tuple[float, list[str]]:
+    """Worst element's error relative to the largest element, and what is wrong."""
+    problems = []
+    rows, wanted = ((v[:, None] if v.ndim == 1 else v.flatten(1)) for v in (actual, expected))  # (n, m) each
+    longest = _largest(wanted.norm(dim=1))
+    if _largest(rows[kinks].norm(dim=1)) > KINK_FACTOR * longest:
+        problems.append(f"gradient of {name}: longer at a kink than {KINK_FACTOR:g} times the longest elsewhere")
+    rows, wanted = rows[~kinks], wanted[~kinks]
+    difference = rows - wanted
+    norms = wanted.norm(dim=1).clamp(min=max(bounds.row_floor * longest, 1e-30))  # (n,)
+    measured = {
+        "its largest element": (_largest(difference) / max(_largest(wanted), 1e-30), bounds.element),
+        "the Gaussian's own norm": (_largest(difference.norm(dim=1) / norms), bounds.row),
+        "its norm": (float(difference.norm()) / max(float(wanted.norm()), 1e-30), bounds.relative_l2),
+    }
+    for measure, (error, bound) in measured.items():
+        if error > bound:
+            problems.append(f"gradient of {name} is off by {error:.1e} of {measure}, expected at most {bound:.0e}")
+    extra = int(((wanted == 0).all(1) & (rows != 0).any(1)).sum())
+    if extra:
+        problems.append(f"gradient of {name}: {extra} Gaussians have one that are in no pixel")
+    return measured["its largest element"][0], problems
+
+
+def _largest(values: Tensor) -> float:
+    return float(values.abs().max()) if values.numel() else 0.0
