@@ -151,7 +151,7 @@ def has_signed_color(extension: Extension) -> bool:
             sh_degree=signed_degree(degree),
         )
         (gradient,) = torch.autograd.grad(result.image.sum(), sh)
-    weight = 1 - result.transmittance  # (h, w) of the only Gaussian
+    weight = 1 - result.transmittance.detach()  # (h, w) of the only Gaussian
     image_error = (result.image - weight * expected[:, None, None]).abs().max()
     # The image is weight * C0 * sh_0 in each channel; where a clamp is remembered, the gradient is zero instead.
     slope = float(weight.sum()) / math.sqrt(4 * math.pi)

@@ -1,0 +1,258 @@
+"""Signed colour is found by trying, replaced where it is missing, and wrapped extensions render as the oracle does."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin import signed_color
+from lapgs_plugin.adapters.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.evaluation.cases import Case, gradients, pixel_weights, random_case
+from lapgs_plugin.evaluation.conformance import Subject, check, conformance_cases
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
+from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.reference_raster.standins import VARIANTS, install
+from lapgs_plugin.signed_color import (
+    SIGNED_COLOR_BIT,
+    ColorPath,
+    SignedColorRasterizer,
+    explain_fallback,
+    has_signed_color,
+    precomputed_colors,
+    signed_degree,
+)
+
+ORACLE = OracleRasterizer()
+CONSTANT = 0.28209479177387814  # the first basis function
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_torch_thread() -> Iterator[None]:
+    """The tensors are small: a second OpenMP thread only spins."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+class Unpatched:
+    """An extension as its authors ship it: a negative degree is one below 1, and colours are clamped."""
+
+    name = "some_extension"
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, bool]] = []
+
+    def render(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
+    ) -> RenderResult:
+        self.calls.append((sh_degree, colors is not None))
+        if colors is not None:
+            field = replace(field.with_parameters({"sh": colors[:, None] / CONSTANT}), signed=True)
+            return ORACLE(field, camera, background=background, sh_degree=0)
+        return self.with_sh(field, camera, background, sh_degree)
+
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        return ORACLE(replace(field, signed=False), camera, background=background, sh_degree=max(sh_degree, 0))
+
+
+class Patched(Unpatched):
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        signed = bool(sh_degree & SIGNED_COLOR_BIT)
+        degree = sh_degree & ~SIGNED_COLOR_BIT
+        return ORACLE(replace(field, signed=signed), camera, background=background, sh_degree=degree)
+
+
+class PatchedForward(Patched):
+    """Renders signed colour, and still leaves out of the gradient what a clamp would have caught."""
+
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        right = super().with_sh(field, camera, background, sh_degree)
+        clamped = super().with_sh(field, camera, background, sh_degree & ~SIGNED_COLOR_BIT)
+        return replace(right, image=right.image.detach() + clamped.image - clamped.image.detach())
+
+
+class AlwaysSigned(Unpatched):
+    """Signed colour of another kind: the degree is taken for 0."""
+
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        return ORACLE(replace(field, signed=True), camera, background=background, sh_degree=0)
+
+
+def test_the_flag_is_the_sign_bit_and_leaves_the_degree() -> None:
+    for degree in range(4):
+        assert signed_degree(degree) < 0
+        assert signed_degree(degree) & ~SIGNED_COLOR_BIT == degree
+
+
+@pytest.mark.parametrize(
+    ("extension", "native"), [(Unpatched, False), (Patched, True), (PatchedForward, False), (AlwaysSigned, False)]
+)
+def test_the_probe_finds_out_what_an_extension_does(extension: type[Unpatched], native: bool) -> None:
+    assert has_signed_color(extension()) is native
+
+
+def test_the_probe_works_where_gradients_are_off() -> None:
+    with torch.no_grad():
+        assert has_signed_color(Patched())
+
+
+def scene(signed: bool) -> Case:
+    return random_case(30, 20, 18, seed=3, sh_degree=2, signed=signed)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("extension", [Unpatched, Patched])
+@pytest.mark.parametrize("degree", [None, 1])
+def test_both_paths_give_the_oracles_image_and_gradients(
+    extension: type[Unpatched], signed: bool, degree: int | None
+) -> None:
+    case = replace(scene(signed), sh_degree=degree)
+    weights = pixel_weights(case)
+    actual = gradients(SignedColorRasterizer(extension()), case, weights)
+    for name, value in gradients(ORACLE, case, weights).items():
+        torch.testing.assert_close(actual[name], value, rtol=1e-10, atol=1e-12)  # worst seen 3e-14
+
+
+def test_an_ordinary_call_is_handed_on_untouched_and_asks_nothing() -> None:
+    extension = Unpatched()
+    scene(signed=False).render(SignedColorRasterizer(extension))
+    assert extension.calls == [(2, False)]
+
+
+def test_the_paths_of_signed_calls() -> None:
+    native, fallback = Patched(), Unpatched()
+    scene(signed=True).render(SignedColorRasterizer(native))
+    scene(signed=True).render(SignedColorRasterizer(fallback))
+    assert native.calls[-1] == (signed_degree(2), False)
+    assert fallback.calls[-1] == (2, True)
+    forced = Patched()
+    scene(signed=True).render(SignedColorRasterizer(forced, path=ColorPath.PRECOMPUTED))
+    assert forced.calls == [(2, True)]
+
+
+def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    extension = Unpatched()
+    rasterizer = SignedColorRasterizer(extension, checkout=tmp_path)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            scene(signed=True).render(rasterizer)
+    assert len(extension.calls) == 4
+    (record,) = caplog.records
+    assert "some_extension has no signed colour" in record.getMessage()
+    assert "lapgs patch apply" in record.getMessage()
+
+
+# --------------------------------------------------------------------------------------- what a warning says
+
+
+@pytest.fixture
+def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
+    """A rasterizer's sources in a checkout, with a patch of one edit."""
+    folder = tmp_path / "submodules" / "raster"
+    (folder / "some_extension").mkdir(parents=True)
+    (folder / "shade.cu").write_text("float shade() { return 0.5f; }\n")
+    edit = Edit("signed-color", "raw", Anchor("shade.cu", "return 0.5f"), "/* raw */", False)
+    recipe = Recipe("some", "Some", (), (), "pip install {folder}", (edit,), ())
+    found = Target(recipe, folder)
+    monkeypatch.setattr(signed_color, "find_targets", lambda _: (found,))
+    return found
+
+
+def test_unpatched_sources_are_to_be_patched(target: Target, tmp_path: Path) -> None:
+    said = explain_fallback("some_extension", tmp_path)
+    assert f"run `lapgs patch apply {tmp_path}` and then `pip install {target.folder}`" in said
+
+
+def test_patched_sources_beside_an_old_build_are_said_to_be_stale(target: Target, tmp_path: Path) -> None:
+    write_all(plan_apply(target, ["signed-color"]))
+    said = explain_fallback("some_extension", tmp_path)
+    assert f"sources in {target.folder} are patched, but the installed build is older" in said
+    assert f"run `pip install {target.folder}`" in said
+    assert "lapgs patch" not in said
+
+
+def test_sources_of_another_module_say_nothing_about_this_one(target: Target, tmp_path: Path) -> None:
+    assert str(target.folder) not in explain_fallback("another_extension", tmp_path)
+
+
+def test_a_folder_that_is_no_checkout_still_gets_the_command(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "missing"):
+        said = explain_fallback("some_extension", folder)
+        assert "lapgs patch apply CHECKOUT" in said
+        assert "\n" not in said
+
+
+def test_precomputed_colours_of_an_ordinary_field_are_clamped() -> None:
+    case = scene(signed=False)
+    case = replace(case, field=case.field.with_parameters({"sh": case.field.sh - 1}))
+    colors = precomputed_colors(case.field, case.camera, 2)
+    raw = precomputed_colors(replace(case.field, signed=True), case.camera, 2)
+    assert (raw < -0.5).any()
+    torch.testing.assert_close(colors, (raw + 0.5).clamp(min=0))
+
+
+# -------------------------------------------------------------------------------------- wrapped CUDA modules
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> None:
+    """Matrices, units of the screen gradient, DC apart or not, degree 0, no Gaussians, none in view: seen from outside.
+
+    The stand-ins take what the CUDA modules take.
+    """
+    names = ("off_centre", "non_square_pixels", "invisible", "no_gaussians", "lower_degree", "degree_0_white")
+    chosen = [case for case in conformance_cases() if case.name in names]
+    with install(variant):
+        module = VARIANTS[variant][0]
+        assert module in installed_extensions()
+        extension = CudaExtension(module, device="cpu")
+        assert SignedColorRasterizer(extension).path is ColorPath.NATIVE
+        subject = Subject(variant, SignedColorRasterizer(extension), semantics=SEMANTICS[module])
+        found = list(check(subject, chosen))
+    assert len(found) == 2 * len(names)
+    assert [(outcome.case, outcome.problems) for outcome in found if outcome.problems] == []
+
+
+def test_screen_gradients_come_back_in_pixels() -> None:
+    means2d, absolute = torch.zeros(3, 2, requires_grad=True), torch.zeros(3, 2)
+    points = _Screen.apply(means2d, 40, 20, 4, absolute)
+    assert points.shape == (3, 4)
+    points.backward(torch.tensor([[20.0, 10.0, 40.0, 30.0]]).expand(3, 4))
+    assert means2d.grad is not None
+    assert means2d.grad.tolist() == [[1.0, 1.0]] * 3
+    assert absolute.tolist() == [[2.0, 3.0]] * 3
+
+
+def test_settings_that_are_not_known_are_refused_by_name() -> None:
+    with install("graphdeco") as modules:
+        module = modules["diff_gaussian_rasterization"]
+        fields = [*module.GaussianRasterizationSettings._fields, "kernel_size"]
+        module.GaussianRasterizationSettings = type("Settings", (), {"_fields": tuple(fields)})
+        with pytest.raises(UserInputError, match="its settings have kernel_size"):
+            CudaExtension("diff_gaussian_rasterization", device="cpu")
+
+
+def test_a_field_elsewhere_or_in_other_precision_is_refused() -> None:
+    case = scene(signed=False)
+    with install("graphdeco"):
+        extension = CudaExtension("diff_gaussian_rasterization", device="cpu")
+        with pytest.raises(UserInputError, match=r"means is torch\.float64 on cpu, expected float32 on cpu"):
+            case.render(SignedColorRasterizer(extension))
+
+
+@pytest.mark.skipif("diff_gaussian_rasterization" in installed_extensions(), reason="it is installed")
+def test_a_module_that_is_not_installed_is_said_to_be_so() -> None:
+    with pytest.raises(MissingExtraError, match="diff_gaussian_rasterization cannot be imported"):
+        CudaExtension("diff_gaussian_rasterization")
