@@ -76,8 +76,8 @@ def contributions(n: int, view: View, kept: Kept, weights: Floats) -> Contributi
         _accumulate, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
         offsets(np.dtype(np.float32)), kept.hits, kept.reached, kept.final, weights, slots,
     )  # fmt: skip
-    weighted, counts, blending, distances = (np.bincount(kept.members, slots[column::SLOT], n) for column in range(4))
-    return Contributions(weighted, counts.astype(np.int32), blending, distances)
+    sums = [np.bincount(kept.members, slots[column::SLOT], n).astype(np.float64) for column in range(4)]
+    return Contributions(sums[0], sums[1].astype(np.int32), sums[2], sums[3])
 
 
 @jit
@@ -116,10 +116,10 @@ def _accumulate(
         for pair in range(start + at(reached, tile), at(tile_start, tile + 1)):
             store(slots, pair * SLOT, none)
         for pair in range(start, start + at(reached, tile)):
-            s = np.int64(at(members, pair)) * SPLAT
-            position = splat(splats, np.float64(pair - start + 1))
+            s = int(at(members, pair)) * SPLAT
+            position = splat(splats, float(pair - start + 1))
             sum_weight, sum_one, sum_share, sum_distance = none, none, none, none
-            blocks = np.int64(at(hits, pair))
+            blocks = int(at(hits, pair))
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1

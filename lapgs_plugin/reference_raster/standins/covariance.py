@@ -1,5 +1,5 @@
-"""Covariances in PyTorch, for two options of the CUDA rasterizers that the CPU kernels do not have: covariances given by
-the caller, and antialiasing. Their gradients are those of the CUDA code; DEPARTURE marks where these are not textbook.
+"""Covariances in PyTorch, for two options of the CUDA rasterizers that the CPU kernels do not have: covariances given
+by the caller, and antialiasing. Their gradients are those of the CUDA code: DEPARTURE marks what is not textbook.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: K
     uu, uv, vv = (torch.from_numpy(np.bincount(kept.members, slots[i::SLOT], n)) for i in (SUM_UU, SUM_UV, SUM_VV))
     seen = torch.from_numpy(np.diff(kept.first_pair) > 0)
     splats = torch.from_numpy(kept.splats.reshape(-1, SPLAT)[:n]).double()
-    # With the inverse covariance L^T L the derivative is L^T ((uu, uv), (uv, vv)) L / 2; off the diagonal, both entries'.
+    # With the inverse covariance L^T L the derivative is L^T ((uu, uv), (uv, vv)) L / 2; off the diagonal, twice.
     l_xx, l_xy, l_yy = (splats[:, i] / FACTOR_SCALE for i in (FACTOR_XX, FACTOR_XY, FACTOR_YY))
     mixed = l_xy * uu + l_yy * uv
     entries = torch.stack([l_xx * l_xx * uu / 2, l_xx * mixed, (l_xy * mixed + l_yy * (l_xy * uv + l_yy * vv)) / 2], 1)

@@ -49,9 +49,9 @@ class GaussianRasterizer(RasterizerBase):
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the image (3, h, w), the radii (n,) int32 and, if `get_flag`, in how many marked pixels each Gaussian is
-        blended (n,) int32, or an empty tensor. `means2D` is (n, 4): its gradient's last two columns are sums over pixels of
-        the first two's absolute values.
+        """Returns the image (3, h, w), the radii (n,) int32 and, if `get_flag`, in how many marked pixels each Gaussian
+        is blended (n,) int32, or an empty tensor. `means2D` is (n, 4): its gradient's last two columns are sums over
+        pixels of the first two's absolute values.
         """
         settings: GaussianRasterizationSettings = self.raster_settings
         inputs = gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)

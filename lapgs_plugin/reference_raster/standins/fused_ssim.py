@@ -1,6 +1,7 @@
 """`fused_ssim`, and the two functions of the same kind in `diff_gaussian_rasterization._C`: SSIM with an 11x11 window.
 
-Outside of the images are zeros. Only the first image gets a gradient. Windows of sigma 1.5, constants 0.01^2 and 0.03^2.
+Outside of the images are zeros. Only the first image gets a gradient. The window has sigma 1.5, the constants are
+0.01^2 and 0.03^2.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """Mean SSIM of two batches of images (b, c, h, w), a scalar; `padding="valid"` leaves out five pixels at each border."""
+    """Mean SSIM of two batches of images (b, c, h, w), a scalar; "valid" leaves out five pixels at each border."""
     first, second = _prepared(img1, img2, padding, train)
     if padding == "valid":
         return _cropped(ssim_map(first, second), padding).mean()
@@ -52,7 +53,8 @@ def ssim_map(first: Tensor, second: Tensor, c1: float = C1, c2: float = C2) -> T
     mu1, mu2, square1, square2, product = moments
     sigma1, sigma2, sigma12 = square1 - mu1 * mu1, square2 - mu2 * mu2, product - mu1 * mu2
     above = (2 * mu1 * mu2 + c1) * (2 * sigma12 + c2)
-    return above / ((mu1 * mu1 + mu2 * mu2 + c1) * (sigma1 + sigma2 + c2))
+    found: Tensor = above / ((mu1 * mu1 + mu2 * mu2 + c1) * (sigma1 + sigma2 + c2))
+    return found
 
 
 def _blurred(images: Tensor) -> Tensor:

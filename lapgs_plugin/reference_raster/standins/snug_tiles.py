@@ -105,7 +105,8 @@ def _span(splats: Floats, s: int, reach: float, half: float, row: int, tiles_x: 
 @inline
 def _radius(splats: Floats, s: int) -> int:
     """The three-sigma radius in pixels, from the inverse covariance."""
-    xx, xy, yy = (float(splats[s + i]) / FACTOR_SCALE for i in (FACTOR_XX, FACTOR_XY, FACTOR_YY))
+    xx, xy = float(splats[s + FACTOR_XX]) / FACTOR_SCALE, float(splats[s + FACTOR_XY]) / FACTOR_SCALE
+    yy = float(splats[s + FACTOR_YY]) / FACTOR_SCALE
     scale = 1.0 / (xx * yy) ** 2
     middle = 0.5 * (xy * xy + yy * yy + xx * xx) * scale
     root = math.sqrt(max(middle * middle - scale, MIN_ROOT))
