@@ -24,8 +24,8 @@ SetName = Annotated[
     str,
     typer.Option(
         "--set",
-        help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to 13) "
-        "or all of them.",
+        help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to "
+        "13), or all of them. Not among all, as it changes ordinary training: gradient-fixes, where there are any.",
     ),
 ]
 AllowDirty = Annotated[
@@ -38,12 +38,12 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     """Say which edits are in, which can be put in, and what stands in the way."""
     from lapgs_plugin.patching import plan_apply, read_only, status, uncommitted
 
-    for target, sets in _targets(checkout, set_name):
+    for target, sets in _targets(checkout, set_name, opt_in=True):
         typer.echo(f"{target.folder}: {target.recipe.title}")
         for found in status(target):
             if found.set not in sets:
                 continue
-            typer.echo(f"  {found.set:13} {found.state.value}")
+            typer.echo(f"  {found.set:14} {found.state.value}")
             for problem in found.problems:
                 typer.echo(f"    {problem}")
             if not found.problems:
@@ -91,7 +91,9 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     from lapgs_plugin.patching import plan_revert, write_all
 
     planned = [
-        (target, change) for target, sets in _targets(checkout, set_name) for change in plan_revert(target, sets)
+        (target, change)
+        for target, sets in _targets(checkout, set_name, opt_in=True)
+        for change in plan_revert(target, sets)
     ]
     if not planned:
         typer.echo(f"{checkout}: nothing to take out, none of these edits is in: {set_name}")
@@ -102,8 +104,14 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     _report("reverted", planned)
 
 
-def _targets(checkout: Path, set_name: str) -> list[tuple[Target, tuple[str, ...]]]:
-    """The extensions in the checkout that take the wanted edits, each with the sets that are meant."""
+def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Target, tuple[str, ...]]]:
+    """The extensions in the checkout that take the wanted edits, each with the sets that are meant.
+
+    Args:
+        checkout: see the commands.
+        set_name: see the commands.
+        opt_in: whether all sets are also those that have to be asked for.
+    """
     from lapgs_plugin.errors import PatchError
     from lapgs_plugin.patching import ALL_SETS, find_targets
 
@@ -111,16 +119,23 @@ def _targets(checkout: Path, set_name: str) -> list[tuple[Target, tuple[str, ...
     known = sorted({name for target in targets for name in target.recipe.sets})
     if set_name not in (ALL_SETS, *known):
         raise PatchError(f"--set {set_name}: expected one of {', '.join([*known, ALL_SETS])} for {checkout}")
-    chosen = [
-        (target, tuple(name for name in target.recipe.sets if set_name in (name, ALL_SETS))) for target in targets
-    ]
-    return [(target, sets) for target, sets in chosen if sets]
+    chosen = []
+    for target in targets:
+        everything = target.recipe.sets if opt_in else target.recipe.default_sets
+        sets = everything if set_name == ALL_SETS else tuple(name for name in target.recipe.sets if name == set_name)
+        if sets:
+            chosen.append((target, sets))
+    return chosen
 
 
 def _planned(checkout: Path, set_name: str) -> list[tuple[Target, FileChange]]:
     from lapgs_plugin.patching import plan_apply
 
-    return [(target, change) for target, sets in _targets(checkout, set_name) for change in plan_apply(target, sets)]
+    return [
+        (target, change)
+        for target, sets in _targets(checkout, set_name, opt_in=False)
+        for change in plan_apply(target, sets)
+    ]
 
 
 def _files(target: Target) -> list[Path]:

@@ -17,7 +17,7 @@ from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recip
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize
 
 ALL_SETS = "all"
-"""Stands for every set that an extension takes."""
+"""Stands for every set: of those to take out for all, of those to put in for all that are not opt-in."""
 
 _SKIPPED_FOLDERS = frozenset({"build", "dist", "third_party", "node_modules"})
 
@@ -99,7 +99,7 @@ def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]
         PatchError: somebody changed a block since it was put in.
     """
     sources = _read(target)
-    sets = _expand(target.recipe, sets)
+    sets = frozenset(target.recipe.sets if ALL_SETS in sets else sets)
     _refuse(target, [problem for file, source in sources.items() for problem in _damage(file, source, sets)])
     after = {file: without_blocks(source, sets) for file, source in sources.items()}
     return _changes(target, sources, after)
@@ -136,10 +136,6 @@ def _subfolders(checkout: Path) -> Iterable[Path]:
                 yield path
 
 
-def _expand(recipe: Recipe, sets: Collection[str]) -> frozenset[str]:
-    return frozenset(recipe.sets) if ALL_SETS in sets else frozenset(sets)
-
-
 def _read(target: Target) -> dict[str, str]:
     """The sources that the recipe looks at, by file; files that do not exist are left out."""
     paths = {file: target.folder / file for file in target.recipe.files}
@@ -156,7 +152,7 @@ def _blocks(data: bytes, set_name: str) -> list[bytes]:
 
 def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange, ...], list[str]]:
     recipe, sources = target.recipe, _read(target)
-    wanted = _expand(recipe, sets) | _present_sets(sources.values())
+    wanted = frozenset(recipe.default_sets if ALL_SETS in sets else sets) | _present_sets(sources.values())
     problems = [
         f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})
     ]

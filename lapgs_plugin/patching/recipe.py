@@ -17,7 +17,7 @@ else:
     import tomli as tomllib
 
 _REQUIRED = {"name", "title", "present"}
-_OPTIONAL = {"extends", "absent", "reinstall", "edit", "check"}
+_OPTIONAL = {"extends", "absent", "reinstall", "opt_in", "edit", "check"}
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,7 @@ class Recipe:
         present, absent: what its folder must and must not contain to be recognised.
         reinstall: the command that builds and installs it again; `{folder}` stands for its folder.
         edits, checks: in the order of the file, inherited ones first.
+        opt_in: sets that change what ordinary calls compute; "all" leaves them out when it puts edits in.
     """
 
     name: str
@@ -92,11 +93,17 @@ class Recipe:
     reinstall: str
     edits: tuple[Edit, ...]
     checks: tuple[Check, ...]
+    opt_in: tuple[str, ...] = ()
 
     @property
     def sets(self) -> tuple[str, ...]:
         """The sets of edits that this extension takes."""
         return tuple(dict.fromkeys(edit.set for edit in self.edits))
+
+    @property
+    def default_sets(self) -> tuple[str, ...]:
+        """Those that are put in when none is named."""
+        return tuple(name for name in self.sets if name not in self.opt_in)
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -169,6 +176,7 @@ def _recipe(name: str, tables: dict[str, dict[str, Any]]) -> Recipe:
             reinstall=table.get("reinstall", base.reinstall),
             edits=_inherited(base.edits, [_edit(item) for item in table.get("edit", ())]),
             checks=base.checks + tuple(check for item in table.get("check", ()) for check in _checks(item)),
+            opt_in=base.opt_in + tuple(table.get("opt_in", ())),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise PatchError(f"patches/{name}.toml: {error}; patches/README.md says what an entry holds") from error

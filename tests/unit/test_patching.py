@@ -14,7 +14,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -390,6 +390,21 @@ def test_states(target: Target) -> None:
     assert states() == {"signed": State.NOT_APPLIED, "build": State.INCOMPLETE}
     apply(target, "signed")
     assert states() == {"signed": State.APPLIED, "build": State.APPLIED}
+
+
+def test_a_set_that_is_opt_in_goes_in_by_name_only_and_out_with_all(target: Target, tree: dict[str, bytes]) -> None:
+    chosen = replace(target, recipe=replace(target.recipe, opt_in=("build",)))
+    apply(chosen, ALL_SETS)
+    assert {found.set: found.state for found in status(chosen)} == {
+        "signed": State.APPLIED,
+        "build": State.NOT_APPLIED,
+    }
+    apply(chosen, "build")
+    assert {found.state for found in status(chosen)} == {State.APPLIED}
+    after = read_tree(target.folder)
+    apply(chosen, ALL_SETS)
+    assert read_tree(target.folder) == after
+    assert revert(chosen, ALL_SETS) == tree
 
 
 def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, bytes]) -> None:
@@ -800,8 +815,8 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             before = read_tree(copy)
             (target,) = find_targets(copy)
             assert target.recipe.name == upstream.recipe.name
-            after = apply(target, ALL_SETS)
+            after = apply(target, *target.recipe.sets)
             assert {found.state for found in status(target)} == {State.APPLIED}
             assert sum(data.count(b">>> lapgs") for data in after.values()) == len(target.recipe.edits)
-            assert apply(target, ALL_SETS) == after
+            assert apply(target, *target.recipe.sets) == after
             assert revert(target, ALL_SETS) == before
