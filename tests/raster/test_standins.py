@@ -19,7 +19,7 @@ from lapgs_plugin.reference_raster.oracle import OracleRasterizer, project
 from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.standins import VARIANTS, install, stand_ins
 from lapgs_plugin.signed_color import signed_degree
-from tests.raster.scenes import COLORED, Case, make_camera, random_case
+from tests.raster.scenes import COLORED, Case, make_camera, random_case, to_world
 
 SPLIT = {"graphdeco-accel", "taming", "taming-rasterizer", "fastgs"}
 
@@ -72,9 +72,11 @@ def module_of(variant: str) -> ModuleType:
 
 
 def case_of(*, signed: bool = False, sh_degree: int = 3, n: int = 60, **more: Any) -> Case:
-    case = random_case(n, 53, 41, seed=5, sh_degree=sh_degree, signed=signed, background=COLORED, **more)
-    camera = make_camera(53, 41, pose_seed=None, principal_offset=(3.0, -2.0))
-    return replace(case, camera=camera).to(torch.float32)
+    camera = make_camera(53, 41, pose_seed=7, principal_offset=(3.0, -2.0))
+    case = random_case(
+        n, 53, 41, seed=5, sh_degree=sh_degree, signed=signed, background=COLORED, camera=camera, **more
+    )  # fmt: skip
+    return case.to(torch.float32)
 
 
 def relative(a: Tensor, b: Tensor) -> float:
@@ -94,16 +96,16 @@ def test_image_radii_and_gradients_are_the_oracles(variant: str, signed: bool) -
     mine = case.with_leaves()
     image, radii, *_, points = call(module_of(variant), variant, mine, activated(mine))
     (image * weights).sum().backward()
-    assert (image - expected.image).abs().max() < 2e-5  # worst seen:
+    assert (image - expected.image).abs().max() < 2e-5  # worst seen: 1.7e-6
     if variant != "fastgs":
         assert torch.equal(radii, expected.radii)
     for name, value in mine.field.parameters.items():
-        assert relative(value.grad, exact.field.parameters[name].grad) < 2e-5, name  # worst seen:
+        assert relative(value.grad, exact.field.parameters[name].grad) < 2e-5, name  # worst seen: 2.5e-6
     half = torch.tensor([53 / 2, 41 / 2])
-    assert relative(points.grad[:, :2], expected.means2d.grad * half) < 2e-5  # worst seen:
+    assert relative(points.grad[:, :2], expected.means2d.grad * half) < 2e-5  # worst seen: 1.9e-6
     assert torch.equal(points.grad[:, 2:3] == 0, torch.ones(len(radii), 1, dtype=torch.bool)) or variant == "fastgs"
     if variant == "fastgs":
-        assert relative(points.grad[:, 2:], expected.absgrad2d * half) < 2e-5  # worst seen:
+        assert relative(points.grad[:, 2:], expected.absgrad2d * half) < 2e-5  # worst seen: 4.5e-7
 
 
 # ------------------------------------------------------------------------------------------- FastGS's tiles and counts
@@ -172,7 +174,7 @@ def test_fastgs_blends_in_the_tiles_that_its_ellipses_meet_and_counts_marked_pix
     image, radii, counts, _ = call(
         module_of("fastgs"), "fastgs", case, activated(case), mult=mult, get_flag=True, metric_map=marked.int()
     )
-    assert (image - expected).abs().max() < 2e-5
+    assert (image - expected).abs().max() < 2e-5  # worst seen: 5.9e-7
     assert torch.equal(radii > 0, reached)
     assert counts.dtype == torch.int32
     assert torch.equal(counts.double(), sums["weights"])
@@ -204,8 +206,8 @@ def test_taming_sums_over_pixels() -> None:
     assert torch.equal(again, radii)
     assert counts.shape == (41, 53)
     assert [t.numel() for t in lists] == [0, 0, 0]
-    assert (centres[seen.ids] - seen.means2d).abs().max() < 1e-4
-    assert (depths[seen.ids] - seen.depths).abs().max() < 1e-5
+    assert (centres[seen.ids] - seen.means2d).abs().max() < 1e-4  # worst seen: 6.8e-6
+    assert (depths[seen.ids] - seen.depths).abs().max() < 1e-5  # worst seen: 6.2e-7
     assert not centres[radii == 0].any()
     assert not depths[radii == 0].any()
     # Tiles outside of three sigma are in the brute force only: in this scene they hold nothing of these.
@@ -213,7 +215,7 @@ def test_taming_sums_over_pixels() -> None:
     assert int(small.sum()) >= 20
     assert torch.equal(pixels[small].double(), sums["counts"][small])
     for mine, name in ((weighted, "weights"), (blending, "blending"), (distances, "distances")):
-        assert relative(mine[small], sums[name][small]) < 1e-5, name
+        assert relative(mine[small], sums[name][small]) < 1e-5, name  # worst seen: 5.9e-7
 
 
 @pytest.mark.parametrize("rows", [None, 0, 1])
@@ -232,10 +234,12 @@ def test_taming_without_two_rows_of_weights_gives_empty_sums(rows: int | None) -
 def covariance_of(case: Case) -> Tensor:
     """(n, 6) covariances of a field, differentiable."""
     w, x, y, z = normalize(case.field.quaternions).unbind(1)
-    rotation = torch.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z),
-         1 - 2 * (x * x + z * z), 2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1
-    ).reshape(-1, 3, 3)  # fmt: skip
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    rotation = torch.stack(rows, 1).reshape(-1, 3, 3)
     full = rotation @ torch.diag_embed((2 * case.field.log_scales).exp()) @ rotation.mT
     upper = torch.triu_indices(3, 3)
     return full[:, upper[0], upper[1]]
@@ -255,16 +259,16 @@ def test_given_covariances_and_colours_have_the_gradients_of_what_they_come_from
     del inputs["scales"], inputs["rotations"]
     again = call(module_of(variant), variant, apart, inputs)[0]
     (again * weights).sum().backward()
-    assert (image - again).abs().max() < 2e-5
+    assert (image - again).abs().max() < 2e-5  # worst seen: 2.4e-7
     for name, value in whole.field.parameters.items():
-        assert relative(apart.field.parameters[name].grad, value.grad) < 1e-4, name
+        assert relative(apart.field.parameters[name].grad, value.grad) < 1e-4, name  # worst seen: 2.9e-7
 
 
 def test_round_gaussians_may_come_as_covariances() -> None:
     """Their axes are arbitrary, and nothing may divide by the differences of their eigenvalues."""
     case = case_of(n=1)
     covariance = torch.tensor([[0.04, 0, 0, 0.04, 0, 0.04]], requires_grad=True)
-    inputs = activated(case) | {"means3D": torch.tensor([[0.0, 0.0, 2.0]])}
+    inputs = activated(case) | {"means3D": to_world(torch.tensor([[0.0, 0.0, 2.0]]), case.camera)}
     del inputs["scales"], inputs["rotations"]
     image = call(module_of("graphdeco"), "graphdeco", case, inputs | {"cov3D_precomp": covariance})[0]
     image.square().sum().backward()
@@ -312,10 +316,10 @@ def test_antialiasing_and_inverse_depths(variant: str, antialiasing: bool) -> No
     mine = case.with_leaves()
     image, _, inverse_depths, _ = call(module_of(variant), variant, mine, activated(mine), antialiasing=antialiasing)
     ((image * weights).sum() + (inverse_depths * depth_weights).sum()).backward()
-    assert (image - expected).abs().max() < 2e-5
-    assert (inverse_depths - expected_depth).abs().max() < 2e-5
+    assert (image - expected).abs().max() < 2e-5  # worst seen: 1.1e-6
+    assert (inverse_depths - expected_depth).abs().max() < 2e-5  # worst seen: 8.7e-7
     for name, value in mine.field.parameters.items():
-        assert relative(value.grad, exact.field.parameters[name].grad) < 1e-4, name
+        assert relative(value.grad, exact.field.parameters[name].grad) < 1e-4, name  # worst seen: 2.3e-6
     if antialiasing:
         plain = call(module_of(variant), variant, case, activated(case))[0]
         assert (plain - image).abs().max() > 0.01, "antialiasing changes nothing here: the test shows nothing"
@@ -332,8 +336,43 @@ def test_scale_modifier_multiplies_scales_but_not_their_gradient() -> None:
         assert scales.grad is not None
         gradients.append(scales.grad)
         images.append(image)
-    assert relative(images[1], images[0]) < 1e-6
-    assert relative(gradients[1], gradients[0]) < 1e-5
+    assert relative(images[1], images[0]) < 1e-6  # worst seen: 0
+    assert relative(gradients[1], gradients[0]) < 1e-5  # worst seen: 0
+
+
+# ----------------------------------------------------------------------------------------------------- training
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_training_loop_written_for_the_cuda_module_learns(variant: str) -> None:
+    """The calls of a checkout's train.py in their order: render, SSIM, statistics of densification, optimizer."""
+    case = case_of(sh_degree=1, n=80)
+    with install(variant) as found, torch.no_grad():
+        module = found[VARIANTS[variant][0]]
+        fused_ssim = found["fused_ssim"].fused_ssim
+        target = call(module, variant, case, activated(case))[0]
+        start = case.field.with_parameters({"sh": torch.zeros_like(case.field.sh)})
+        student = replace(case, field=start).with_leaves()
+        groups = [{"params": [p], "lr": 0.03 if name == "sh" else 1e-3} for name, p in student.field.parameters.items()]
+        sparse = hasattr(module, "SparseGaussianAdam")
+        make = module.SparseGaussianAdam if sparse else torch.optim.Adam
+        optimizer = make(groups, lr=0.0, eps=1e-15)
+        losses, accumulated = [], torch.zeros(80, 1)
+        for _ in range(12):
+            with torch.enable_grad():
+                image, radii, *_, points = call(module, variant, student, activated(student))
+                loss = 0.8 * (image - target).abs().mean() + 0.2 * (1 - fused_ssim(image[None], target[None]))
+                loss.backward()
+            visible = radii > 0
+            accumulated[visible] += points.grad[visible, :2].norm(dim=-1, keepdim=True)
+            if sparse:
+                optimizer.step(visible, len(radii))
+            else:
+                optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            losses.append(loss.item())
+    assert losses[-1] < 0.7 * losses[0]
+    assert int((accumulated > 0).sum()) > 60
 
 
 # ------------------------------------------------------------------------------------------------- edges and errors
@@ -408,9 +447,11 @@ def test_fused_ssim() -> None:
     first, second = (torch.rand(1, 3, 19, 23, generator=generator) for _ in range(2))
     values = torch.tensor([[[ssim_by_hand(first[0, c], second[0, c], y, x) for x in range(23)] for y in range(19)]
                            for c in range(3)])  # fmt: skip
-    assert abs(module.fused_ssim(first, second) - values.mean()) < 1e-6
-    assert abs(module.fused_ssim(first, second, padding="valid") - values[:, 5:-5, 5:-5].mean()) < 1e-6
-    assert (module.fused_ssim_(first, second) - values.mean(0)).abs().max() < 1e-5
+    assert abs(module.fused_ssim(first, second) - values.mean()) < 1e-6  # worst seen: 3.0e-8
+    assert (
+        abs(module.fused_ssim(first, second, padding="valid") - values[:, 5:-5, 5:-5].mean()) < 1e-6
+    )  # worst seen: 1.6e-7
+    assert (module.fused_ssim_(first, second) - values.mean(0)).abs().max() < 1e-5  # worst seen: 8.0e-7
     with pytest.raises(UserInputError, match="padding"):
         module.fused_ssim(first, second, padding="full")
 
@@ -426,11 +467,11 @@ def test_ssim_gradient_goes_to_the_first_image(padding: str) -> None:
     step, direction = 1e-3, torch.randn(1, 3, 19, 23, generator=generator)
     with torch.no_grad():
         ahead, back = (module.fused_ssim(first + s * direction, second, padding=padding) for s in (step, -step))
-    assert abs((ahead - back) / (2 * step) - (first.grad * direction).sum()) < 1e-3
+    assert abs((ahead - back) / (2 * step) - (first.grad * direction).sum()) < 1e-3  # worst seen: 1.9e-5
     if padding == "same":
         values = binding.fusedssim(1e-4, 9e-4, first, second)
         grad = binding.fusedssim_backward(1e-4, 9e-4, first, second, torch.full_like(values, 1 / values.numel()))
-        assert relative(grad, first.grad) < 1e-4
+        assert relative(grad, first.grad) < 1e-4  # worst seen: 3.4e-7
 
 
 def test_distances_to_three_neighbours() -> None:
@@ -438,7 +479,7 @@ def test_distances_to_three_neighbours() -> None:
     points[7] = points[3]  # a double is a neighbour at distance 0
     squared = torch.cdist(points.double(), points.double()).square().fill_diagonal_(torch.inf)
     found = stand_ins("taming")["simple_knn._C"].distCUDA2(points)
-    assert relative(found, squared.topk(3, largest=False).values.mean(1)) < 1e-6
+    assert relative(found, squared.topk(3, largest=False).values.mean(1)) < 1e-6  # worst seen: 2.8e-8
 
 
 def test_sparse_adam_moves_visible_rows_only() -> None:
@@ -456,6 +497,6 @@ def test_sparse_adam_moves_visible_rows_only() -> None:
                 m[i], v[i] = 0.9 * m[i] + 0.1 * g, 0.999 * v[i] + 0.001 * g * g
                 expected[i] -= 0.1 * m[i] / (v[i].sqrt() + 1e-15)
         optimizer.step(visible, 6)
-        assert relative(parameter.detach(), expected) < 1e-5, seed
-    assert relative(optimizer.state[parameter]["exp_avg"], m) < 1e-5
-    assert relative(optimizer.state[parameter]["exp_avg_sq"], v) < 1e-5
+        assert relative(parameter.detach(), expected) < 1e-5, seed  # worst seen: 6.0e-8
+    assert relative(optimizer.state[parameter]["exp_avg"], m) < 1e-5  # worst seen: 5.5e-8
+    assert relative(optimizer.state[parameter]["exp_avg_sq"], v) < 1e-5  # worst seen: 8.4e-8

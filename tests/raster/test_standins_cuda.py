@@ -1,0 +1,56 @@
+"""Stand-ins against what the CUDA modules returned on an H200; see `fixtures/README.md` for how that was recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.reference_raster.standins import VARIANTS, stand_ins
+from tests.raster.standin_cases import CASES, outputs, ssim_outputs
+
+FIXTURES = Path(__file__).parent / "fixtures"
+pytestmark = pytest.mark.skipif(not (FIXTURES / "standin_inputs.npz").exists(), reason="CUDA outputs not recorded yet")
+
+
+def load(name: str) -> dict[str, Tensor]:
+    with np.load(FIXTURES / f"standin_{name}.npz") as stored:
+        return {key: torch.from_numpy(stored[key]) for key in stored.files}
+
+
+def assert_close(actual: Tensor, expected: Tensor, name: str, bound: float) -> None:
+    """Every element is within `bound` of the largest; whole numbers are the same."""
+    assert actual.shape == expected.shape, name
+    assert actual.dtype == expected.dtype, name
+    if expected.numel() == 0:
+        return
+    if not expected.is_floating_point():
+        assert torch.equal(actual, expected), f"{name}: {int((actual != expected).sum())} differ"
+        return
+    error = ((actual - expected).abs().max() / expected.abs().max().clamp_min(1e-30)).item()
+    assert error <= bound, f"{name}: off by {error:.2e} of the largest"
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_rasterizer_returns_what_its_cuda_module_does(variant: str, case: str) -> None:
+    module = stand_ins(variant)[VARIANTS[variant][0]]
+    found = outputs(module, variant, case, load("inputs"), "cpu")
+    recorded = {key.split("/")[1]: value for key, value in load(variant).items() if key.startswith(f"{case}/")}
+    assert found.keys() == recorded.keys()
+    for key, expected in recorded.items():
+        # Bounds of float32 sums in other orders; the worst values belong here once recorded
+        assert_close(found[key], expected, key, 1e-4 if key.startswith("grad_") else 2e-5)
+
+
+def test_neighbours_and_ssim_return_what_their_cuda_modules_do() -> None:
+    inputs, recorded = load("inputs"), load("others")
+    modules = stand_ins("taming")
+    assert_close(
+        modules["simple_knn._C"].distCUDA2(inputs["means"]), recorded["simple-knn/distances"], "distances", 1e-6
+    )
+    for key, value in ssim_outputs(modules["fused_ssim"].fused_ssim, inputs, "cpu").items():
+        assert_close(value, recorded[f"fused-ssim/{key}"], key, 1e-5)
