@@ -6,13 +6,14 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from lapgs_plugin import signed_color
-from lapgs_plugin.adapters.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.adapters.extensions import SEMANTICS, CudaExtension, _blends_something, _Screen, installed_extensions
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.cases import Case, gradients, pixel_weights, random_case
@@ -233,6 +234,36 @@ def test_screen_gradients_come_back_in_pixels() -> None:
     assert means2d.grad is not None
     assert means2d.grad.tolist() == [[1.0, 1.0]] * 3
     assert absolute.tolist() == [[2.0, 3.0]] * 3
+
+
+class _Counted(torch.autograd.Function):
+    """Notes what the CUDA bindings note for their backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return gradient
+
+
+@pytest.mark.parametrize(
+    ("noted", "something"),
+    [
+        ({}, True),
+        ({"num_rendered": 5}, True),
+        ({"num_rendered": 0}, False),
+        ({"num_rendered": 5, "num_buckets": 0}, False),
+    ],
+)
+def test_an_empty_backward_pass_is_foreseen(noted: dict[str, int], something: bool) -> None:
+    """Where no tile has a Gaussian, some backward passes launch a grid of no blocks, which CUDA refuses."""
+    image = _Counted.apply(torch.zeros(1, requires_grad=True))
+    for name, value in noted.items():
+        setattr(image.grad_fn, name, value)
+    assert _blends_something(image) is something
+    assert _blends_something(torch.zeros(1))
 
 
 def test_settings_that_are_not_known_are_refused_by_name() -> None:
