@@ -19,7 +19,7 @@ SPLITS = ("test", "train", "all")
 FORMATS = ("png", "exr")
 
 
-def render(  # noqa: PLR0917 - a command line has as many parameters as options
+def render(
     run: Annotated[Path, typer.Argument(help="Run folder that `lapgs train` wrote.")],
     views: Annotated[
         str | None,
