@@ -36,14 +36,12 @@ from lapgs_plugin.reference_raster.lanes import (
     store,
 )
 from lapgs_plugin.reference_raster.threads import parallel
+from lapgs_plugin.supervision import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
+from lapgs_plugin.supervision import SSIM_C1 as C1
+from lapgs_plugin.supervision import SSIM_C2 as C2
+from lapgs_plugin.supervision import SSIM_RADIUS as RADIUS
 
 Integers = NDArray[np.int64]
-
-RADIUS = 5
-"""Rows and columns of the SSIM window on each side of its centre."""
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
 
 _TAPS = 2 * RADIUS + 1
 _MOMENTS = 4  # p, t, p^2 + t^2, p t: SSIM needs the squares in their sum only
@@ -53,7 +51,7 @@ _STRIP_ROWS = 128  # each strip computes 20 rows of its neighbours again
 
 
 def _half_window() -> tuple[float, ...]:
-    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
     return tuple((gaussian / gaussian.sum())[: RADIUS + 1].tolist())
 
 
@@ -309,7 +307,7 @@ class _PhotometricLoss(torch.autograd.Function):
         return (gradient if grad_loss.item() == 1 else gradient * grad_loss), None, None
 
 
-def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
     """(1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once with respect to the prediction.
 
     Args:
