@@ -25,8 +25,9 @@ from lapgs_plugin.scenes.images import resize_image, write_image
 from lapgs_plugin.scenes.scene import View
 
 TEMPLATE = "report.html.jinja"
-IMAGE_SIDE = 640
+IMAGE_SIDE = 800
 """Longest side in pixels of an image on the page."""
+MOST_COLUMNS = 5
 MINUTES_FROM = 300.0
 """Runs at least this many seconds long are charted in minutes."""
 
@@ -69,6 +70,12 @@ class Strip:
     why: str
     figures: str
     pictures: tuple[Picture, ...]
+
+    @property
+    def columns(self) -> int:
+        """Pictures in a row of a wide page: all of them, or half when they would get too small."""
+        count = len(self.pictures)
+        return count if count <= MOST_COLUMNS else (count + 1) // 2
 
 
 def write_report(run: MeasuredRun, baseline: MeasuredRun | None = None, moved_to: Path | None = None) -> Path:
