@@ -24,12 +24,21 @@ IMAGE_BOUND = 1e-12  # worst seen 4.0e-14 (needles), 5e-15 elsewhere
 FLOAT32_BOUND = 1e-4  # worst seen in 3600 random scenes 1.6e-5, in colours of about 1
 
 
+MAX_MASKED = 0.05
+"""Share of an image that the mask may excuse: it is built on parts of the oracle, and may not hide their faults."""
+
+
+def max_masked(case: Case) -> float:
+    """`MAX_MASKED`, but for the scene whose purpose is a huge Gaussian exactly at the culling depth."""
+    return 0.4 if case.name == "near_plane" else MAX_MASKED
+
+
 def assert_equals_naive(case: Case) -> None:
     expected = naive.render(case)
     with torch.no_grad():
         actual = case.render(ORACLE)
     mask = threshold_mask(case.field, case.camera, sh_degree=case.sh_degree)
-    assert_close_outside(actual.image, expected.image, mask.pixels, IMAGE_BOUND)
+    assert_close_outside(actual.image, expected.image, mask.pixels, IMAGE_BOUND, max_masked=max_masked(case))
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, IMAGE_BOUND)
     assert_radii_close(actual.radii, expected.radii, mask.radii)
     assert actual.radii.dtype == torch.int32
@@ -53,7 +62,7 @@ def test_float32_equals_float64_outside_the_mask(name: str) -> None:
     with torch.no_grad():
         actual, expected = rounded.render(ORACLE), rounded.to(torch.float64).render(ORACLE)
     assert actual.image.dtype == torch.float32
-    assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND)
+    assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND, max_masked=max_masked(rounded))
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, FLOAT32_BOUND)
     assert_radii_close(actual.radii, expected.radii, mask.radii)
 
