@@ -1,4 +1,4 @@
-"""Numbers that the kernels agree on: thresholds of the 3DGS rasterizers, and what lies where in the arrays between them.
+"""Numbers that the kernels agree on: thresholds of the 3DGS rasterizers, and what lies where in arrays between them.
 
 A change here makes all kernels compile again.
 """

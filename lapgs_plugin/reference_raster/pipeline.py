@@ -1,7 +1,7 @@
 """The CPU rasterizer on plain arrays: what `fast` wraps for autograd and stand-ins for CUDA modules can wrap otherwise.
 
-    project_kernels.project -> ordering_kernels -> tile_kernels.blend
-    tile_kernels.blend_backward -> projection_kernels.project_backward
+project_kernels.project -> ordering_kernels -> tile_kernels.blend
+tile_kernels.blend_backward -> projection_kernels.project_backward
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ def make_view(
     """
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     limits = JACOBIAN_LIMIT * width / (2 * focal[0]), JACOBIAN_LIMIT * height / (2 * focal[1])
-    parts = [rotation.ravel(), translation, -rotation.T @ translation, focal, principal, limits]
-    return View(width, height, np.concatenate(parts).astype(world_to_camera.dtype))
+    values = [*rotation.ravel(), *translation, *(-rotation.T @ translation), *focal, *principal, *limits]
+    return View(width, height, np.array(values, world_to_camera.dtype))
 
 
 def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, int]:
@@ -245,4 +245,7 @@ def _order(
 
 @lru_cache
 def _offsets(kind: Any) -> Floats:
-    return tile_kernels.pixel_offsets(kind)
+    offsets = tile_kernels.pixel_offsets(kind)
+    aligned = empty(offsets.size, kind)
+    np.copyto(aligned, offsets)
+    return aligned
