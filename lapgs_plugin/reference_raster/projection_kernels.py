@@ -61,7 +61,7 @@ from lapgs_plugin.reference_raster.layout import (
     LIMIT_Y,
     LOG2_MIN_ALPHA,
     NEAR_DEPTH,
-    OPACITY,
+    OPACITY_RATE,
     PIXEL_VARIANCE,
     POSITION,
     PRINCIPAL_X,
@@ -155,8 +155,8 @@ def _length(q: Lanes4) -> Lanes:
 
 
 @inline
-def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) -> Lanes:
-    """Opacities of 16 Gaussians."""
+def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) -> tuple[Lanes, Lanes]:
+    """Opacities of 16 Gaussians, and the derivatives of their logarithms by what they come from."""
     if first + WIDTH > n:
         for i in range(WIDTH):
             put(spare, i, at(opacities, first + i) if first + i < n else 0.0)
@@ -164,8 +164,10 @@ def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) ->
     else:
         opacity = load(opacities, first)
     if raw:
-        opacity = 1.0 / (1.0 + exp(-opacity))
-    return opacity
+        odds_against = exp(-opacity)
+        opacity = 1.0 / (1.0 + odds_against)
+        return opacity, odds_against * opacity  # 1 - opacity, without its rounding where that is nearly 1
+    return opacity, 1.0 / opacity
 
 
 # ------------------------------------------------------------------------------------------------ geometry
@@ -337,7 +339,7 @@ def project(
         finite = (determinant < HUGE) & (absolute(centre_x) < HUGE) & (absolute(centre_y) < HUGE)
         seen = in_front & finite & (box[0] < box[2]) & (box[1] < box[3])
 
-        opacity = _opacity(opacities, first, n, raw, spare)
+        opacity, opacity_rate = _opacity(opacities, first, n, raw, spare)
         log2_opacity = log2(opacity)
         margin = log2_opacity - LOG2_MIN_ALPHA
         # Rounding moves the border of 1/255 by some epsilon of the products whose difference u is.
@@ -353,7 +355,7 @@ def project(
         store_rows(
             splats, first * SPLAT, SPLAT,
             centre_x, centre_y, factor_xx, ridge_x * -factor_xx, FACTOR_SCALE / sqrt(yy), log2_opacity,
-            color[0], color[1], color[2], reach, ridge_x, xy / xx, free[0], free[1], free[2], opacity,
+            color[0], color[1], color[2], reach, ridge_x, xy / xx, free[0], free[1], free[2], opacity_rate,
         )  # fmt: skip
     keep_alive(scratch)
 
@@ -522,8 +524,7 @@ def project_backward(
             by_color = (none, none, none)
         else:
             by_color = _color_backward(camera, mean, sh, first, n, columns, degree, d_color, blended, spare, grad_sh)
-        d_opacity = total[SUM_1] * (1.0 - shape[OPACITY]) if raw else total[SUM_1] / shape[OPACITY]
-        store(grad_opacities, first, select(blended, d_opacity, 0.0))
+        store(grad_opacities, first, select(blended, total[SUM_1] * shape[OPACITY_RATE], 0.0))
         d_centre_x = total[SUM_U] * shape[FACTOR_XX] * _UNIT
         d_centre_y = fma(total[SUM_U], shape[FACTOR_XY], total[SUM_V] * shape[FACTOR_YY]) * _UNIT
         _store2(grad_centres, first, d_centre_x, d_centre_y, blended)
