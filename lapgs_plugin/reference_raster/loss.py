@@ -23,6 +23,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster._jit import inline, jit
+from lapgs_plugin.reference_raster.buffers import empty
 from lapgs_plugin.reference_raster.lanes import (
     WIDTH,
     Floats,
@@ -253,12 +254,8 @@ def _ssim_kernel(
     wide = _MOMENTS * pitch
     moments, unused = np.zeros(4 * _GROUP * wide, dtype), np.zeros(_DERIVATIVES * pitch, dtype)
     filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
-    p_row, t_row, row, inside = (
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-    )
+    p_row, t_row = np.empty(pitch, dtype), np.empty(pitch, dtype)
+    inside, row = np.empty(pitch, dtype), np.empty(pitch, dtype)
     while True:
         task = fetch_add(counter, 1)
         if task >= len(blocks):
@@ -319,18 +316,16 @@ def _check(prediction: Tensor, target: Tensor) -> None:
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        images = prediction.detach().contiguous(), target.contiguous()
+        images = [image.detach().contiguous().numpy() for image in (prediction, target)]
         count = prediction.numel()
-        gradient = torch.empty_like(images[0])
+        gradient = empty(count, images[0].dtype).reshape(prediction.shape)
         blocks, pitch = _blocks(*prediction.shape)
         sums = np.empty((len(blocks), 2))
         # The mean of 1 - SSIM, and the factor 2 that the stored derivatives lack.
         weights = (1 - ssim_weight) / count, -2 * ssim_weight / count
-        parallel(
-            _photometric_kernel, blocks, pitch, images[0].numpy(), images[1].numpy(), weights, gradient.numpy(), sums
-        )
+        parallel(_photometric_kernel, blocks, pitch, *images, weights, gradient, sums)
         l1, ssim = sums.sum(axis=0) / count
-        ctx.save_for_backward(gradient)
+        ctx.save_for_backward(torch.from_numpy(gradient))
         return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
 
     @staticmethod
@@ -371,10 +366,10 @@ def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
         UserInputError: the images differ in shape or type, or are not float32 or float64 on the CPU.
     """
     _check(prediction, target)
-    images = prediction.detach().contiguous(), target.detach().contiguous()
-    ssim = torch.empty_like(images[0])
-    parallel(_ssim_kernel, *_blocks(*prediction.shape), images[0].numpy(), images[1].numpy(), ssim.numpy())
-    return ssim
+    images = [image.detach().contiguous().numpy() for image in (prediction, target)]
+    ssim = np.empty_like(images[0])
+    parallel(_ssim_kernel, *_blocks(*prediction.shape), *images, ssim)
+    return torch.from_numpy(ssim)
 
 
 def ssim_cpu(prediction: Tensor, target: Tensor) -> Tensor:
