@@ -14,7 +14,7 @@ def prepare(
     matcher: Annotated[
         str,
         typer.Option(
-            help="exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours in name order, for a video."
+            help="exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours by name, for a video."
         ),
     ] = "exhaustive",
     camera_model: Annotated[

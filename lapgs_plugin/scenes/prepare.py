@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -411,11 +411,13 @@ def _run_step(
     with bar or nullcontext(), log.open("wb") as words:
         task = bar.add_task(title, total=total) if bar else None
         command = [sys.executable, str(WORKER)]
-        worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=words, stderr=words, start_new_session=True)
+        worker = subprocess.Popen(
+            command, bufsize=0, stdin=subprocess.PIPE, stdout=words, stderr=words, start_new_session=True
+        )
         assert worker.stdin is not None
         try:
-            worker.stdin.write(order.encode() + b"\n")
-            worker.stdin.flush()
+            with suppress(BrokenPipeError):  # its exit code will tell
+                worker.stdin.write(order.encode() + b"\n")
             running = True
             while running:
                 running = not _ended(worker)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import shutil
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -302,6 +305,36 @@ def test_a_full_disk_is_one_line(few: Path, tmp_path: Path) -> None:
             prepare_scene(few, tmp_path / "scene", progress=False)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("raise ValueError('the words of COLMAP')", "ValueError: the words of COLMAP"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "exit code -9"),
+        (
+            "import sys; sys.stderr.write('E20261121 10:00:00.0 1 sift.cc:1] no features\\n'); sys.exit(3)",
+            "no features",
+        ),
+    ],
+)
+def test_a_failure_of_colmap_is_one_line(
+    noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
+) -> None:
+    (tmp_path / "worker.py").write_text(program)
+    monkeypatch.setattr(prepare_module, "WORKER", tmp_path / "worker.py")
+    with pytest.raises(LapgsError, match=f"COLMAP failed at finding features .*{reason}") as caught:
+        prepare_scene(noise, tmp_path / "scene", progress=False)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_worker_ends_with_the_process_that_started_it(photos: Path, tmp_path: Path) -> None:
+    job = {"step": "features", "database": str(tmp_path / "database.db"), "photos": str(photos), "max_size": None}
+    job |= {"names": [file.name for file in photos.iterdir()], "camera_model": "OPENCV", "single_camera": True}
+    command = [sys.executable, str(prepare_module.WORKER)]
+    worker = subprocess.run(command, input=json.dumps(job).encode() + b"\n", capture_output=True, check=False)
+    assert worker.returncode == 1
+    assert b"Traceback" not in worker.stderr
 
 
 def test_command_line_makes_smaller_images_of_the_same_view(few: Path, tmp_path: Path) -> None:
