@@ -187,7 +187,9 @@ def store_sh_gradient(
         color: gradient by the colour that `sh_color` returned.
         spare: at least 16 * 48 floats.
     """
+    # Both factors of the products, because zero times the direction of a broken centre would not be zero.
     r, g, b = select(where, color[0], 0.0), select(where, color[1], 0.0), select(where, color[2], 0.0)
+    d = (select(where, d[0], 0.0), select(where, d[1], 0.0), select(where, d[2], 0.0))
     none = r * 0.0
     d1 = (none, none, none)
     d2 = (none, none, none, none, none)
