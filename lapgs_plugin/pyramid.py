@@ -9,6 +9,10 @@ coarse pixels:
              sees the pixel where it is. For even n it is the middle of a pair of fine pixels.
     even     coarse i is at fine 2 i: every second pixel is kept, as OpenCV's pyrDown does. Against the cameras the
              image is shifted by half a fine pixel a level.
+
+The even grid blurs a little less: on the 50 photos of the fox scene its first residual holds 18 % less energy at full
+size and 8 % less at a quarter. Trained (a quarter of the size, 1500 iterations, two levels, two seeds), the camera grid
+is 0.15 and 0.34 dB better on held-out views all the same, and it is the default.
 """
 
 from __future__ import annotations

@@ -8,6 +8,12 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin import __version__
+from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.cli.doctor import doctor
+from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.render import render
+from lapgs_plugin.cli.report import report
+from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError
 
@@ -38,7 +44,13 @@ def options(
     """
 
 
+app.command("sample")(sample)
 app.command("train")(train)
+app.command("eval")(evaluate)
+app.command("render")(render)
+app.command("report")(report)
+app.add_typer(bench_app, name="bench")
+app.command("doctor")(doctor)
 
 
 def run() -> None:

@@ -7,6 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+SHOWN_VIEWS = 12
+"""How many views the terminal shows; metrics.json and the report hold all."""
+
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Complete run folder that `lapgs train` wrote.")],
@@ -30,22 +33,20 @@ def evaluate(
 
 
 def _print(metrics: dict[str, Any]) -> None:
+    from rich import box
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
-    by_view = Table("view", "PSNR dB", "SSIM", title="Views, worst first", title_justify="left")
-    for view in sorted(metrics["views"], key=lambda view: float(view["psnr"])):
-        by_view.add_row(view["name"], f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
-    console.print(by_view)
+    by_view = Table("view", "PSNR (dB)", "SSIM", box=box.SIMPLE_HEAD)
+    ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
+    for view in ranked[:SHOWN_VIEWS]:
+        by_view.add_row(escape(view["name"]), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
+    more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
+    console.print(f"[bold]Views, worst first[/bold]{more}", by_view, highlight=False)
 
-    by_level = Table(
-        *("level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR dB", "upsampled dB"),
-        title="Levels, in training order",
-        title_justify="left",
-        caption="PSNR at the level's own size, and upsampled to full resolution without finer levels",
-        caption_justify="left",
-    )
+    by_level = Table("level", "size", "steps", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD)
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]
         by_level.add_row(
@@ -53,7 +54,11 @@ def _print(metrics: dict[str, Any]) -> None:
             *(f"{figures['num_gaussians']:,}", f"{figures['peak_gaussians']:,}"),
             *(f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}"),
         )
-    console.print(by_level)
+    console.print(
+        "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels",
+        by_level,
+        highlight=False,
+    )
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(

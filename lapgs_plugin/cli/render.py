@@ -19,7 +19,7 @@ SPLITS = ("test", "train", "all")
 FORMATS = ("png", "exr")
 
 
-def render(  # noqa: PLR0917 - a command line has as many parameters as options
+def render(
     run: Annotated[Path, typer.Argument(help="Run folder that `lapgs train` wrote.")],
     views: Annotated[
         str | None,
@@ -92,16 +92,21 @@ def _write_views(
     renderer: HierarchyRenderer, views: Sequence[View], level: int, *, folder: Path, image_format: str, compare: bool
 ) -> None:
     """Render and write the views of one split; each file appears whole or not at all."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from lapgs_plugin.progress import item_progress
     from lapgs_plugin.rendering.images import file_stems, view_images
     from lapgs_plugin.scenes import write_image
 
     stems = file_stems(views)
-    with item_progress("views") as progress:
+    # Compressing a PNG takes longer than rendering it.
+    with item_progress("views") as progress, ThreadPoolExecutor() as pool:
         task = progress.add_task(f"Rendering {folder.name} views", total=len(views))
         for view in views:
             composition = renderer.render(view.camera, level)
             photo = renderer.pyramid.gaussian(view.image, level + 1)[level] if compare else None
-            for suffix, image in view_images(composition, photo, raw=image_format == "exr").items():
-                write_image(folder / f"{stems[view.name]}_{suffix}.{image_format}", image)
+            images = view_images(composition, photo, raw=image_format == "exr")
+            paths = [folder / f"{stems[view.name]}_{suffix}.{image_format}" for suffix in images]
+            for _ in pool.map(write_image, paths, images.values()):
+                pass
             progress.advance(task)

@@ -23,7 +23,7 @@ RUN = "Run"
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
-def train(  # noqa: PLR0917 - a command line has as many parameters as options
+def train(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(help="Folder of a COLMAP or Blender-style scene.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],

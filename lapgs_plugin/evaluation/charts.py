@@ -10,6 +10,8 @@ WIDTH, HEIGHT = 420, 260
 """Of a chart in its own units: narrow enough that a phone shows the labels at a readable size."""
 LEFT, RIGHT, TOP, BOTTOM = 50, 14, 22, 42
 """Margins around the plot, for labels."""
+CHARACTER_WIDTH, LINE_HEIGHT = 7.5, 14.0
+"""Of a label, about."""
 TICKS = 5
 HEADROOM = 1.04
 
@@ -44,6 +46,21 @@ class Tick:
 
 
 @dataclass(frozen=True)
+class PlacedMark:
+    """A mark in chart units.
+
+    Attributes:
+        at: x of its line and of the start of its label.
+        label: the word.
+        y: baseline of its label; labels that would overlap stand below each other.
+    """
+
+    at: float
+    label: str
+    y: float
+
+
+@dataclass(frozen=True)
 class Line:
     """One line in chart units, as the value of an SVG polyline's "points"."""
 
@@ -68,7 +85,7 @@ class Chart:
     lines: tuple[Line, ...]
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
-    marks: tuple[Tick, ...]
+    marks: tuple[PlacedMark, ...]
 
 
 def draw(
@@ -110,8 +127,19 @@ def draw(
         tuple(lines),
         x_ticks=tuple(Tick(to_x(x), format_x(x)) for x in _ticks(0.0, right) if x <= right * 1.001),
         y_ticks=tuple(Tick(to_y(y), format_y(y)) for y in y_ticks),
-        marks=tuple(Tick(to_x(mark.x), mark.label) for mark in marks),
+        marks=_place_marks([(to_x(mark.x), mark.label) for mark in marks]),
     )
+
+
+def _place_marks(marks: Sequence[tuple[float, str]]) -> tuple[PlacedMark, ...]:
+    """Marks by increasing x, each label in the first row that is free."""
+    ends: list[float] = []
+    placed = []
+    for x, label in marks:
+        row = next((row for row, end in enumerate(ends) if end <= x), len(ends))
+        ends[row : row + 1] = [x + CHARACTER_WIDTH * (len(label) + 1)]
+        placed.append(PlacedMark(x, label, TOP - 8 + LINE_HEIGHT * row))
+    return tuple(placed)
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -15,10 +15,17 @@ Metrics = dict[str, Any]
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure of one run: its value and how it is written."""
+    """One figure of one run.
+
+    Attributes:
+        value: the number.
+        text: how it is written.
+        parts: what it is the sum of, each with its name; empty when it is no sum.
+    """
 
     value: float
     text: str
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
-        ("overhead_seconds", "Beside it (s)", "{:.1f}", _difference("{:+.1f} s")),
+        ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
         ("num_gaussians", "Gaussians, all levels", "{:,.0f}", _ratio),
         ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),
     )
@@ -62,12 +69,12 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
 
 
 def _cell(value: float | dict[str, float], pattern: str) -> Cell:
-    """A number, or the sum of named numbers with these behind it."""
+    """A number, or the sum of named numbers."""
     if not isinstance(value, dict):
         return Cell(value, pattern.format(value))
     total = math.fsum(value.values())
     parts = [f"{f'level {name}' if name.isdigit() else name} {pattern.format(part)}" for name, part in value.items()]
-    return Cell(total, pattern.format(total) + (f" ({', '.join(parts)})" if len(parts) > 1 else ""))
+    return Cell(total, pattern.format(total), tuple(parts) if len(parts) > 1 else ())
 
 
 def _difference(pattern: str) -> Callable[[float, float], str]:

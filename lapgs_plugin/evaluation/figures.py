@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive
+from lapgs_plugin.archive import METRICS, LevelRecord, Manifest, RunArchive
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.metrics import psnr, ssim
@@ -17,6 +17,12 @@ from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.scenes.scene import View
+
+METRIC_KEYS = {
+    *("psnr", "ssim", "split", "num_views", "views", "levels"),
+    *("train_seconds", "overhead_seconds", "num_gaussians", "peak_gaussians", "rasterizer", "versions"),
+}
+"""What metrics.json holds; `run_figures` says what each is."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,23 @@ def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str,
             ]
     metrics = run_figures(archive.manifest, split, measured)
     archive.write_metrics(metrics)
+    return metrics
+
+
+def run_metrics(archive: RunArchive, moved_to: Path | None = None) -> dict[str, Any]:
+    """The run's metrics.json, measured now if it never was.
+
+    Raises:
+        RunFolderError: as `evaluate_run`, or the file was written by something else.
+    """
+    require_complete(archive)
+    metrics = archive.metrics()
+    if metrics is None:
+        return evaluate_run(archive, moved_to)
+    if missing := METRIC_KEYS - metrics.keys():
+        raise RunFolderError(
+            f"{archive.path(METRICS)} lacks {', '.join(sorted(missing))}; write it again with `lapgs eval`"
+        )
     return metrics
 
 

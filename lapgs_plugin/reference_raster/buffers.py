@@ -1,7 +1,7 @@
-"""Memory that is used again: at a million pixels, touching fresh memory costs as much as a kernel.
+"""Memory that is used again: with a million pixels, touching fresh memory costs as much as a kernel.
 
-`empty` hands out arrays that find their way back by themselves, when the array, all its views and all tensors made of it
-are gone: gradients that PyTorch owns as `.grad` come back when the optimizer drops them.
+`empty` hands out arrays that find their way back by themselves, when the array, all its views and all tensors made of
+it are gone: gradients that PyTorch owns as `.grad` come back when the optimizer drops them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class _Block:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self.memory = memoryview(np.empty(size + ALIGNMENT, np.uint8))
+        # Through a memoryview, so that views of an array made of it keep that array alive and not this one.
+        self.memory = np.empty(size + ALIGNMENT, np.uint8).data
         self.returned = 0
 
 

@@ -65,7 +65,9 @@ class CpuRasterizer:
         means2d, absgrad2d = (torch.from_numpy(_zeros(n, 2, _numpy_type(kind))) for _ in range(2))
         call = _Call(view, field.signed, degree, differentiable, means2d.detach(), absgrad2d)
         means2d.requires_grad_(differentiable)
-        image, transmittance, radii = _Rasterize.apply(call, background, means2d, *parameters)
+        image, transmittance, radii = _Rasterize.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
+            call, background, means2d, *parameters
+        )
         return RenderResult(image, transmittance, radii, means2d, absgrad2d)
 
 
@@ -112,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, radii
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    @once_differentiable
     def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
         rendering: Rendering = ctx.rendering

@@ -1,4 +1,4 @@
-"""Numbers that the kernels agree on: thresholds of the 3DGS rasterizers, and what lies where in the arrays between them.
+"""Numbers that the kernels agree on: thresholds of the 3DGS rasterizers, and what lies where in arrays between them.
 
 A change here makes all kernels compile again.
 """
@@ -48,7 +48,7 @@ SPLAT = 16
     RED_FREE,  # 1 where the colour map passes gradients, 0 where it clamps
     GREEN_FREE,
     BLUE_FREE,
-    OPACITY,
+    OPACITY_RATE,  # derivative of the natural logarithm of the opacity by the parameter it comes from
 ) = range(SPLAT)
 
 FACTOR_SCALE = math.sqrt(math.log2(math.e) / 2)

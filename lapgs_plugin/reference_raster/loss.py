@@ -23,6 +23,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster._jit import inline, jit
+from lapgs_plugin.reference_raster.buffers import empty
 from lapgs_plugin.reference_raster.lanes import (
     WIDTH,
     Floats,
@@ -36,24 +37,22 @@ from lapgs_plugin.reference_raster.lanes import (
     store,
 )
 from lapgs_plugin.reference_raster.threads import parallel
+from lapgs_plugin.supervision import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
+from lapgs_plugin.supervision import SSIM_C1 as C1
+from lapgs_plugin.supervision import SSIM_C2 as C2
+from lapgs_plugin.supervision import SSIM_RADIUS as RADIUS
 
 Integers = NDArray[np.int64]
 
-RADIUS = 5
-"""Rows and columns of the SSIM window on each side of its centre."""
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
-
-_TAPS = 2 * RADIUS + 1
 _MOMENTS = 4  # p, t, p^2 + t^2, p t: SSIM needs the squares in their sum only
 _DERIVATIVES = 3  # with respect to the means of p, p^2 and p t
-_BLOCK_COLUMNS = 400  # both buffers of a block fit a level-2 cache of 512 KiB in float32
-_STRIP_ROWS = 128  # each strip computes 20 rows of its neighbours again
+_GROUP = 4  # rows filtered down together: 14 rows are read for them, where one by one they would read 44
+_BLOCK_COLUMNS = 400  # both buffers of a block fit a level-2 cache of 256 KiB in float32
+_STRIP_ROWS = 192  # each strip computes 20 rows of its neighbours again
 
 
 def _half_window() -> tuple[float, ...]:
-    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
     return tuple((gaussian / gaussian.sum())[: RADIUS + 1].tolist())
 
 
@@ -62,55 +61,70 @@ _W0, _W1, _W2, _W3, _W4, _W5 = _half_window()
 
 
 @inline
-def _weighted(array: Floats, start: int, step: int) -> Lanes:
-    """The window over 11 vectors that lie `step` elements apart."""
-    total = _W0 * (load(array, start) + load(array, start + 10 * step))
-    total = fma(_W1, load(array, start + step) + load(array, start + 9 * step), total)
-    total = fma(_W2, load(array, start + 2 * step) + load(array, start + 8 * step), total)
-    total = fma(_W3, load(array, start + 3 * step) + load(array, start + 7 * step), total)
-    total = fma(_W4, load(array, start + 4 * step) + load(array, start + 6 * step), total)
-    return fma(_W5, load(array, start + 5 * step), total)
-
-
-# The buffers hold each row twice, 11 slots apart, in slots y % 11 and y % 11 + 11. So the 11 rows that end with y are
-# contiguous, from slot (y + 1) % 11 on, and nothing is ever moved.
+def _window_sum(
+    v0: Lanes, v1: Lanes, v2: Lanes, v3: Lanes, v4: Lanes, v5: Lanes,
+    v6: Lanes, v7: Lanes, v8: Lanes, v9: Lanes, v10: Lanes,
+) -> Lanes:  # fmt: skip
+    """The 11 values weighted by the window."""
+    total = fma(_W1, v1 + v9, _W0 * (v0 + v10))
+    total = fma(_W3, v3 + v7, fma(_W2, v2 + v8, total))
+    return fma(_W5, v5, fma(_W4, v4 + v6, total))
 
 
 @inline
-def _store_row(rows: Floats, y: int, maps: int, pitch: int, index: int, x: int, value: Lanes) -> None:
-    at = (y % _TAPS * maps + index) * pitch + x
-    store(rows, at, value)
-    store(rows, at + _TAPS * maps * pitch, value)
+def _filter_across(row: Floats, x: int) -> Lanes:
+    """The window over the 11 columns from x on, for 16 neighbouring x."""
+    return _window_sum(
+        load(row, x), load(row, x + 1), load(row, x + 2), load(row, x + 3), load(row, x + 4), load(row, x + 5),
+        load(row, x + 6), load(row, x + 7), load(row, x + 8), load(row, x + 9), load(row, x + 10),
+    )  # fmt: skip
+
+
+# A buffer holds the last 16 rows as a ring of four groups of four. A row is its maps one after the other, each `pitch`
+# long. From a group, filtering makes the four rows whose windows end with the group's rows.
 
 
 @inline
-def _store_moments(p_row: Floats, t_row: Floats, y: int, pitch: int, moments: Floats) -> None:
+def _filter_down(rows: Floats, group: int, size: int, out: Floats) -> None:
+    """Filter the 14 rows that end with a group into four, `size` elements each."""
+    oldest, older = (group + 1) % 4 * _GROUP * size, (group + 2) % 4 * _GROUP * size
+    newer, newest = (group + 3) % 4 * _GROUP * size, group % 4 * _GROUP * size
+    for x in range(0, size, WIDTH):
+        r0, r1 = load(rows, oldest + 2 * size + x), load(rows, oldest + 3 * size + x)
+        r2, r3 = load(rows, older + x), load(rows, older + size + x)
+        r4, r5 = load(rows, older + 2 * size + x), load(rows, older + 3 * size + x)
+        r6, r7 = load(rows, newer + x), load(rows, newer + size + x)
+        r8, r9 = load(rows, newer + 2 * size + x), load(rows, newer + 3 * size + x)
+        r10, r11 = load(rows, newest + x), load(rows, newest + size + x)
+        r12, r13 = load(rows, newest + 2 * size + x), load(rows, newest + 3 * size + x)
+        store(out, x, _window_sum(r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10))
+        store(out, size + x, _window_sum(r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11))
+        store(out, 2 * size + x, _window_sum(r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12))
+        store(out, 3 * size + x, _window_sum(r3, r4, r5, r6, r7, r8, r9, r10, r11, r12, r13))
+
+
+@inline
+def _store_moments(p_row: Floats, t_row: Floats, pitch: int, moments: Floats, start: int) -> None:
     for x in range(0, pitch, WIDTH):
         p, t = load(p_row, x), load(t_row, x)
-        _store_row(moments, y, _MOMENTS, pitch, 0, x, p)
-        _store_row(moments, y, _MOMENTS, pitch, 1, x, t)
-        _store_row(moments, y, _MOMENTS, pitch, 2, x, fma(p, p, t * t))
-        _store_row(moments, y, _MOMENTS, pitch, 3, x, p * t)
+        store(moments, start + x, p)
+        store(moments, start + pitch + x, t)
+        store(moments, start + 2 * pitch + x, fma(p, p, t * t))
+        store(moments, start + 3 * pitch + x, p * t)
 
 
 @inline
-def _filter_down(rows: Floats, y: int, maps: int, pitch: int, out: Floats) -> None:
-    """Filter the 11 rows that end with `y` into one."""
-    start = (y + 1) % _TAPS * maps * pitch
-    for x in range(0, maps * pitch, WIDTH):
-        store(out, x, _weighted(rows, start + x, maps * pitch))
-
-
-@inline
-def _store_derivatives(filtered: Floats, inside: Floats, y: int, pitch: int, derivatives: Floats, ssim: Floats) -> None:
-    """SSIM of row `y` and its derivatives with respect to the moments; zero where `inside` is.
+def _store_derivatives(
+    filtered: Floats, row: int, inside: Floats, pitch: int, derivatives: Floats, start: int, ssim: Floats
+) -> None:
+    """SSIM of a row and its derivatives with respect to the moments; zero where `inside` is.
 
     With A1 = 2 mu_p mu_t + C1, A2 = 2 cov + C2, B1 = mu_p^2 + mu_t^2 + C1, B2 = var_p + var_t + C2 it is
     S = A1 A2 / (B1 B2). What is stored lacks the factor 2 that all terms of the gradient share: its weight has it.
     """
     for x in range(0, pitch, WIDTH):
-        mean_p, mean_t = _weighted(filtered, x, 1), _weighted(filtered, x + pitch, 1)
-        squares, product = _weighted(filtered, x + 2 * pitch, 1), _weighted(filtered, x + 3 * pitch, 1)
+        mean_p, mean_t = _filter_across(filtered, row + x), _filter_across(filtered, row + pitch + x)
+        squares, product = _filter_across(filtered, row + 2 * pitch + x), _filter_across(filtered, row + 3 * pitch + x)
         mean_product, mean_squares = mean_p * mean_t, fma(mean_p, mean_p, mean_t * mean_t)
         a1, a2 = fma(2.0, mean_product, C1), fma(2.0, product - mean_product, C2)
         b1, b2 = mean_squares + C1, squares - mean_squares + C2
@@ -118,27 +132,33 @@ def _store_derivatives(filtered: Floats, inside: Floats, y: int, pitch: int, der
         by_product = a1 * inverse
         s = a2 * by_product
         store(ssim, x, s)
-        _store_row(derivatives, y, _DERIVATIVES, pitch, 0, x, fma(mean_t, a2 - a1, mean_p * s * (b1 - b2)) * inverse)
-        _store_row(derivatives, y, _DERIVATIVES, pitch, 1, x, -s * b1 * inverse)
-        _store_row(derivatives, y, _DERIVATIVES, pitch, 2, x, by_product)
+        store(derivatives, start + x, fma(mean_t, a2 - a1, mean_p * s * (b1 - b2)) * inverse)
+        store(derivatives, start + pitch + x, -s * b1 * inverse)
+        store(derivatives, start + 2 * pitch + x, by_product)
 
 
 @inline
 def _store_gradient(
-    filtered: Floats, moments: Floats, y: int, pitch: int, weights: tuple[float, float], l1_sum: Floats, row: Floats
+    filtered: Floats,
+    row: int,
+    moments: Floats,
+    start: int,
+    pitch: int,
+    weights: tuple[float, float],
+    l1_sum: Floats,
+    out: Floats,
 ) -> None:
-    """One row of the gradient; p and t are those of the first of the 11 rows of moments that end with `y`."""
+    """One row of the gradient; adds |p - t| to `l1_sum`."""
     l1_weight, ssim_weight = weights
-    plus, minus = splat(row, l1_weight), splat(row, -l1_weight)
-    start = (y + 1) % _TAPS * _MOMENTS * pitch + 2 * RADIUS
+    plus, minus = splat(out, l1_weight), splat(out, -l1_weight)
     for x in range(0, pitch - 2 * WIDTH + 1, WIDTH):
         p, t = load(moments, start + x), load(moments, start + pitch + x)
-        by_mean = _weighted(filtered, x, 1)
-        by_square, by_product = _weighted(filtered, x + pitch, 1), _weighted(filtered, x + 2 * pitch, 1)
+        by_mean, by_square = _filter_across(filtered, row + x), _filter_across(filtered, row + pitch + x)
+        by_product = _filter_across(filtered, row + 2 * pitch + x)
         difference = p - t
         store(l1_sum, x, load(l1_sum, x) + absolute(difference))
         by_l1 = select(difference > 0.0, plus, select(difference < 0.0, minus, 0.0))
-        store(row, x, fma(ssim_weight, fma(p, by_square, fma(t, by_product, by_mean)), by_l1))
+        store(out, x, fma(ssim_weight, fma(p, by_square, fma(t, by_product, by_mean)), by_l1))
 
 
 @inline
@@ -179,9 +199,9 @@ def _photometric_kernel(
     """Gradient (c, h, w), and for each block the sums of |p - t| and of SSIM, (blocks, 2)."""
     _, height, width = prediction.shape
     dtype = prediction.dtype
-    moments = np.empty(2 * _TAPS * _MOMENTS * pitch, dtype)
-    derivatives = np.empty(2 * _TAPS * _DERIVATIVES * pitch, dtype)
-    filtered = np.zeros(_MOMENTS * pitch + WIDTH, dtype)
+    wide, narrow = _MOMENTS * pitch, _DERIVATIVES * pitch
+    moments, derivatives = np.zeros(4 * _GROUP * wide, dtype), np.zeros(4 * _GROUP * narrow, dtype)
+    filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
     p_row, t_row, row = np.empty(pitch, dtype), np.empty(pitch, dtype), np.empty(pitch, dtype)
     inside, nothing = np.empty(pitch, dtype), np.zeros(pitch, dtype)
     l1_sum, ssim_sum = np.empty(pitch, dtype), np.empty(pitch, dtype)
@@ -195,22 +215,30 @@ def _photometric_kernel(
         # Summed by column first: vectors, in a fixed order, and precise enough in float32.
         l1_sum[:] = 0
         ssim_sum[:] = 0
-        for y in range(top - 2 * RADIUS, bottom + 2 * RADIUS):
-            _copy_row(prediction[channel], y, left, first, last, p_row)
-            _copy_row(target[channel], y, left, first, last, t_row)
-            _store_moments(p_row, t_row, y, pitch, moments)
-            if y < top:
+        for group, y in enumerate(range(top - 2 * RADIUS, bottom + 2 * RADIUS, _GROUP)):
+            ring = group % 4 * _GROUP
+            for i in range(_GROUP):
+                _copy_row(prediction[channel], y + i, left, first, last, p_row)
+                _copy_row(target[channel], y + i, left, first, last, t_row)
+                _store_moments(p_row, t_row, pitch, moments, (ring + i) * wide)
+            if y + _GROUP <= top:
                 continue
-            centre, out = y - RADIUS, y - 2 * RADIUS
-            _filter_down(moments, y, _MOMENTS, pitch, filtered)
-            visible = inside if 0 <= centre < height else nothing
-            _store_derivatives(filtered, visible, centre, pitch, derivatives, row)
-            if top <= centre < bottom:
-                _add_row(ssim_sum, row, pitch)
-            if out >= top:
-                _filter_down(derivatives, centre, _DERIVATIVES, pitch, filtered)
-                _store_gradient(filtered, moments, y, pitch, weights, l1_sum, row)
-                gradient[channel, out, start:stop] = row[: stop - start]
+            _filter_down(moments, group, wide, filtered)
+            for i in range(_GROUP):
+                centre = y - RADIUS + i
+                visible = inside if 0 <= centre < height else nothing
+                _store_derivatives(filtered, i * wide, visible, pitch, derivatives, (ring + i) * narrow, row)
+                if top <= centre < bottom:
+                    _add_row(ssim_sum, row, pitch)
+            if y + _GROUP <= top + 2 * RADIUS:
+                continue
+            _filter_down(derivatives, group, narrow, filtered)
+            for i in range(_GROUP):
+                out = y - 2 * RADIUS + i
+                if top <= out < bottom:
+                    there = ((group * _GROUP + i - 2 * RADIUS) % (4 * _GROUP)) * wide + 2 * RADIUS
+                    _store_gradient(filtered, i * narrow, moments, there, pitch, weights, l1_sum, row)
+                    gradient[channel, out, start:stop] = row[: stop - start]
         sums[task, 0], sums[task, 1] = 0, 0
         for x in range(stop - start):
             sums[task, 0] += l1_sum[x]
@@ -223,15 +251,11 @@ def _ssim_kernel(
 ) -> None:
     """SSIM of each pixel, (c, h, w)."""
     width, dtype = prediction.shape[2], prediction.dtype
-    moments = np.empty(2 * _TAPS * _MOMENTS * pitch, dtype)
-    unused = np.empty(2 * _TAPS * _DERIVATIVES * pitch, dtype)
-    filtered = np.zeros(_MOMENTS * pitch + WIDTH, dtype)
-    p_row, t_row, row, inside = (
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-        np.empty(pitch, dtype),
-    )
+    wide = _MOMENTS * pitch
+    moments, unused = np.zeros(4 * _GROUP * wide, dtype), np.zeros(_DERIVATIVES * pitch, dtype)
+    filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
+    p_row, t_row = np.empty(pitch, dtype), np.empty(pitch, dtype)
+    inside, row = np.empty(pitch, dtype), np.empty(pitch, dtype)
     while True:
         task = fetch_add(counter, 1)
         if task >= len(blocks):
@@ -239,15 +263,19 @@ def _ssim_kernel(
         channel, top, bottom, start, stop = blocks[task]
         left, first, last = start - 2 * RADIUS, max(start - 2 * RADIUS, 0), min(stop + 2 * RADIUS, width)
         _mark_inside(start - RADIUS, width, inside)
-        for y in range(top - RADIUS, bottom + RADIUS):
-            _copy_row(prediction[channel], y, left, first, last, p_row)
-            _copy_row(target[channel], y, left, first, last, t_row)
-            _store_moments(p_row, t_row, y, pitch, moments)
-            centre = y - RADIUS
-            if centre >= top:
-                _filter_down(moments, y, _MOMENTS, pitch, filtered)
-                _store_derivatives(filtered, inside, centre, pitch, unused, row)
-                ssim[channel, centre, start:stop] = row[RADIUS : RADIUS + stop - start]
+        for group, y in enumerate(range(top - RADIUS, bottom + RADIUS, _GROUP)):
+            for i in range(_GROUP):
+                _copy_row(prediction[channel], y + i, left, first, last, p_row)
+                _copy_row(target[channel], y + i, left, first, last, t_row)
+                _store_moments(p_row, t_row, pitch, moments, (group % 4 * _GROUP + i) * wide)
+            if y + _GROUP <= top + RADIUS:
+                continue
+            _filter_down(moments, group, wide, filtered)
+            for i in range(_GROUP):
+                centre = y - RADIUS + i
+                if top <= centre < bottom:
+                    _store_derivatives(filtered, i * wide, inside, pitch, unused, 0, row)
+                    ssim[channel, centre, start:stop] = row[RADIUS : RADIUS + stop - start]
 
 
 @lru_cache(maxsize=64)
@@ -256,7 +284,8 @@ def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
 
     It depends on nothing but the size, so that sums over blocks have the same bits for any number of threads.
     """
-    strips, columns = -(-height // _STRIP_ROWS), -(-width // _BLOCK_COLUMNS)
+    # An even number, so that two threads get the same work.
+    strips, columns = 2 * -(-height // (2 * _STRIP_ROWS)), -(-width // _BLOCK_COLUMNS)
     blocks = [
         (channel, i * height // strips, (i + 1) * height // strips, j * width // columns, (j + 1) * width // columns)
         for channel in range(channels)
@@ -287,18 +316,16 @@ def _check(prediction: Tensor, target: Tensor) -> None:
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        images = prediction.detach().contiguous(), target.contiguous()
+        images = [image.detach().contiguous().numpy() for image in (prediction, target)]
         count = prediction.numel()
-        gradient = torch.empty_like(images[0])
+        gradient = empty(count, images[0].dtype).reshape(prediction.shape)
         blocks, pitch = _blocks(*prediction.shape)
         sums = np.empty((len(blocks), 2))
         # The mean of 1 - SSIM, and the factor 2 that the stored derivatives lack.
         weights = (1 - ssim_weight) / count, -2 * ssim_weight / count
-        parallel(
-            _photometric_kernel, blocks, pitch, images[0].numpy(), images[1].numpy(), weights, gradient.numpy(), sums
-        )
+        parallel(_photometric_kernel, blocks, pitch, *images, weights, gradient, sums)
         l1, ssim = sums.sum(axis=0) / count
-        ctx.save_for_backward(gradient)
+        ctx.save_for_backward(torch.from_numpy(gradient))
         return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
 
     @staticmethod
@@ -309,7 +336,7 @@ class _PhotometricLoss(torch.autograd.Function):
         return (gradient if grad_loss.item() == 1 else gradient * grad_loss), None, None
 
 
-def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
     """(1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once with respect to the prediction.
 
     Args:
@@ -339,10 +366,10 @@ def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
         UserInputError: the images differ in shape or type, or are not float32 or float64 on the CPU.
     """
     _check(prediction, target)
-    images = prediction.detach().contiguous(), target.detach().contiguous()
-    ssim = torch.empty_like(images[0])
-    parallel(_ssim_kernel, *_blocks(*prediction.shape), images[0].numpy(), images[1].numpy(), ssim.numpy())
-    return ssim
+    images = [image.detach().contiguous().numpy() for image in (prediction, target)]
+    ssim = np.empty_like(images[0])
+    parallel(_ssim_kernel, *_blocks(*prediction.shape), *images, ssim)
+    return torch.from_numpy(ssim)
 
 
 def ssim_cpu(prediction: Tensor, target: Tensor) -> Tensor:

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.reference_raster._jit import jit
-from lapgs_plugin.reference_raster.lanes import at, fetch_add
+from lapgs_plugin.reference_raster._jit import inline, jit
+from lapgs_plugin.reference_raster.lanes import at, fetch_add, prefetch
 
 DIGIT_BITS = 11
 """Bits that one round of the radix sort looks at."""
 DIGITS = 1 << DIGIT_BITS
+
+
+AHEAD = 16
+"""How many splats ahead of their use the cache is asked for them."""
+
+
+@inline
+def _box(boxes: NDArray[np.int32], i: int) -> tuple[int, int, int, int]:
+    """First tile across and down, one past the last across and down."""
+    return (
+        at(boxes, 4 * i), at(boxes, 4 * i + 1),
+        at(boxes, 4 * i + 2), at(boxes, 4 * i + 3),
+    )  # fmt: skip
 
 
 @jit
@@ -18,17 +33,17 @@ def count_pairs(n: int, boxes: NDArray[np.int32], first_pair: NDArray[np.int64])
     """Number the pairs of a splat and a tile, splat after splat.
 
     Args:
-        boxes: (4 * m,) tiles covered: first across, first down, one past the last across, down.
+        boxes: (m * 4,) tiles covered: first across, first down, one past the last across, down.
         first_pair: (n + 1,) filled with the number of each splat's first pair, then their total.
 
     Returns:
         Splats that cover a tile.
     """
-    m = boxes.size // 4
     total, shown = 0, 0
     for i in range(n):
         first_pair[i] = total
-        area = (boxes[i + 2 * m] - boxes[i]) * np.int64(boxes[i + 3 * m] - boxes[i + m])
+        left, top, right, bottom = _box(boxes, i)
+        area = (right - left) * (bottom - top)
         if area > 0:
             total += area
             shown += 1
@@ -39,11 +54,11 @@ def count_pairs(n: int, boxes: NDArray[np.int32], first_pair: NDArray[np.int64])
 @jit
 def sort_by_depth(
     first_pair: NDArray[np.int64],  # (n + 1,)
-    keys: NDArray[np.unsignedinteger],  # (n,) bits of the depths: positive floats sort as integers
+    keys: NDArray[Any],  # (n,) bits of the depths: positive floats sort as integers
     order: NDArray[np.int32],  # (shown,) filled: splats that cover a tile, nearest first, ties by index
     spare: NDArray[np.int32],  # (shown,)
-    sorted_keys: NDArray[np.unsignedinteger],  # (shown,)
-    spare_keys: NDArray[np.unsignedinteger],  # (shown,)
+    sorted_keys: NDArray[Any],  # (shown,)
+    spare_keys: NDArray[Any],  # (shown,)
 ) -> None:
     """Stable radix sort, least significant digit first."""
     rounds = (keys.itemsize * 8 + DIGIT_BITS - 1) // DIGIT_BITS
@@ -68,10 +83,10 @@ def sort_by_depth(
             total += count
         for i in range(shown):
             key = source_keys[i]
-            digit = np.int64(key >> (r * DIGIT_BITS)) & (DIGITS - 1)
-            target[counts[r, digit]] = source[i]
-            target_keys[counts[r, digit]] = key
-            counts[r, digit] += 1
+            bucket = np.int64(key >> (r * DIGIT_BITS)) & (DIGITS - 1)
+            target[counts[r, bucket]] = source[i]
+            target_keys[counts[r, bucket]] = key
+            counts[r, bucket] += 1
         source, source_keys, target, target_keys = target, target_keys, source, source_keys
     if source is not order:
         order[:] = source
@@ -81,12 +96,11 @@ def sort_by_depth(
 def count_tiles(
     counter: NDArray[np.int64],  # (1,) zero
     order: NDArray[np.int32],  # (shown,)
-    boxes: NDArray[np.int32],  # (4 * m,)
+    boxes: NDArray[np.int32],  # (m * 4,)
     tiles_x: int,
     counts: NDArray[np.int64],  # (chunks, tiles) zero
 ) -> None:
     """How many splats of each chunk of the order cover each tile."""
-    m = boxes.size // 4
     chunks = counts.shape[0]
     while True:
         chunk = fetch_add(counter, 1)
@@ -94,9 +108,10 @@ def count_tiles(
             break
         row = counts[chunk]
         for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
-            i = np.int64(at(order, rank))
-            for y in range(at(boxes, i + m), at(boxes, i + 3 * m)):
-                for x in range(at(boxes, i), at(boxes, i + 2 * m)):
+            prefetch(boxes, 4 * at(order, min(rank + AHEAD, order.size - 1)))
+            left, top, right, bottom = _box(boxes, at(order, rank))
+            for y in range(top, bottom):
+                for x in range(left, right):
                     row[y * tiles_x + x] += 1
 
 
@@ -122,7 +137,7 @@ def start_tiles(counts: NDArray[np.int64], tile_start: NDArray[np.int64]) -> Non
 def deal_to_tiles(
     counter: NDArray[np.int64],  # (1,) zero
     order: NDArray[np.int32],  # (shown,)
-    boxes: NDArray[np.int32],  # (4 * m,)
+    boxes: NDArray[np.int32],  # (m * 4,)
     tiles_x: int,
     starts: NDArray[np.int64],  # (chunks, tiles), used up
     first_pair: NDArray[np.int64],  # (n + 1,)
@@ -130,7 +145,6 @@ def deal_to_tiles(
     places: NDArray[np.int32],  # (pairs,) filled: where in `members` each splat's pairs are, splat after splat
 ) -> None:
     """Stable counting sort of the pairs by tile."""
-    m = boxes.size // 4
     chunks = starts.shape[0]
     while True:
         chunk = fetch_add(counter, 1)
@@ -138,10 +152,14 @@ def deal_to_tiles(
             break
         row = starts[chunk]
         for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
-            i = np.int64(at(order, rank))
+            coming = at(order, min(rank + AHEAD, order.size - 1))
+            prefetch(boxes, 4 * coming)
+            prefetch(first_pair, coming)
+            i = at(order, rank)
             pair = at(first_pair, i)
-            for y in range(at(boxes, i + m), at(boxes, i + 3 * m)):
-                for x in range(at(boxes, i), at(boxes, i + 2 * m)):
+            left, top, right, bottom = _box(boxes, i)
+            for y in range(top, bottom):
+                for x in range(left, right):
                     place = row[y * tiles_x + x]
                     row[y * tiles_x + x] = place + 1
                     members[place] = i

@@ -227,8 +227,8 @@ def make_view(
     """
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     limits = JACOBIAN_LIMIT * width / (2 * focal[0]), JACOBIAN_LIMIT * height / (2 * focal[1])
-    parts = [rotation.ravel(), translation, -rotation.T @ translation, focal, principal, limits]
-    return View(width, height, np.concatenate(parts).astype(world_to_camera.dtype))
+    values = [*rotation.ravel(), *translation, *(-rotation.T @ translation), *focal, *principal, *limits]
+    return View(width, height, np.array(values, world_to_camera.dtype))
 
 
 def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, int]:
@@ -262,5 +262,8 @@ def _order(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles
 
 @lru_cache
 def offsets(kind: Any) -> Floats:
-    """`tile_kernels.pixel_offsets` of a float type."""
-    return tile_kernels.pixel_offsets(kind)
+    """`tile_kernels.pixel_offsets` of a float type, aligned for vector loads."""
+    unaligned = tile_kernels.pixel_offsets(kind)
+    aligned = empty(unaligned.size, kind)
+    np.copyto(aligned, unaligned)
+    return aligned

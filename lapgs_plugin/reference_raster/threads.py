@@ -1,10 +1,10 @@
 """Threads for kernels: a pool of our own, beside PyTorch's.
 
-`parallel(kernel, ...)` runs one kernel on several threads at once. Each draws pieces of work from a shared counter until
-none is left, so that the result depends neither on the number of threads nor on who did what. The calling thread works
-too and waits only for threads that have begun; a pool that is late, busy with another caller's kernel or gone after a
-fork costs speed, never a result. Nothing here is bound to an OpenMP or TBB library, and any number of Python threads
-may render at the same time.
+`parallel(kernel, ...)` runs one kernel on several threads at once. Each draws pieces of work from a shared counter
+until none is left, so that the result depends neither on the number of threads nor on who did what. The calling thread
+works too and waits only for threads that have begun; a pool that is late, busy with another caller's kernel or gone
+after a fork costs speed, never a result. Nothing here is bound to an OpenMP or TBB library, and any number of Python
+threads may render at the same time.
 
 PyTorch's OpenMP threads are the trouble. GNU OpenMP, on Linux, lets them spin for about ten milliseconds after each
 operation that ran in parallel (on a tensor of 32768 elements or more), on the cores that the next kernel needs. The

@@ -10,9 +10,9 @@ elementary result (a dot product of a few terms); each quantity gets the bound t
 including cancellation: a needle's 2D determinant, say, is known far less well than its entries. A pixel is masked when,
 before the transmittance has surely fallen under its limit, for any Gaussian
     - alpha is within its bound of 1/255, or of the cap 0.99 and not surely over it,
-    - the exponent's sign is open (an indefinite conic is skipped),
     - the transmittance is within its bound of 1e-4,
     - it is in the pixel's tile or not depending on the bounds of centre, radius (rounded up) and depth (culled at 0.2),
+      or its determinant may be 0 (culled) or negative (skipped where the exponent turns positive),
     - the next Gaussian that contributes is not surely behind it. Exactly equal centres are not masked: their depths are
       computed from the same numbers, so they tie in any implementation and the index decides.
 Of a Gaussian the radius may be open, and its gradient where it has a kink: a colour channel at the clamp, or a centre
@@ -183,7 +183,7 @@ class _Shapes:
         conics: (v, 3) xx, xy, yy of the inverse covariance.
         conic_errors: (v,) relative error of the quadratic form with this conic.
         smallest_radii, largest_radii: (v,) whole pixels.
-        degenerate: (v,) True where the determinant may round to 0.
+        degenerate: (v,) True where the determinant may round to 0 or below.
     """
 
     conics: Tensor
@@ -290,7 +290,7 @@ def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixel
     Returns:
         (p,) bool.
     """
-    low, middle, high, sign_open = _alphas(bounded, members, pixels, tolerance)  # (p, k) each
+    low, middle, high = _alphas(bounded, members, pixels, tolerance)  # (p, k) each
     maybe_visible = high >= MIN_ALPHA  # (p, k)
     alpha = torch.where(maybe_visible, middle.clamp(max=MAX_ALPHA), 0)  # (p, k)
     alpha_errors = torch.where(maybe_visible, high.clamp(max=MAX_ALPHA) - low.clamp(max=MAX_ALPHA), 0)  # (p, k)
@@ -300,7 +300,7 @@ def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixel
     before_errors = torch.cat([torch.zeros_like(behind[:, :1]), behind_errors[:, :-1]], dim=1)  # (p, k)
     reached = before * (1 + before_errors) >= MIN_TRANSMITTANCE  # (p, k)
 
-    presence = (low < MIN_ALPHA) | sign_open | ~surely_here  # (p, k)
+    presence = (low < MIN_ALPHA) | ~surely_here  # (p, k)
     at_cap = (low <= MAX_ALPHA) & (high >= MAX_ALPHA)  # (p, k)
     at_stop = (behind - MIN_TRANSMITTANCE).abs() <= behind * behind_errors  # (p, k)
     decisions = presence | at_cap | at_stop | _ties(bounded, members, maybe_visible)  # (p, k)
@@ -308,7 +308,7 @@ def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixel
 
 
 def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float) -> tuple[Tensor, ...]:
-    """o exp(-q) before the cap: lower bound, value, upper bound, and whether the sign of q is open; (p, k) each."""
+    """o exp(-q) before the cap: lower bound, value and upper bound; (p, k) each."""
     dx, dy = (bounded.means2d[members] - pixels[:, None]).unbind(-1)  # (p, k) each
     xx, xy, yy = bounded.conics[members].unbind(-1)  # (k,) each
     q = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (p, k)
@@ -319,7 +319,7 @@ def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float
     opacities, relative = bounded.opacities[members], bounded.opacity_errors[members]  # (k,) each
     low = opacities * (1 - relative) * torch.exp(-q - q_errors)  # (p, k)
     high = opacities * (1 + relative) * torch.exp((q_errors - q).clamp(max=0))  # (p, k)
-    return low, opacities * torch.exp(-q), high, q < tolerance * terms
+    return low, opacities * torch.exp(-q), high
 
 
 def _ties(bounded: _Bounded, members: Tensor, visible: Tensor) -> Tensor:

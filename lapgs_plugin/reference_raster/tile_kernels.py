@@ -25,14 +25,18 @@ from lapgs_plugin.reference_raster.lanes import (
     any_lane,
     at,
     bits,
+    borrowed,
     broadcast,
     exp2,
     fetch_add,
     fma,
+    keep_alive,
     load,
     lowest_bit,
     maximum,
     minimum,
+    prefetch,
+    put,
     select,
     splat,
     store,
@@ -65,6 +69,9 @@ from lapgs_plugin.reference_raster.layout import (
 BATCH = 256
 """Splats that are dealt to the blocks of a tile at a time; their lists stay in the level-1 cache."""
 
+AHEAD = 8
+"""How many splats ahead of their use the cache is asked for them."""
+
 # Vectors of a block's state, forward: transmittance (negative once the pixel is opaque or if it is outside of the
 # image), colour, and how far down the tile's list the last blended splat is, counted from 1.
 _T, _R, _G, _B, _LAST, _FORWARD = range(6)
@@ -76,7 +83,7 @@ FINAL = 2 * TILE_PIXELS
 
 
 def pixel_offsets(dtype: type[np.floating]) -> Floats:
-    """Coordinates relative to their tile: of each block's pixels (x, then y), then of the blocks' corners (x, then y)."""
+    """Coordinates relative to their tile: of each block's pixels (x, then y), then of all blocks' corners (x, y)."""
     corner_y, corner_x = (axis.ravel() * BLOCK for axis in np.indices((TILE // BLOCK, TILE // BLOCK)))  # (16,) each
     y, x = (axis.ravel() for axis in np.indices((BLOCK, BLOCK)))  # (16,) each
     pixels = np.stack([corner_x[:, None] + x, corner_y[:, None] + y], axis=1)  # (16, 2, 16)
@@ -84,6 +91,14 @@ def pixel_offsets(dtype: type[np.floating]) -> Floats:
 
 
 _CORNERS = 2 * TILE_PIXELS
+
+
+@inline
+def _aligned(size: int, like: Floats) -> Floats:
+    """Uninitialised floats whose vectors do not straddle lines of the cache."""
+    memory = np.empty(size + WIDTH, like.dtype)
+    start = -memory.ctypes.data % (WIDTH * memory.itemsize) // memory.itemsize
+    return memory[start : start + size]
 
 
 @inline
@@ -145,12 +160,14 @@ def blend(
     final: Floats,  # (tiles * FINAL,)
 ) -> None:
     """Blend all splats front to back over the background."""
-    state = np.empty(_FORWARD * TILE_PIXELS, splats.dtype)
-    lists = np.empty(BLOCKS * BATCH, np.int64)
-    counts = np.empty(BLOCKS, np.int64)
+    tiles = reached.size
+    scratch, integers = _aligned(_FORWARD * TILE_PIXELS, splats), np.empty(BLOCKS * (BATCH + 1), np.int64)
+    state, lists, counts = borrowed(scratch), borrowed(integers), borrowed(integers[BLOCKS * BATCH :])
+    splats, background, offsets, members = borrowed(splats), borrowed(background), borrowed(offsets), borrowed(members)
+    image, transmittance, hits, final = borrowed(image), borrowed(transmittance), borrowed(hits), borrowed(final)
     while True:
         tile = fetch_add(counter, 1)
-        if tile >= reached.size:
+        if tile >= tiles:
             break
         tile_y, tile_x = divmod(tile, tiles_x)
         alive = _open_tile(state, offsets, tile_x, tile_y, width, height)
@@ -168,7 +185,8 @@ def blend(
                     alive &= ~(1 << block)
                     if keep:
                         for j in range(done, at(counts, block)):
-                            hits[at(lists, block * BATCH + j)] &= ~(1 << block)
+                            pair = at(lists, block * BATCH + j)
+                            put(hits, pair, at(hits, pair) & ~(1 << block))
             batch += size
         if keep:
             reached[tile] = batch - start
@@ -177,6 +195,8 @@ def blend(
                 store(final, place, absolute(load(state, (_FORWARD * block + _T) * WIDTH)))
                 store(final, place + WIDTH, load(state, (_FORWARD * block + _LAST) * WIDTH))
         _close_tile(state, background, tile_x, tile_y, width, height, image, transmittance)
+    keep_alive(scratch)
+    keep_alive(integers)
 
 
 @inline
@@ -212,16 +232,19 @@ def _deal_to_blocks(
     """List the pairs from `batch` on by the blocks that they reach."""
     left, top = load(offsets, _CORNERS) + tile_x * TILE, load(offsets, _CORNERS + WIDTH) + tile_y * TILE
     for block in range(BLOCKS):
-        counts[block] = 0
+        put(counts, block, 0)
+    last = batch + size - 1
     for pair in range(batch, batch + size):
-        reached = _blocks_reached(splats, np.int64(at(members, pair)) * SPLAT, left, top) & alive
+        prefetch(splats, at(members, min(pair + AHEAD, last)) * SPLAT)
+        reached = _blocks_reached(splats, at(members, pair) * SPLAT, left, top) & alive
         if keep:
-            hits[pair] = reached
+            put(hits, pair, reached)
         while reached != 0:
             block = lowest_bit(reached)
             reached &= reached - 1
-            lists[block * BATCH + at(counts, block)] = pair
-            counts[block] += 1
+            count = at(counts, block)
+            put(lists, block * BATCH + count, pair)
+            put(counts, block, count + 1)
 
 
 @inline
@@ -251,7 +274,7 @@ def _blend_block(
     done = -1
     for j in range(at(counts, block)):
         pair = at(lists, block * BATCH + j)
-        s = np.int64(at(members, pair)) * SPLAT
+        s = at(members, pair) * SPLAT
         dx, dy = x - broadcast(splats, s + CENTRE_X), y - broadcast(splats, s + CENTRE_Y)
         u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
         v = dy * broadcast(splats, s + FACTOR_YY)
@@ -264,7 +287,7 @@ def _blend_block(
         red = fma(weight, broadcast(splats, s + RED), red)
         green = fma(weight, broadcast(splats, s + GREEN), green)
         blue = fma(weight, broadcast(splats, s + BLUE), blue)
-        last = select(blended, splat(splats, np.float64(pair - start + 1)), last)
+        last = select(blended, splat(splats, pair - start + 1), last)
         t = select(blended, behind, select(visible, minimum(t, -t), t))
         if not any_lane(t > 0.0):
             done = j + 1
@@ -304,10 +327,10 @@ def _close_tile(
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
                 lane = place + row * BLOCK + column
-                transmittance[pixel] = at(state, lane + _T * WIDTH)
-                image[pixel] = at(state, lane + _R * WIDTH)
-                image[pixels + pixel] = at(state, lane + _G * WIDTH)
-                image[2 * pixels + pixel] = at(state, lane + _B * WIDTH)
+                put(transmittance, pixel, at(state, lane + _T * WIDTH))
+                put(image, pixel, at(state, lane + _R * WIDTH))
+                put(image, pixels + pixel, at(state, lane + _G * WIDTH))
+                put(image, 2 * pixels + pixel, at(state, lane + _B * WIDTH))
 
 
 # ------------------------------------------------------------------------------------------------ backward
@@ -332,14 +355,19 @@ def blend_backward(
     slots: Floats,  # (pairs * SLOT,) filled: see `layout.SLOT`
 ) -> None:
     """Gradient of each splat in each tile."""
-    state = np.empty(_BACKWARD * TILE_PIXELS, splats.dtype)
+    tiles, by_transmittance = reached.size, grad_transmittance.size > 0
+    scratch = _aligned(_BACKWARD * TILE_PIXELS, splats)
+    state, splats, background, offsets = borrowed(scratch), borrowed(splats), borrowed(background), borrowed(offsets)
+    members, hits, final, slots = borrowed(members), borrowed(hits), borrowed(final), borrowed(slots)
+    grad_image, grad_transmittance = borrowed(grad_image), borrowed(grad_transmittance)
     while True:
         tile = fetch_add(counter, 1)
-        if tile >= reached.size:
+        if tile >= tiles:
             break
         tile_y, tile_x = divmod(tile, tiles_x)
         _reopen_tile(
-            state, tile, tile_x, tile_y, width, height, background, final, grad_image, grad_transmittance
+            state, tile, tile_x, tile_y, width, height, background, final, grad_image, grad_transmittance,
+            by_transmittance,
         )  # fmt: skip
         start = at(tile_start, tile)
         end = start + at(reached, tile)
@@ -347,11 +375,13 @@ def blend_backward(
         for pair in range(end, at(tile_start, tile + 1)):
             store(slots, pair * SLOT, none)
         for pair in range(end - 1, start - 1, -1):
-            blocks = np.int64(at(hits, pair))
+            prefetch(splats, at(members, max(pair - AHEAD, start)) * SPLAT)
+            blocks = at(hits, pair)
             if blocks == 0:
                 store(slots, pair * SLOT, none)
             else:
                 _splat_backward(pair, start, members, splats, offsets, tile_x, tile_y, blocks, state, slots)
+    keep_alive(scratch)
 
 
 @inline
@@ -366,6 +396,7 @@ def _reopen_tile(
     final: Floats,
     grad_image: Floats,
     grad_transmittance: Floats,
+    by_transmittance: bool,
 ) -> None:
     """Put the pixels into the state behind the last splat; those outside of the image have no gradient."""
     pixels = width * height
@@ -380,11 +411,11 @@ def _reopen_tile(
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
                 lane = place + row * BLOCK + column
-                state[lane + _GRAD_R * WIDTH] = at(grad_image, pixel)
-                state[lane + _GRAD_G * WIDTH] = at(grad_image, pixels + pixel)
-                state[lane + _GRAD_B * WIDTH] = at(grad_image, 2 * pixels + pixel)
-                if grad_transmittance.size > 0:
-                    state[lane + _REST * WIDTH] = at(grad_transmittance, pixel)
+                put(state, lane + _GRAD_R * WIDTH, at(grad_image, pixel))
+                put(state, lane + _GRAD_G * WIDTH, at(grad_image, pixels + pixel))
+                put(state, lane + _GRAD_B * WIDTH, at(grad_image, 2 * pixels + pixel))
+                if by_transmittance:
+                    put(state, lane + _REST * WIDTH, at(grad_transmittance, pixel))
         t = load(final, tile * FINAL + 2 * block * WIDTH)
         rest = load(state, place + _REST * WIDTH)
         for channel in range(3):
@@ -413,12 +444,9 @@ def _splat_backward(
     by the transmittance behind it times that transmittance, the derivative by alpha is T c - R / (1 - alpha), and in
     front of the splat R is more by alpha T c.
     """
-    s = np.int64(at(members, pair)) * SPLAT
-    centre_x, centre_y = broadcast(splats, s + CENTRE_X), broadcast(splats, s + CENTRE_Y)
-    xx, xy, yy = broadcast(splats, s + FACTOR_XX), broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
-    log2_opacity = broadcast(splats, s + LOG2_OPACITY)
-    red, green, blue = broadcast(splats, s + RED), broadcast(splats, s + GREEN), broadcast(splats, s + BLUE)
-    position = splat(splats, np.float64(pair - start + 1))
+    s = at(members, pair) * SPLAT
+    xy, yy = broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
+    position = splat(splats, pair - start + 1)
     none = splat(splats, 0.0)
     sum_red, sum_green, sum_blue = none, none, none
     sum_1, sum_u, sum_v, sum_uu, sum_uv, sum_vv = none, none, none, none, none, none
@@ -427,10 +455,12 @@ def _splat_backward(
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         place = _BACKWARD * block * WIDTH
-        dx, dy = _pixels_x(offsets, block, tile_x) - centre_x, _pixels_y(offsets, block, tile_y) - centre_y
-        u = fma(dx, xx, dy * xy)
+        # Read again in each block, where a register held for long would be spilled.
+        dx = _pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
+        dy = _pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
+        u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * xy)
         v = dy * yy
-        exponent = fma(-u, u, fma(-v, v, log2_opacity))
+        exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
         density = exp2(exponent)
         alpha = minimum(density, MAX_ALPHA)
         blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, place + _FINAL * WIDTH) >= position)
@@ -440,11 +470,12 @@ def _splat_backward(
             load(state, place + _GRAD_G * WIDTH),
             load(state, place + _GRAD_B * WIDTH),
         )
-        inverse = 1.0 / (1.0 - alpha)
+        inverse = select(blended, 1.0 / (1.0 - alpha), 1.0)
         in_front = t * inverse
-        shade = fma(red, grad_red, fma(green, grad_green, blue * grad_blue))
+        shade = grad_blue * broadcast(splats, s + BLUE)
+        shade = fma(grad_red, broadcast(splats, s + RED), fma(grad_green, broadcast(splats, s + GREEN), shade))
         weight = select(blended, alpha * in_front, 0.0)
-        store(state, place + _T_BEHIND * WIDTH, select(blended, in_front, t))
+        store(state, place + _T_BEHIND * WIDTH, in_front)
         store(state, place + _REST * WIDTH, fma(weight, shade, rest))
         # The cap at 0.99 passes the gradient as if it were not there, as the CUDA code does.
         d = select(blended, density * (fma(t, shade, -rest) * inverse), 0.0)

@@ -7,19 +7,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lapgs_plugin.errors import LapgsError, UserInputError
+import pycolmap
+
+from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.scenes.colmap_binary import check_whole
 
 SCENE_ENTRIES = frozenset({"images", "sparse"})
 """What a scene folder of ours holds; anything else in it is somebody's work and is never deleted."""
 
 
-def check_output(out: Path, overwrite: bool, own: frozenset[str] = SCENE_ENTRIES) -> None:
+def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
     """Refuse a folder that must not be written to.
 
     Args:
         out: the folder, which may be missing.
-        overwrite: replace what is there, if it is nothing but a scene.
-        own: names of the entries that may be replaced.
+        overwrite: replace the scene that is there.
+        work: name of an entry that may be there in any case: unfinished work of the same command.
 
     Raises:
         UserInputError: `out` is a file, holds a scene and `overwrite` is False, or holds anything else.
@@ -28,8 +31,8 @@ def check_output(out: Path, overwrite: bool, own: frozenset[str] = SCENE_ENTRIES
         return
     if not out.is_dir():
         raise UserInputError(f"{out}: a file, expected a folder or a new name")
-    entries = {entry.name for entry in out.iterdir()}
-    if foreign := sorted(entries - own):
+    entries = {entry.name for entry in out.iterdir()} - {work}
+    if foreign := sorted(entries - SCENE_ENTRIES):
         raise UserInputError(
             f"{out}: it holds {foreign[0]}, expected an empty or new folder; choose another or remove that yourself"
         )
@@ -74,3 +77,26 @@ def one_line_errors(out: Path) -> Iterator[None]:
             f"{out}: the scene cannot be written ({error.strerror or error}); check free space and permissions, then "
             "run the command again"
         ) from error
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write COLMAP's binary files into a new folder.
+
+    Raises:
+        LapgsError: the disk is full.
+    """
+    folder.mkdir(parents=True)
+    model.write_binary(folder)
+    check_written(folder)
+
+
+def check_written(folder: Path) -> None:
+    """Check a model that pycolmap has just written: it does not notice when the disk is full.
+
+    Raises:
+        LapgsError: a file is not whole.
+    """
+    try:
+        check_whole(folder)
+    except SceneError as error:
+        raise LapgsError(f"{folder}: the model was cut short; check free space, then run the command again") from error

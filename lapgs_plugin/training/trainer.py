@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
-from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
+from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.inheritance import field_from_points, inherit
@@ -90,32 +89,23 @@ class Trainer:
             TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
         """
         checkpoint = self.archive.load_checkpoint() if resume else None
-        moments: dict[str, dict[str, Tensor]] | None = None
         with stop_request() as stop:
             try:
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
                         continue
                     here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
-                    moments = self._run_stage(stage, here, moments, stop)
+                    self._run_stage(stage, here, stop)
             finally:
                 self._close_caches()
 
-    def _run_stage(
-        self,
-        stage: Stage,
-        checkpoint: dict[str, Any] | None,
-        moments: dict[str, dict[str, Tensor]] | None,
-        stop: StopRequest,
-    ) -> dict[str, dict[str, Tensor]]:
-        """Train and archive one stage; returns its Adam moments for the next one to inherit."""
+    def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
+        """Train and archive one stage."""
         self._overhead = {} if checkpoint is None else dict(checkpoint["overhead"])
-        run = self._prepare(stage, self._first_model(stage, checkpoint, moments))
+        run = self._prepare(stage, self._first_model(stage, checkpoint))
         if checkpoint is not None:
             run.restore(checkpoint)
         self.archive.rewind_history(stage.level, run.progress.iteration)
-        if checkpoint is None and self.settings.inherit == "full":
-            self._save_checkpoint(run)  # it holds the optimizer state that the next lines inherit from nowhere else
         self.monitor.stage_started(stage, run.progress.iteration + 1)
         self._last_tick = (run.progress.seconds, run.progress.iteration)
         run.hooks.on_stage_start(stage)
@@ -126,11 +116,8 @@ class Trainer:
         run.run(after_iteration)
         run.hooks.on_stage_end(stage)
         self._finish(run)
-        return run.model.optimizer_moments()
 
-    def _first_model(
-        self, stage: Stage, checkpoint: dict[str, Any] | None, moments: dict[str, dict[str, Tensor]] | None
-    ) -> TrainableField:
+    def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
         """The field a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
         torch.manual_seed(self.settings.seed * 1000 + stage.level)  # split positions; the same however we got here
         rates, extent = self.settings.learning_rates, self.scene.extent
@@ -146,12 +133,7 @@ class Trainer:
             )
             model = TrainableField.create(field, rates, extent)
             if self.settings.inherit == "full":
-                if moments is None:
-                    raise RunFolderError(
-                        f"{self.archive.path()}: --inherit full needs the optimizer state of level {stage.level + 1}, "
-                        "which only the checkpoint held, and that is gone; start again with --overwrite"
-                    )
-                model.adopt_moments(moments, kept)
+                model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
@@ -270,7 +252,8 @@ class Trainer:
             overhead_seconds=dict(self._overhead),
             image_size=run.stage.image_size,
         )
-        self.archive.finish_level(record, field)
+        heir_wants_it = self.settings.inherit == "full" and run.stage.level > 0
+        self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:

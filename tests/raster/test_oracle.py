@@ -20,8 +20,17 @@ from tests.raster.scenes import ADVERSARIAL, BLACK, Case
 
 ORACLE = OracleRasterizer()
 
-IMAGE_BOUND = 1e-12  # worst seen 1.4e-14 (needles), 3e-15 elsewhere
-FLOAT32_BOUND = 5e-5  # worst seen 8.4e-6; what rounding of the projection leaves of colours of about 1
+IMAGE_BOUND = 1e-12  # worst seen 4.0e-14 (needles), 5e-15 elsewhere
+FLOAT32_BOUND = 1e-4  # worst seen in 3600 random scenes 1.6e-5, in colours of about 1
+
+
+MAX_MASKED = 0.05
+"""Share of an image that the mask may excuse: it is built on parts of the oracle, and may not hide their faults."""
+
+
+def max_masked(case: Case) -> float:
+    """`MAX_MASKED`, but for the scene whose purpose is a huge Gaussian exactly at the culling depth."""
+    return 0.4 if case.name == "near_plane" else MAX_MASKED
 
 
 def assert_equals_naive(case: Case) -> None:
@@ -29,7 +38,7 @@ def assert_equals_naive(case: Case) -> None:
     with torch.no_grad():
         actual = case.render(ORACLE)
     mask = threshold_mask(case.field, case.camera, sh_degree=case.sh_degree)
-    assert_close_outside(actual.image, expected.image, mask.pixels, IMAGE_BOUND)
+    assert_close_outside(actual.image, expected.image, mask.pixels, IMAGE_BOUND, max_masked=max_masked(case))
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, IMAGE_BOUND)
     assert_radii_close(actual.radii, expected.radii, mask.radii)
     assert actual.radii.dtype == torch.int32
@@ -53,7 +62,7 @@ def test_float32_equals_float64_outside_the_mask(name: str) -> None:
     with torch.no_grad():
         actual, expected = rounded.render(ORACLE), rounded.to(torch.float64).render(ORACLE)
     assert actual.image.dtype == torch.float32
-    assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND)
+    assert_close_outside(actual.image, expected.image, mask.pixels, FLOAT32_BOUND, max_masked=max_masked(rounded))
     assert_close_outside(actual.transmittance, expected.transmittance, mask.pixels, FLOAT32_BOUND)
     assert_radii_close(actual.radii, expected.radii, mask.radii)
 
@@ -82,7 +91,7 @@ def test_order_of_the_gaussians_does_not_matter(case: Case, seed: int) -> None:
         expected = case.render(ORACLE)
         actual = replace(case, field=case.field.with_parameters(shuffled)).render(ORACLE)
     mask = threshold_mask(case.field, case.camera, sh_degree=case.sh_degree)
-    # Sums in another batch may be vectorised differently, hence not torch.equal; worst seen 5.6e-16.
+    # Sums in another batch may be vectorised differently, hence not torch.equal; worst seen 1.1e-16.
     assert_close_outside(actual.image, expected.image, mask.pixels, 1e-13)
     assert torch.equal(actual.radii, expected.radii[shuffle])
 
@@ -136,7 +145,7 @@ def test_moving_the_world_with_the_camera_changes_nothing(case: Case, seed: int)
     with torch.no_grad():
         expected, actual = still.render(ORACLE), replace(still, field=moved, camera=camera).render(ORACLE)
     mask = threshold_mask(case.field, case.camera, sh_degree=0, tolerance=1e-12)
-    assert_close_outside(actual.image, expected.image, mask.pixels, 1e-9)  # worst seen 2e-12, with w near 0.05
+    assert_close_outside(actual.image, expected.image, mask.pixels, 1e-9)  # worst seen 2.1e-14
 
 
 def multiply_quaternions(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

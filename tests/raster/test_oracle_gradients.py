@@ -29,10 +29,10 @@ DIFFERENCE_NOISE = 2e-9
 STEP_TOLERANCE = 4e-5
 """A step moves what is compared with a threshold by no more than this, relatively."""
 
-# Worst seen: element 2.3e-8, row 6.6e-7, L2 1.3e-8, all of them errors of the differences.
-DIFFERENCE_BOUNDS = GradientBounds(element=3e-7, row=1e-5, row_floor=1e-5, relative_l2=2e-7)
-# Worst seen: element 3e-5, row 6e-4, L2 2e-5, by needles; what a float32 conic allows.
-FLOAT32_BOUNDS = GradientBounds(element=3e-4, row=1e-2, row_floor=1e-3, relative_l2=3e-4)
+# Worst seen: element 6.4e-8, row 2.4e-7, L2 5.4e-8, all of them errors of the differences.
+DIFFERENCE_BOUNDS = GradientBounds(element=5e-7, row=3e-6, row_floor=1e-5, relative_l2=5e-7)
+# Worst seen in 3600 random scenes: element 7.3e-4, row 2.9e-2, L2 6.1e-4, by needles; medians are below 1e-5.
+FLOAT32_BOUNDS = GradientBounds(element=5e-3, row=0.1, row_floor=1e-3, relative_l2=5e-3)
 
 
 def small(case: Case) -> Case:
@@ -270,7 +270,7 @@ def test_cap_passes_the_gradient_straight_through() -> None:
                 for sign in (1, -1)
             ]
             expected[i] = sum(s * (up - down) / (2 * STEP) for s, up, down in zip(slopes, *sides, strict=True))
-        assert_elements_close(actual[name], expected.reshape(value.shape), 1e-8, name=name)  # worst seen 4.4e-10
+        assert_elements_close(actual[name], expected.reshape(value.shape), 1e-7, name=name)  # worst seen 4.5e-9
         assert (actual[name][0] != 0).all(), "the textbook's gradient of a capped Gaussian is zero"
 
 

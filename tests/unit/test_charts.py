@@ -42,6 +42,13 @@ def test_points_lie_where_the_axes_say() -> None:
     assert {tick.label: tick.at for tick in chart.x_ticks}["10"] == WIDTH - RIGHT
 
 
+def test_labels_of_close_marks_stand_below_each_other() -> None:
+    line = Series("run", [(0.0, 1.0), (100.0, 1.0)])
+    chart = draw("t", "x", [line], marks=[Mark(0, "level 3"), Mark(50, "level 2"), Mark(55, "level 1")])
+    first, second, third = chart.marks
+    assert first.y == second.y < third.y
+
+
 @pytest.mark.parametrize("points", [[(0.0, 0.0)], [(0.0, 3.0), (1.0, 3.0)], [(2.0, 0.0), (4.0, 0.0)]])
 @pytest.mark.parametrize("from_zero", [True, False])
 def test_flat_and_single_points_are_drawn(points: list[tuple[float, float]], from_zero: bool) -> None:

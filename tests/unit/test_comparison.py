@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from lapgs_plugin.archive import Manifest, SceneReference
-from lapgs_plugin.evaluation.comparison import comparison_rows, unlike
+from lapgs_plugin.evaluation.comparison import Cell, comparison_rows, unlike
 
 
 def metrics(**changes: Any) -> dict[str, Any]:
@@ -42,12 +42,12 @@ def test_rows_of_a_run_and_its_baseline() -> None:
         "num_gaussians": "1.14x",
         "peak_gaussians": "0.50x",
     }
-    assert [cell.text for cell in rows["num_gaussians"].cells] == [
-        "2,600,000 (level 1 1,130,000, level 0 1,470,000)",
-        "2,290,000",
-    ]
+    assert rows["num_gaussians"].cells == (
+        Cell(2_600_000, "2,600,000", ("level 1 1,130,000", "level 0 1,470,000")),
+        Cell(2_290_000, "2,290,000"),
+    )
     assert [cell.value for cell in rows["train_seconds"].cells] == [300.0, 525.0]
-    assert rows["overhead_seconds"].cells[0].text == "3.5 (pyramid 1.5, cache 2.0)"
+    assert rows["overhead_seconds"].cells[0] == Cell(3.5, "3.5", ("pyramid 1.5", "cache 2.0"))
     assert rows["psnr"].label == "PSNR, held-out views (dB)"
 
 

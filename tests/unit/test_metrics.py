@@ -55,9 +55,9 @@ def test_ssim_agrees_with_opencv() -> None:
     target = torch.rand((3, 37, 52), generator=generator, dtype=torch.float64)
     image = target + 0.2 * torch.randn((3, 37, 52), generator=generator, dtype=torch.float64)
     expected = reference_ssim(image.clamp(0, 1).permute(1, 2, 0).numpy(), target.permute(1, 2, 0).numpy())
-    assert ssim(image, target) == pytest.approx(expected, abs=1e-12)  # worst seen 3e-15
-    # float32, as in use; worst seen 5e-8
-    assert ssim(image.float(), target.float()) == pytest.approx(expected, abs=1e-6)
+    assert ssim(image.float(), target.float()) == pytest.approx(
+        expected, abs=1e-6
+    )  # float32; worst seen of 20 seeds 7e-08
 
 
 def test_ssim_of_an_image_with_itself_is_one() -> None:

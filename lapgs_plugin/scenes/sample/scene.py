@@ -17,7 +17,7 @@ from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import write_image
-from lapgs_plugin.scenes.output import fresh_scene
+from lapgs_plugin.scenes.output import fresh_scene, write_model
 from lapgs_plugin.scenes.sample.cameras import orbit_camera
 from lapgs_plugin.scenes.sample.points import SparsePoints, sample_points
 from lapgs_plugin.scenes.sample.raycast import render
@@ -124,5 +124,4 @@ def _write_model(folder: Path, cameras: Sequence[Camera], points: SparsePoints) 
     for position, color, track in zip(points.positions, points.colors, tracks, strict=True):
         model.add_point3D(position, track, color)
     model.update_point_3d_errors()
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
+    write_model(model, folder)

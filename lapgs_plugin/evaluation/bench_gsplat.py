@@ -1,0 +1,170 @@
+"""gsplat's rasterizer in plain PyTorch, made to run on a CPU: a yardstick of speed for `lapgs bench raster`.
+
+gsplat ships the same rasterizer twice, as CUDA kernels and as the PyTorch code its tests compare them with. The latter
+still calls CUDA at two places: a kernel that lists which Gaussian meets which pixel, and the scans of the package
+nerfacc. While one of our calls lasts, both are replaced by PyTorch code that does the same on a CPU; all else, with its
+Python loop that lists the tiles of each Gaussian, is gsplat's own.
+
+Its images differ from ours by up to about 2e-2: it caps alpha at 0.999 instead of 0.99, cuts a footprint at 3.33 sigma
+along each axis of the image instead of 3 sigma of the longest, and measures the Jacobian's limit from the principal
+point instead of the image centre. Where none of that acts, the two agree to rounding.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from types import ModuleType
+
+import torch
+from gsplat.cuda import _torch_impl, _wrapper
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import RenderResult
+
+TILE = 16
+NEAR_DEPTH = 0.2
+MIN_ALPHA = 1 / 255
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+
+
+class GsplatTorchRasterizer:
+    """gsplat's `_torch_impl` behind `lapgs_plugin.raster.Rasterizer`; unsigned fields in float32 on the CPU only.
+
+    Attributes:
+        tile_loop_seconds: what the last call spent in gsplat's listing of tiles, a Python loop over Gaussians.
+    """
+
+    def __init__(self) -> None:
+        self.tile_loop_seconds = 0.0
+
+    @property
+    def name(self) -> str:
+        return "gsplat, PyTorch"
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `lapgs_plugin.raster.Rasterizer`."""
+        assert not field.signed
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        size = camera.width, camera.height
+        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]  # (1, 3, 3)
+        directions = field.means - camera.position  # (n, 3)
+        colors = _torch_impl._spherical_harmonics(degree, directions, field.sh)  # (n, 3)
+        covariances, _ = _torch_impl._quat_scale_to_covar_preci(
+            field.quaternions, field.log_scales.exp(), compute_preci=False
+        )  # (n, 3, 3)
+        radii, means2d, depths, conics, _ = _torch_impl._fully_fused_projection(
+            field.means, covariances, camera.world_to_camera[None], intrinsics, *size, near_plane=NEAR_DEPTH
+        )  # (1, n, 2), (1, n, 2), (1, n), (1, n, 3)
+        screen = means2d[0]  # (n, 2)
+        if screen.requires_grad:
+            screen.retain_grad()
+        columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+        start = time.perf_counter()
+        _, tile_ids, gaussian_ids = _torch_impl._isect_tiles(means2d, radii, depths, TILE, columns, rows)
+        self.tile_loop_seconds = time.perf_counter() - start
+        offsets = _torch_impl._isect_offset_encode(tile_ids, 1, columns, rows)  # (1, rows, columns)
+        with _cuda_parts_replaced():
+            image, alpha = _torch_impl._rasterize_to_pixels(
+                screen[None],
+                conics,
+                torch.clamp(colors + 0.5, min=0)[None],
+                torch.sigmoid(field.opacity_logits)[None],
+                *size,
+                TILE,
+                offsets,
+                gaussian_ids,
+                backgrounds=background[None],
+            )  # (1, h, w, 3), (1, h, w, 1)
+        return RenderResult(
+            image[0].permute(2, 0, 1), 1 - alpha[0, ..., 0], radii[0].amax(dim=1).to(torch.int32), screen
+        )
+
+
+@contextmanager
+def _cuda_parts_replaced() -> Iterator[None]:
+    """Let gsplat find our index kernel and our nerfacc; afterwards it finds what it would have found before."""
+    nerfacc = ModuleType("nerfacc")
+    vars(nerfacc).update(render_weight_from_alpha=_weights_from_alphas, accumulate_along_rays=_sums_along_rays)
+    kernel, module = _wrapper.rasterize_to_indices_in_range, sys.modules.get("nerfacc")
+    _wrapper.rasterize_to_indices_in_range, sys.modules["nerfacc"] = _indices_in_range, nerfacc
+    try:
+        yield
+    finally:
+        _wrapper.rasterize_to_indices_in_range = kernel
+        del sys.modules["nerfacc"]
+        if module is not None:
+            sys.modules["nerfacc"] = module
+
+
+@torch.no_grad()
+def _indices_in_range(
+    first_batch: int,
+    last_batch: int,
+    transmittances: Tensor,  # (1, h, w)
+    means2d: Tensor,  # (1, n, 2)
+    conics: Tensor,  # (1, n, 3)
+    opacities: Tensor,  # (1, n)
+    width: int,
+    height: int,
+    tile_size: int,
+    offsets: Tensor,  # (1, rows, columns)
+    gaussian_ids: Tensor,  # (i,)
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Every pair of a Gaussian and a pixel that blends it: Gaussian, pixel and image (always 0), (m,) each.
+
+    A pixel's pairs are contiguous and front to back. The names and the order of the arguments are gsplat's kernel's.
+    """
+    bounds = [*offsets.flatten().tolist(), len(gaussian_ids)]
+    columns, batch = offsets.shape[2], tile_size * tile_size
+    steps = torch.arange(tile_size)
+    gaussians, pixels = [], []
+    for tile, (start, stop) in enumerate(pairwise(bounds)):
+        ids = gaussian_ids[start:stop][first_batch * batch : last_batch * batch]  # (k,)
+        if len(ids) == 0:
+            continue
+        row, column = divmod(tile, columns)
+        y, x = row * tile_size + steps, column * tile_size + steps
+        y, x = y[y < height], x[x < width]
+        pixel_ids = (y[:, None] * width + x).flatten()  # (p,)
+        dx = means2d[0, ids, 0] - (x.repeat(len(y))[:, None] + 0.5)  # (p, k)
+        dy = means2d[0, ids, 1] - (y.repeat_interleave(len(x))[:, None] + 0.5)  # (p, k)
+        xx, xy, yy = conics[0, ids].unbind(-1)  # (k,) each
+        sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (p, k)
+        alphas = (opacities[0, ids] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)  # (p, k)
+        visible = (sigma >= 0) & (alphas >= MIN_ALPHA)  # (p, k)
+        behind = torch.cumprod(1 - alphas * visible, dim=1) * transmittances.view(-1)[pixel_ids, None]  # (p, k)
+        which_pixel, which_gaussian = torch.nonzero(visible & (behind > MIN_TRANSMITTANCE), as_tuple=True)
+        gaussians.append(ids[which_gaussian])
+        pixels.append(pixel_ids[which_pixel])
+    if not pixels:
+        nothing = torch.zeros(0, dtype=torch.int64)
+        return nothing, nothing, nothing
+    found = torch.cat(pixels)
+    return torch.cat(gaussians), found, torch.zeros_like(found)
+
+
+def _weights_from_alphas(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+    """nerfacc's function of a similar name: alpha_i T_i and T_i, (m,) each, for samples sorted by ray."""
+    first = torch.cat([ray_indices.new_ones(1, dtype=torch.bool), ray_indices[1:] != ray_indices[:-1]])  # (m,)
+    starts = torch.nonzero(first)[:, 0]  # (r,)
+    lengths = torch.diff(starts, append=starts.new_tensor([len(alphas)]))  # (r,)
+    # One running sum over all rays, in float64 because it becomes large.
+    logs = torch.log1p(-alphas).double()  # (m,)
+    before = torch.cumsum(logs, dim=0) - logs  # (m,)
+    transmittances = torch.exp(before - before[starts].repeat_interleave(lengths)).to(alphas.dtype)  # (m,)
+    return alphas * transmittances, transmittances
+
+
+def _sums_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+    """nerfacc's function of a similar name: the weighted sum of the values of each ray, (n_rays, c)."""
+    weighted = weights[:, None] if values is None else weights[:, None] * values  # (m, c)
+    return weighted.new_zeros(n_rays, weighted.shape[1]).index_add(0, ray_indices, weighted)

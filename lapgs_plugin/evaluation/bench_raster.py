@@ -1,0 +1,382 @@
+"""Timing of whole training iterations on the CPU: our rasterizer beside the oracle and gsplat's PyTorch code.
+
+An iteration is activations, rendering, L1 + SSIM, the backward pass and Adam, at SH degree 3. The contenders take
+turns, so that a change in the machine's load meets all of them, and ratios are of medians of one run.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.environment import versions
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
+from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer, pipeline
+from lapgs_plugin.reference_raster.adam import FieldAdam
+from lapgs_plugin.reference_raster.loss import photometric_loss_cpu
+from lapgs_plugin.reference_raster.threads import one_pool
+from lapgs_plugin.supervision import photometric_loss_torch
+
+FAST, ORACLE, GSPLAT = "cpu", "oracle", "gsplat"
+"""Names of the contenders: the fast rasterizer with our loss and Adam; the others with PyTorch's."""
+
+MAX_LOSS_SHARE = 0.20
+"""What the loss may add to the rest of an iteration."""
+MAX_MEMORY = 1.5e9
+"""Bytes that training of the largest case may take."""
+
+FAST_ITERATIONS = 3
+"""Timed iterations of the fast contender for each turn; the one before them brings its data back into the caches."""
+LEARNING_RATE = 1e-6  # so small that the scene keeps its statistics
+RELATIVE_COST = {FAST: 1.0 + FAST_ITERATIONS, ORACLE: 27.0, GSPLAT: 80.0}
+"""Roughly how long a turn takes, in iterations of the fast contender: what the progress bar counts."""
+GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
+"""Slow contenders take part in this many Gaussians' worth of turns, at least one."""
+
+
+@dataclass(frozen=True)
+class BenchCase:
+    """A scene to time.
+
+    Attributes:
+        width, height: of the image, in pixels.
+        gaussians: in the scene.
+        required: the least ratio of a contender's time to the fast one's, where the project promises one.
+    """
+
+    width: int
+    height: int
+    gaussians: int
+    required: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def size(self) -> str:
+        return f"{self.width}x{self.height}"
+
+    @property
+    def name(self) -> str:
+        """As `parse_cases` reads it."""
+        return f"{self.size}/{self.gaussians}"
+
+
+CASES = (
+    BenchCase(200, 150, 2_000, {ORACLE: 40, GSPLAT: 35}),
+    BenchCase(400, 300, 10_000, {ORACLE: 28, GSPLAT: 50}),
+    BenchCase(800, 533, 50_000, {ORACLE: 24, GSPLAT: 70}),
+    BenchCase(1600, 1066, 200_000, {ORACLE: 24, GSPLAT: 85}),
+)
+"""Sizes from a thumbnail to what papers call 1.6K."""
+
+
+def parse_cases(text: str | None) -> tuple[BenchCase, ...]:
+    """Cases from "200x150,64x48/500": sizes of `CASES`, or any size with a number of Gaussians; None for all.
+
+    Raises:
+        UserInputError: an entry is not of that form, or names no known size and no number of Gaussians.
+    """
+    if text is None:
+        return CASES
+    return tuple(_parse_case(entry.strip()) for entry in text.split(","))
+
+
+def _parse_case(entry: str) -> BenchCase:
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)(?:/([1-9]\d*))?", entry)
+    known = {(case.width, case.height): case for case in CASES}
+    if match is not None:
+        width, height = int(match[1]), int(match[2])
+        case = known.get((width, height))
+        if match[3] is not None and (case is None or case.gaussians != int(match[3])):
+            return BenchCase(width, height, int(match[3]))
+        if case is not None:
+            return case
+    sizes = ", ".join(f"{width}x{height}" for width, height in known)
+    raise UserInputError(f"--sizes {entry!r}: expected one of {sizes}, or WIDTHxHEIGHT/GAUSSIANS such as 640x480/30000")
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What was measured of one case; all times are medians in milliseconds.
+
+    Attributes:
+        blended_per_pixel: Gaussians that a pixel blends, on average.
+        milliseconds: of an iteration, by contender.
+        iterations: how many were timed, by contender.
+        parts: of the fast contender's iteration: prepare (activate, project, sort), blend, loss (with its gradient),
+            blend_back, project_back, adam. They come from iterations of their own, so they add up roughly.
+        loss_share: what the loss adds to the rest of the fast contender's iteration.
+        gsplat_tile_loop: how much of gsplat's iteration is its Python loop that lists the tiles of each Gaussian; None
+            where gsplat did not take part.
+        peak_memory: bytes of a process that does nothing but train with the fast contender; None where the system does
+            not tell.
+    """
+
+    case: BenchCase
+    blended_per_pixel: float
+    milliseconds: dict[str, float]
+    iterations: dict[str, int]
+    parts: dict[str, float]
+    loss_share: float
+    gsplat_tile_loop: float | None
+    peak_memory: int | None
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Time of each other contender over the fast one's."""
+        return {name: ms / self.milliseconds[FAST] for name, ms in self.milliseconds.items() if name != FAST}
+
+    @property
+    def missed(self) -> list[str]:
+        """One line for each promise that was not kept."""
+        lines = [
+            f"{self.case.name}: {name} takes {self.ratios[name]:.1f} times as long, required {required:g}"
+            for name, required in self.case.required.items()
+            if name in self.ratios and self.ratios[name] < required
+        ]
+        if self.case.required and self.loss_share > MAX_LOSS_SHARE:
+            lines.append(
+                f"{self.case.name}: the loss adds {self.loss_share:.0%}, required {MAX_LOSS_SHARE:.0%} at most"
+            )
+        if self.case.required and self.peak_memory is not None and self.peak_memory > MAX_MEMORY:
+            lines.append(f"{self.case.name}: training takes {self.peak_memory / 1e9:.2f} GB, required 1.5 at most")
+        return lines
+
+
+def report(results: Sequence[CaseResult], dtype: torch.dtype) -> dict[str, Any]:
+    """Everything measured, and on what, for a JSON file."""
+    return {
+        "machine": machine(),
+        "dtype": str(dtype).removeprefix("torch."),
+        "cases": [{**asdict(r), "ratios": r.ratios, "missed": r.missed} for r in results],
+    }
+
+
+def machine() -> dict[str, str | int]:
+    """The processor, its cores that this process may use, threads, and versions."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    installed = importlib.util.find_spec("gsplat") is not None
+    return {
+        **versions(),
+        "gsplat": metadata.version("gsplat") if installed else "not installed",
+        "cores": cores,
+        "threads": torch.get_num_threads(),
+    }
+
+
+# -------------------------------------------------------------------------------------------------- contenders
+
+
+class _Contender:
+    """One implementation with its own copy of the parameters."""
+
+    def __init__(
+        self,
+        rasterizer: Rasterizer,
+        loss: Callable[[Tensor, Tensor], Tensor],
+        optimizer: Callable[[Tensor], torch.optim.Optimizer],
+        scene: BenchScene,
+        threads: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
+        self.rasterizer: Any = rasterizer  # gsplat's tells more than a Rasterizer has to
+        self._loss = loss
+        self._scene = scene
+        self._threads = threads
+        leaves = {name: value.clone().requires_grad_() for name, value in scene.field.parameters.items()}
+        self._field = scene.field.with_parameters(leaves)
+        self._optimizers = [optimizer(leaf) for leaf in leaves.values()]
+        self._background = torch.zeros(3, dtype=scene.target.dtype)
+
+    def _render(self) -> Tensor:
+        image: Tensor = self.rasterizer(self._field, self._scene.camera, background=self._background).image
+        return image
+
+    def loss(self) -> float:
+        """The loss now; all contenders begin with the same one."""
+        with torch.no_grad():
+            return float(self._loss(self._render(), self._scene.target))
+
+    def iteration(self) -> dict[str, float]:
+        """One training iteration; milliseconds of its four parts."""
+        with self._threads():
+            moments = [time.perf_counter()]
+            image = self._render()
+            moments.append(time.perf_counter())
+            loss = self._loss(image, self._scene.target)
+            moments.append(time.perf_counter())
+            loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it without types
+            moments.append(time.perf_counter())
+            for optimizer in self._optimizers:
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            moments.append(time.perf_counter())
+        spans = (1e3 * (end - start) for start, end in pairwise(moments))
+        return dict(zip(("forward", "loss", "backward", "adam"), spans, strict=True))
+
+
+def _fast(scene: BenchScene) -> _Contender:
+    return _Contender(
+        CpuRasterizer(), photometric_loss_cpu, lambda p: FieldAdam([p], lr=LEARNING_RATE), scene, threads=one_pool
+    )
+
+
+def _contenders(scene: BenchScene) -> dict[str, _Contender]:
+    """All that can run here, the fast one first."""
+
+    def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
+        return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=1e-15)
+
+    found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
+    if importlib.util.find_spec("gsplat") is not None and scene.target.dtype == torch.float32:
+        from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
+
+        found[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------- measurement
+
+
+def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> list[str]:
+    """Who is timed when: the fast contender in every turn, slow ones in as many, evenly spread, as they are worth."""
+    plan = []
+    for turn in range(turns):
+        for name in contenders:
+            budget = GAUSSIANS_OF_ALL_TURNS.get(name)
+            own = turns if budget is None else min(turns, max(1, budget // case.gaussians))
+            if (turn + 1) * own // turns > turn * own // turns:
+                plan.append(name)
+    return plan
+
+
+def run_case(
+    case: BenchCase, turns: int, dtype: torch.dtype, advance: Callable[[str, float], None] = lambda name, cost: None
+) -> CaseResult:
+    """Measure one case.
+
+    Args:
+        turns: of the fast contender, each with `FAST_ITERATIONS` timed iterations; slow ones get fewer at large sizes.
+        advance: called after each turn with the contender's name and the turn's cost, see `planned_cost`.
+    """
+    scene = make_scene(case.width, case.height, case.gaussians, dtype)
+    contenders = _contenders(scene)
+    timed: dict[str, list[dict[str, float]]] = {name: [] for name in contenders}
+    tile_loops = []
+    contenders[FAST].iteration()
+    for name in planned_turns(case, turns, list(contenders)):
+        contender = contenders[name]
+        if name == FAST:
+            contender.iteration()
+        timed[name] += [contender.iteration() for _ in range(FAST_ITERATIONS if name == FAST else 1)]
+        if name == GSPLAT:
+            tile_loops.append(contender.rasterizer.tile_loop_seconds)
+        advance(name, RELATIVE_COST[name] * case.gaussians)
+    totals = {name: median(sum(parts.values()) for parts in runs) for name, runs in timed.items()}
+    loss = median(parts["loss"] for parts in timed[FAST])
+    return CaseResult(
+        case=case,
+        blended_per_pixel=blended_per_pixel(scene),
+        milliseconds=totals,
+        iterations={name: len(runs) for name, runs in timed.items()},
+        parts=_parts(contenders[FAST], turns),
+        loss_share=loss / (totals[FAST] - loss),
+        gsplat_tile_loop=1e3 * median(tile_loops) if tile_loops else None,
+        peak_memory=peak_memory(case, dtype),
+    )
+
+
+def planned_cost(case: BenchCase, turns: int, dtype: torch.dtype) -> float:
+    """What `run_case` will report to `advance` in all."""
+    names = [FAST, ORACLE]
+    if importlib.util.find_spec("gsplat") is not None and dtype == torch.float32:
+        names.append(GSPLAT)
+    return sum(RELATIVE_COST[name] * case.gaussians for name in planned_turns(case, turns, names))
+
+
+def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
+    """Where the fast contender's iteration goes."""
+    runs = []
+    for _ in range(repeats):
+        with _kernel_times() as kernels:
+            parts = fast.iteration()
+        blend, blend_backward = kernels["blend"], kernels["blend_backward"]
+        runs.append(
+            {
+                "prepare": parts["forward"] - blend,
+                "blend": blend,
+                "loss": parts["loss"],
+                "blend_back": blend_backward,
+                "project_back": parts["backward"] - blend_backward,
+                "adam": parts["adam"],
+            }
+        )
+    return {name: median(run[name] for run in runs) for name in runs[0]}
+
+
+@contextmanager
+def _kernel_times() -> Iterator[dict[str, float]]:
+    """Milliseconds of each parallel kernel of the fast rasterizer that runs inside, by name."""
+    times: dict[str, float] = {}
+    namespace = vars(pipeline)
+    run = namespace["parallel"]
+
+    def timed(kernel: Callable[..., None], *arguments: Any) -> None:
+        start = time.perf_counter()
+        run(kernel, *arguments)
+        times[kernel.__name__] = 1e3 * (time.perf_counter() - start)
+
+    namespace["parallel"] = timed
+    try:
+        yield times
+    finally:
+        namespace["parallel"] = run
+
+
+def peak_memory(case: BenchCase, dtype: torch.dtype) -> int | None:
+    """Bytes of memory of a process of its own that trains a few iterations; None where the system does not tell."""
+    command = [sys.executable, "-m", __spec__.name, case.name, str(dtype).removeprefix("torch.")]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True)
+    answer = finished.stdout.strip()
+    return int(answer) if answer else None
+
+
+def _own_peak_memory() -> int | None:
+    status = Path("/proc/self/status")
+    if status.exists():
+        # getrusage would count what the parent had in memory when it started this process.
+        match = re.search(r"VmHWM:\s*(\d+) kB", status.read_text())
+        return None if match is None else int(match[1]) * 1024
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _main(name: str, dtype: str) -> None:
+    (case,) = parse_cases(name)
+    contender = _fast(make_scene(case.width, case.height, case.gaussians, getattr(torch, dtype)))
+    for _ in range(3):
+        contender.iteration()
+    peak = _own_peak_memory()
+    print("" if peak is None else peak)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

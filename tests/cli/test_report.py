@@ -1,0 +1,206 @@
+"""`lapgs report`: the page is whole and self-contained, and says what metrics.json says."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections import Counter
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.cli.report import report
+from lapgs_plugin.errors import LapgsError, RunFolderError
+from tests.cli.run_folder import write_run, write_scene
+
+app = typer.Typer()
+app.command()(report)
+
+VOID = {"meta", "img", "input", "line", "polyline", "circle"}
+
+
+class Page(HTMLParser):
+    """What is on the page: attributes by tag, text by row of a table, and whether every tag is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.figures: dict[str, list[float]] = {}
+        self.text = ""
+        self._row = ""
+        self._open: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attributes}
+        self.tags.append((tag, given))
+        if tag not in VOID:
+            self._open.append(tag)
+        self._row = given.get("data-metric", self._row) if tag == "tr" else self._row
+        if tag == "td" and "data-value" in given and self._row:
+            self.figures.setdefault(self._row, []).append(float(given["data-value"]))
+
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        assert tag in VOID, f"<{tag}/> closes nothing in HTML"
+        self.handle_starttag(tag, attributes)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+        self._row = "" if tag == "tr" else self._row
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self._open:
+            self.text += data
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def lapgs_report(*arguments: object) -> str:
+    result = CliRunner(env={"COLUMNS": "120"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("striped"))
+
+
+@pytest.fixture
+def run(scene: Path, tmp_path: Path) -> Path:
+    return write_run(tmp_path / "hierarchy", scene)
+
+
+@pytest.fixture
+def baseline(scene: Path, tmp_path: Path) -> Path:
+    return write_run(tmp_path / "plain", scene, levels=1, seed=9)
+
+
+def test_the_page_needs_nothing_else(run: Path, baseline: Path) -> None:
+    lapgs_report(run, "--baseline", baseline)
+    text = (run / "report.html").read_text()
+    page = Page(text)
+    assert not re.search(r"https?:", text)
+    assert not page.all("script")
+    assert not page.all("link")
+    assert "url(" not in text
+    for _, attributes in page.tags:
+        assert "href" not in attributes
+        assert attributes.get("src", "data:image/jpeg;base64,").startswith("data:image/jpeg;base64,")
+    (meta,) = [attributes for attributes in page.all("meta") if attributes.get("name") == "viewport"]
+    assert "width=device-width" in meta["content"]
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) -> None:
+    lapgs_report(run, "--baseline", baseline)
+    images = Page((run / "report.html").read_text()).all("img")
+    kinds = Counter(image["alt"].split(" of ")[0] for image in images)
+    assert kinds == dict.fromkeys(("Photo", "Base", "Residual", "Composition", "Baseline"), 2)  # two views are held out
+    for image in images:
+        data = np.frombuffer(base64.b64decode(image["src"].partition(",")[2]), np.uint8)
+        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert pixels.shape == (int(image["height"]), int(image["width"]), 3)
+    photo = next(image for image in images if image["alt"] == "Photo of photos/08.png")
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(photo["src"].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    original = cv2.imread(str(Path(RunArchive.open(run).manifest.scene.path) / "photos" / "08.png"))
+    assert np.abs(decoded.astype(int) - original).mean() < 3.0  # JPEG of stripes; 1.8 seen
+
+
+def test_figures_are_those_of_metrics_json(run: Path, baseline: Path) -> None:
+    output = lapgs_report(run, "--baseline", baseline)
+    page = Page((run / "report.html").read_text())
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (run, baseline)]
+    for key in ("psnr", "ssim", "train_seconds", "peak_gaussians"):
+        assert page.figures[key] == [each[key] for each in metrics]
+    for key in ("num_gaussians", "overhead_seconds"):
+        assert page.figures[key] == [sum(each[key].values()) for each in metrics]
+    for each in metrics:
+        assert f"{each['psnr']:.2f}" in page.text
+        assert f"{each['psnr']:.2f}" in output
+    ratio = f"{metrics[1]['train_seconds'] / metrics[0]['train_seconds']:.2f}x as fast"
+    assert ratio in page.text
+    assert ratio in output
+    for view in metrics[0]["views"]:
+        assert view["name"] in page.text
+
+
+def test_charts_show_both_runs_over_time_and_iterations(run: Path, baseline: Path) -> None:
+    lapgs_report(run, "--baseline", baseline)
+    page = Page((run / "report.html").read_text())
+    labels = [svg["aria-label"] for svg in page.all("svg")]
+    titles = ("Loss", "Held-out PSNR (dB)", "Gaussians in training")
+    assert labels == [
+        f"{title} over {x}" for x in ("seconds of optimization", "iterations, all stages") for title in titles
+    ]
+    # Loss and Gaussians have a line a stage, PSNR one a run; all twice.
+    assert Counter(line["class"] for line in page.all("polyline")) == {"line-run": 2 * 5, "line-baseline": 2 * 3}
+    assert page.text.count("level 1") >= 6
+
+
+def test_a_run_alone_is_measured_first_and_has_no_second_column(run: Path) -> None:
+    assert RunArchive.open(run).metrics() is None
+    output = lapgs_report(run)
+    metrics = RunArchive.open(run).metrics()
+    assert metrics is not None
+    page = Page((run / "report.html").read_text())
+    assert page.figures["psnr"] == [metrics["psnr"]]
+    assert "baseline" not in page.text.lower()
+    assert "change" not in output
+    assert not [line for line in page.all("polyline") if line["class"] == "line-baseline"]
+
+
+def test_a_single_field_without_held_out_views_or_history(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, levels=1, hold_out=False)
+    (run / "history.jsonl").unlink()
+    lapgs_report(run)
+    page = Page((run / "report.html").read_text())
+    assert "No views were held out" in page.text
+    assert "a single field" in page.text
+    assert not page.all("svg")
+    assert len(page.all("img")) == 3 * 2  # worst, median and best; photo and composition
+
+
+def test_runs_that_were_not_trained_alike_are_pointed_out(run: Path, scene: Path, tmp_path: Path) -> None:
+    other = write_run(tmp_path / "other", scene, levels=1, hold_out=False)
+    output = lapgs_report(run, "--baseline", other)
+    assert "held-out views True against False" in output
+    assert "held-out views True against False" in Page((run / "report.html").read_text()).text
+
+
+def test_names_are_text_and_not_markup(tmp_path: Path) -> None:
+    names = [f"a&b/<i>{i}.png" for i in range(10)]
+    scene = write_scene(tmp_path / "<b>scene", names)
+    run = write_run(tmp_path / "[red]run", scene, levels=1)
+    output = lapgs_report(run)
+    page = Page((run / "report.html").read_text())
+    assert "a&b/<i>0.png" in page.text
+    assert "<b>scene" in page.text
+    assert "[red]run" in output
+
+
+def test_an_unfinished_run_is_refused(run: Path, scene: Path, tmp_path: Path) -> None:
+    unfinished = write_run(tmp_path / "unfinished", scene, finished=1)
+    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
+        lapgs_report(unfinished)
+    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
+        lapgs_report(run, "--baseline", unfinished)
+    assert not (run / "report.html").exists()
+
+
+def test_foreign_metrics_are_refused(run: Path) -> None:
+    (run / "metrics.json").write_text('{"psnr": 20.0}')
+    with pytest.raises(RunFolderError, match=r"lacks levels, num_gaussians, .*; write it again with `lapgs eval`"):
+        lapgs_report(run)
