@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 
-INHERIT_MODES = ("xyz", "full")
+INHERIT_MODES = ("geometry", "xyz", "full")
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every side."""
@@ -57,7 +57,7 @@ def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> Gaussia
 
 def inherit(
     field: GaussianField,
-    mode: str = "xyz",
+    mode: str = "geometry",
     ratio: float = 1.0,
     generator: torch.Generator | None = None,
     sh_degree: int | None = None,
@@ -65,15 +65,16 @@ def inherit(
     """The residual field that continues from the field of the next coarser level (paper, "Initialization and
     inheritance" and the supplement's ablation).
 
-    "xyz" keeps the positions and starts everything else afresh: scale from the nearest neighbours among the kept
-    Gaussians, opacity 0.1, no rotation, and zero colour, so that the residual renders exactly zero. "full" keeps every
-    parameter, colours included, as the paper ("retains all parameters") and its authors' release do; `kept` tells which
+    "geometry", ours, keeps positions, shapes and opacities and starts with zero colour, so that the residual renders
+    exactly zero where the paper's would too, but by Gaussians that already follow the scene's surfaces. "xyz", the
+    paper's default, keeps the positions and starts everything else afresh: scale from the nearest neighbours among the
+    kept Gaussians, opacity 0.1, no rotation, and zero colour. "full" keeps every parameter, colours included, as the paper ("retains all parameters") and its authors' release do; `kept` tells which
     rows of the optimizer state go with it. As a residual's colour is the raw SH value, what inherits fully from a base
     starts as the base's image minus 0.5 wherever that is opaque, and has to unlearn it.
 
     Args:
         field: of the coarser level; not modified.
-        mode: "xyz" or "full".
+        mode: "geometry", "xyz" or "full".
         ratio: rho in (0, 1], the share of Gaussians to keep, drawn without replacement; at least one is kept.
         generator: CPU generator of the draw; None takes PyTorch's global one. Not used when all are kept.
         sh_degree: of the new field; None keeps the old one's. "full" can only keep it.
@@ -82,24 +83,25 @@ def inherit(
         UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
     """
     if mode not in INHERIT_MODES:
-        raise UserInputError(f"--inherit {mode}: expected {' or '.join(INHERIT_MODES)}")
+        raise UserInputError(f"--inherit {mode}: expected {', '.join(INHERIT_MODES)}")
     if not 0.0 < ratio <= 1.0:
         raise UserInputError(f"inheritance ratio {ratio}: expected above 0 and at most 1 (1 inherits every Gaussian)")
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _draw(len(field), ratio, generator).to(field.means.device)
     degree = field.sh_degree if sh_degree is None else sh_degree
+    rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
     if mode == "full":
         if degree != field.sh_degree:
             raise UserInputError(
                 f"full inheritance of a field of SH degree {field.sh_degree} cannot give degree {degree}; "
                 "keep the degree or inherit xyz"
             )
-        rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
         return Inherited(GaussianField(**rows, signed=True), kept)
-    means = field.means.detach()[kept]
-    sh = torch.zeros(len(kept), (degree + 1) ** 2, 3, dtype=means.dtype, device=means.device)
-    return Inherited(_fresh_field(means, sh, signed=True), kept)
+    sh = torch.zeros(len(kept), (degree + 1) ** 2, 3, dtype=field.means.dtype, device=field.means.device)
+    if mode == "geometry":
+        return Inherited(GaussianField(**{**rows, "sh": sh}, signed=True), kept)
+    return Inherited(_fresh_field(rows["means"], sh, signed=True), kept)
 
 
 def _draw(n: int, ratio: float, generator: torch.Generator | None) -> Tensor:

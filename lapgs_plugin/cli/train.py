@@ -60,10 +60,10 @@ def train(
         str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="What the next level starts from: xyz (positions), full (all parameters and optimizer state), or a "
-            "ratio in (0, 1] of the positions.",
+            help="What the next level starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
+            "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
         ),
-    ] = "xyz",
+    ] = "geometry",
     grid: Annotated[
         str,
         typer.Option(
@@ -81,9 +81,7 @@ def train(
             rich_help_panel=SCHEDULE, help="Last one, of the whole run; stages scale it. Default: 15000 of 30000."
         ),
     ] = None,
-    densify_every: Annotated[
-        int | None, typer.Option(rich_help_panel=SCHEDULE, help="Iterations in between. Default: 100 of 30000.")
-    ] = None,
+    densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
     opacity_reset_every: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
     ] = None,
@@ -166,13 +164,20 @@ def train(
 
 
 def _inheritance(text: str) -> dict[str, Any]:
-    """--inherit as settings: a mode, or a ratio of the positions."""
-    if text in ("xyz", "full"):
-        return {"inherit": text}
+    """--inherit as settings: MODE, RATIO or MODE:RATIO."""
+    from lapgs_plugin.inheritance import INHERIT_MODES
+
+    mode, colon, ratio = text.partition(":")
+    if mode not in INHERIT_MODES and not colon:
+        mode, ratio = INHERIT_MODES[0], text
     try:
-        return {"inherit_ratio": float(text)}
+        if mode not in INHERIT_MODES:
+            raise ValueError(mode)
+        return {"inherit": mode, "inherit_ratio": float(ratio or 1.0)}
     except ValueError as error:
-        raise UserInputError(f"--inherit {text!r}: expected xyz, full or a ratio in (0, 1] such as 0.5") from error
+        raise UserInputError(
+            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1] such as 0.5, or both as xyz:0.5"
+        ) from error
 
 
 def _color(text: str) -> tuple[float, float, float]:

@@ -54,7 +54,7 @@ class TrainableField:
             "quats": rates.quats,
             "scales": rates.scales,
             "opacities": rates.opacities,
-            "sh": rates.sh,
+            "sh": rates.residual_sh if field.signed else rates.sh,
         }
         optimizers = {
             name: FieldAdam([param], lr=rate[name], eps=ADAM_EPS, column_scale=sh_scale if name == "sh" else None)

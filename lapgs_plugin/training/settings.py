@@ -26,6 +26,7 @@ class LearningRates:
     means_first: float = 1.6e-4
     means_last: float = 1.6e-6
     sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
+    residual_sh: float = 1e-2  # the same for residual fields, which start from zero colour and have fewer iterations
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
@@ -35,12 +36,13 @@ class LearningRates:
 class Densification:
     """When Gaussians are cloned, split, pruned and reset, in iterations of a whole run (see `StageSchedule`).
 
-    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 100, 3,000), shrunk in proportion for shorter runs.
+    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000), shrunk in proportion for shorter runs.
+    `every` never shrinks: its statistics need about that many views.
     """
 
     start: int | None = None
     until: int | None = None
-    every: int | None = None
+    every: int = 100
     reset_every: int | None = None
     grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
 
@@ -54,7 +56,7 @@ class TrainSettings:
     split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
     grid: str = "camera"
     supervision: str = "reconstructed"
-    inherit: str = "xyz"
+    inherit: str = "geometry"
     inherit_ratio: float = 1.0
     sh_degree: int = 3
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
@@ -130,7 +132,7 @@ class StageSchedule:
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),
             densify_until=round(until * stage.iterations / settings.iterations),
-            densify_every=constant(given.every, 100, 25),
+            densify_every=given.every,
             reset_every=constant(given.reset_every, 3000, 300),
             sh_every=constant(settings.sh_every, 1000, 1),
             sh_degree=settings.sh_degree,

@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(scene: Scen
     assert first != plys(train(tmp_path / "c", scene, replace(SETTINGS, seed=1)))
 
 
-@pytest.fixture(scope="module", params=["xyz", "full"])
+@pytest.fixture(scope="module", params=["geometry", "full"])
 def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
     """An uninterrupted run."""
     settings = replace(SETTINGS, inherit=request.param)
@@ -134,7 +134,7 @@ def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_
         {"supervision": "online_residual"},
         {"supervision": "gt_laplacian"},
         {"levels": 1},
-        {"inherit_ratio": 0.5},
+        {"inherit": "xyz", "inherit_ratio": 0.5},
         {"grid": "even"},
         {"cache": "disk", "cache_precision": "float16"},
         {"cache_precision": "uint8"},

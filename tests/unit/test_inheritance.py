@@ -103,8 +103,20 @@ def test_xyz_keeps_positions_and_starts_the_rest_afresh(degree: int | None, sign
     assert all(torch.equal(old.parameters[name], tensor) for name, tensor in before.items())
 
 
-def test_an_inherited_residual_renders_exactly_zero() -> None:
-    field, _ = inherit(base_field(), "xyz")
+def test_geometry_keeps_all_but_colour() -> None:
+    old = base_field()
+    field, kept = inherit(old, "geometry")
+    assert torch.equal(kept, torch.arange(50))
+    assert field.signed
+    assert not field.sh.any()
+    for name in ("means", "quaternions", "log_scales", "opacity_logits"):
+        assert torch.equal(field.parameters[name], old.parameters[name])
+        assert field.parameters[name].data_ptr() != old.parameters[name].data_ptr()
+
+
+@pytest.mark.parametrize("mode", ["geometry", "xyz"])
+def test_an_inherited_residual_renders_exactly_zero(mode: str) -> None:
+    field, _ = inherit(base_field(), mode)
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(4))
     result = OracleRasterizer()(field, camera, background=torch.zeros(3))
     assert not result.image.any()
@@ -121,7 +133,7 @@ def test_full_keeps_every_parameter() -> None:
         assert field.parameters[name].data_ptr() != tensor.data_ptr()
 
 
-@pytest.mark.parametrize("mode", ["xyz", "full"])
+@pytest.mark.parametrize("mode", ["geometry", "xyz", "full"])
 @settings(deadline=None, max_examples=40)
 @given(n=st.integers(1, 200), ratio=st.floats(0, 1, exclude_min=True), seed=st.integers(0, 99))
 def test_a_share_is_a_seeded_subset(mode: str, n: int, ratio: float, seed: int) -> None:
@@ -159,7 +171,7 @@ def test_ratios_outside_the_unit_interval_are_refused(ratio: float) -> None:
 
 
 def test_what_cannot_be_inherited() -> None:
-    with pytest.raises(UserInputError, match="--inherit everything: expected xyz or full"):
+    with pytest.raises(UserInputError, match="--inherit everything: expected geometry, xyz, full"):
         inherit(base_field(), "everything")
     with pytest.raises(UserInputError, match="no Gaussians left to inherit"):
         inherit(base_field(0))
@@ -170,6 +182,6 @@ def test_what_cannot_be_inherited() -> None:
 def test_gradients_do_not_flow_back() -> None:
     old = base_field()
     old = old.with_parameters({name: tensor.requires_grad_() for name, tensor in old.parameters.items()})
-    for mode in ("xyz", "full"):
+    for mode in ("geometry", "xyz", "full"):
         field, _ = inherit(old, mode)
         assert not any(tensor.requires_grad for tensor in field.parameters.values())
