@@ -15,6 +15,8 @@ from numpy.typing import DTypeLike, NDArray
 
 ALIGNMENT = 64
 """Bytes: a line of the cache, and the widest vector."""
+SMALL = 2**20
+"""Bytes: less than this, the system's allocator gets from what it has at hand, faster than is possible here."""
 MAX_WASTE = 1.5
 """A block serves requests down to this fraction of its size."""
 PATIENCE = 256
@@ -26,8 +28,10 @@ class _Block:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        # Through a memoryview, so that views of an array made of it keep that array alive and not this one.
-        self.memory = np.empty(size + ALIGNMENT, np.uint8).data
+        memory = np.empty(size + ALIGNMENT, np.uint8)
+        self.start = -memory.ctypes.data % ALIGNMENT
+        # A memoryview, so that views of an array made of it keep that array alive and not this one.
+        self.memory = memory.data
         self.returned = 0
 
 
@@ -62,8 +66,11 @@ _store = _Store()
 def empty(size: int, dtype: DTypeLike) -> NDArray[Any]:
     """A writable array of `size` elements, aligned for vectors, with anything in it."""
     kind = np.dtype(dtype)
-    block = _store.take(max(size, 1) * kind.itemsize)
-    start = -np.frombuffer(block.memory, np.uint8).ctypes.data % ALIGNMENT
-    array = np.frombuffer(block.memory, kind, size, start)
+    needed = size * kind.itemsize
+    if needed < SMALL:
+        memory = np.empty(needed + ALIGNMENT, np.uint8)
+        return np.frombuffer(memory, kind, size, -memory.ctypes.data % ALIGNMENT)
+    block = _store.take(needed)
+    array = np.frombuffer(block.memory, kind, size, block.start)
     weakref.finalize(array, _store.give_back, block).atexit = False
     return array

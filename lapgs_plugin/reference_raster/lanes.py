@@ -158,7 +158,7 @@ def select(mask: Mask, a: Lanes | float, b: Lanes | float) -> Lanes:
 
 
 def exp2(a: Lanes) -> Lanes:
-    """2^a to a relative error of 3e-7 (float32) or 4e-16 (float64); garbage where that leaves the type's range."""
+    """2^a to a relative error of 3e-7 (float32) or 2e-16 (float64); garbage where that leaves the type's range."""
     _compiled_only()
 
 

@@ -1,7 +1,8 @@
 """The CPU rasterizer on plain arrays: what `fast` wraps for autograd and stand-ins for CUDA modules can wrap otherwise.
 
-project_kernels.project -> ordering_kernels -> tile_kernels.blend
-tile_kernels.blend_backward -> projection_kernels.project_backward
+`render` runs projection_kernels.project, then ordering_kernels, then tile_kernels.blend. `gradients` runs
+tile_kernels.blend_backward, then projection_kernels.project_backward. Gaussians come as raw or activated parameters,
+with SH coefficients or colours.
 """
 
 from __future__ import annotations
@@ -107,8 +108,13 @@ class Kept:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Derivatives of the loss by each array of `Gaussians`, in its shape, by the projected centres in pixels, and sums
-    over pixels of the latter's absolute value."""
+    """Derivatives of a loss.
+
+    Attributes:
+        means, quats, scales, opacities, sh, colors: by the arrays of `Gaussians`, in their shapes.
+        centres: (n, 2) by the centres on the image, in loss per pixel.
+        absolute_centres: (n, 2) sum over pixels of the absolute value of that.
+    """
 
     means: Floats
     quats: Floats

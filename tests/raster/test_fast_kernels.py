@@ -96,7 +96,7 @@ def exponentials(a: Floats, powers: Floats, exponentials: Floats) -> None:
         lanes.store(exponentials, start, lanes.exp(lanes.load(a, start)))
 
 
-# Worst 2.1e-7 and 3.6e-16, where long double is longer than double.
+# Worst 2.3e-7 and 1.7e-16, where long double is longer than double.
 @pytest.mark.parametrize(("kind", "bound"), [(np.float32, 3e-7), (np.float64, 8e-16)])
 def test_exponentials_are_accurate(kind: type[np.floating[Any]], bound: float) -> None:
     a = np.concatenate([np.linspace(-20, 20, 16000), np.arange(-80, 80) / 2]).astype(kind)

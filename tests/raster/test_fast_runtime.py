@@ -146,17 +146,24 @@ def test_results_survive_later_calls() -> None:
     assert_same_bits(kept, copies)
 
 
-def test_memory_comes_back_when_its_last_user_is_gone() -> None:
-    array = buffers.empty(5000, np.float32)
+@pytest.mark.parametrize("size", [1, 1000, buffers.SMALL // 4])
+def test_memory_is_aligned_and_writable(size: int) -> None:
+    array = buffers.empty(size, np.float32)
+    array[:] = 3.0
+    assert array.shape == (size,)
+    assert array.ctypes.data % buffers.ALIGNMENT == 0
+
+
+def test_large_memory_comes_back_when_its_last_user_is_gone() -> None:
+    array = buffers.empty(buffers.SMALL, np.float32)
     address = array.ctypes.data
-    assert address % buffers.ALIGNMENT == 0
     tensor = torch.from_numpy(array[8:].reshape(-1, 4)[::2])
     del array
-    held = buffers.empty(5000, np.float32)
+    held = buffers.empty(buffers.SMALL, np.float32)
     assert held.ctypes.data != address  # the tensor of a view still needs it
     del tensor
     gc.collect()
-    again = [buffers.empty(5000, np.float32) for _ in range(2)]
+    again = [buffers.empty(buffers.SMALL, np.float32) for _ in range(2)]
     assert address in {a.ctypes.data for a in again}
 
 
