@@ -167,6 +167,25 @@ def test_large_memory_comes_back_when_its_last_user_is_gone() -> None:
     assert address in {a.ctypes.data for a in again}
 
 
+def test_sizes_that_vary_from_view_to_view_share_memory() -> None:
+    addresses = set()
+    for size in (1_100_000, 1_090_000, 1_120_000, 1_100_001):
+        array = buffers.empty(size, np.float32)
+        addresses.add(array.ctypes.data)
+        del array
+    assert len(addresses) == 1
+
+
+def test_idle_memory_is_given_back() -> None:
+    before = len(buffers._store._free)
+    first = [buffers.empty(buffers.SMALL * i, np.float32) for i in range(1, 6)]
+    del first
+    assert len(buffers._store._free) >= before
+    for _ in range(buffers.PATIENCE + 1):
+        buffers.empty(buffers.SMALL * 10, np.float32)
+    assert [block.size for block in buffers._store._free] == [buffers.SMALL * 40]
+
+
 def test_optimizers_own_gradients_without_a_copy(monkeypatch: pytest.MonkeyPatch) -> None:
     handed_out = set()
 
