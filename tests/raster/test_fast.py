@@ -30,22 +30,24 @@ from tests.raster.scenes import Case
 ORACLE, CPU = OracleRasterizer(), CpuRasterizer()
 DTYPES = [torch.float64, torch.float32]
 
-# Worst values seen over the adversarial and 300 random scenes, in float64 and float32:
-# image and transmittance 2.3e-14 and 5.4e-6, absolute.
+# Worst values seen over the adversarial and 700 random scenes, in float64 and float32:
+# image and transmittance 2.3e-14 and 5.6e-6, absolute.
 IMAGE_BOUND = {torch.float64: 1e-12, torch.float32: 3e-5}
-# Centres on the image 6e-16 and 6e-7 of the largest.
+# Centres on the image 1.7e-15 and 6e-7 of the largest.
 CENTRE_BOUND = {torch.float64: 1e-13, torch.float32: 3e-6}
-# Gradients: element 7.7e-14 and 2.1e-5, row 1.5e-12 and 7e-4, relative L2 5.9e-14 and 1.2e-5.
+# Gradients: element 2.8e-13 and 6.2e-5, row 4e-12 and 1.2e-3, relative L2 2.8e-13 and 5.6e-5.
 GRADIENT_BOUNDS = {
     torch.float64: GradientBounds(element=1e-12, row=3e-11, row_floor=1e-3, relative_l2=1e-12),
-    torch.float32: GradientBounds(element=1e-4, row=5e-3, row_floor=1e-3, relative_l2=1e-4),
+    torch.float32: GradientBounds(element=3e-4, row=5e-3, row_floor=1e-3, relative_l2=3e-4),
 }
 
-# Hypothesis would otherwise shrink a failure for minutes, and its clock does not know compilation.
+# The same scenes in each run: how closely gradients agree depends on their conditioning, which has no bound over all
+# scenes. No shrinking, which takes minutes; no clock, which does not know compilation.
 PROPERTY = settings(
     deadline=None,
-    max_examples=20,
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+    derandomize=True,
+    max_examples=25,
+    phases=[Phase.explicit, Phase.generate],
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 
