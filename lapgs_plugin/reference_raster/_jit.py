@@ -59,6 +59,11 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
         stamp = (self._impl.locator.get_source_stamp(), _SHARED_STAMP)
         self._cache_file = caching.IndexDataCacheFile(self._cache_path, self._impl.filename_base, stamp)
 
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save machine code; on a full disk the next process compiles again, and this one goes on."""
+        with suppress(OSError):
+            super().save_overload(sig, data)
+
 
 class _Announcement(event.Listener):  # type: ignore[misc]  # see above
     """Says once in a process that kernels are being compiled. Loading them from the cache is silent."""

@@ -304,11 +304,20 @@ def test_compiling_is_announced_once_and_happens_again_only_after_a_change(copie
     assert MESSAGE in run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
 
 
-def test_nowhere_to_cache_is_no_error(copied_package: Path) -> None:
-    nowhere = """
+NOWHERE = """
 from numba.core import caching
 for locator in caching.CacheImpl._locator_classes:
     locator.from_function = classmethod(lambda cls, function, file: None)
 """
-    assert MESSAGE in run_python(nowhere + TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
+FULL_DISK = """
+from numba.core import caching
+def save(self, key, data):
+    raise OSError(28, "No space left on device")
+caching.IndexDataCacheFile.save = save
+"""
+
+
+@pytest.mark.parametrize("trouble", [NOWHERE, FULL_DISK])
+def test_no_place_for_a_cache_is_no_error(trouble: str, copied_package: Path) -> None:
+    assert MESSAGE in run_python(trouble + TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
     assert not list(copied_package.rglob("*.nbc"))
