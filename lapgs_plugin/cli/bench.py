@@ -110,17 +110,18 @@ def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> li
 
 
 def _print_results(results: Sequence[CaseResult]) -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.evaluation.bench_raster import FAST, machine
 
-    times = Table(title="A training iteration, medians")
+    times = Table(title="A training iteration, medians", box=box.SIMPLE, pad_edge=False)
     for heading in ("size", "Gaussians", "a pixel", "contender", "ms", "times cpu", "required"):
-        times.add_column(heading, justify="right")
-    parts = Table(title=f"Where the time of {FAST} goes, medians in ms")
-    for heading in ("size", *(name.replace("_", " ") for name in results[0].parts), "loss adds", "memory"):
-        parts.add_column(heading, justify="right")
+        times.add_column(heading, justify="right", no_wrap=True)
+    parts = Table(title=f"Where the time of {FAST} goes, medians in ms", box=box.SIMPLE, pad_edge=False)
+    for heading in ("size", *(name.replace("_", "\n") for name in results[0].parts), "loss\nadds", "MB"):
+        parts.add_column(heading, justify="right", no_wrap=True)
     for result in results:
         case = result.case
         for name, ms in result.milliseconds.items():
@@ -131,8 +132,8 @@ def _print_results(results: Sequence[CaseResult]) -> None:
             required = f"{case.required[name]:g}" if name in case.required else ""
             times.add_row(*about, name, f"{ms:.1f}", ratio, required)
         times.add_section()
-        memory = "" if result.peak_memory is None else f"{result.peak_memory / 1e6:.0f} MB"
-        parts.add_row(case.size, *(f"{ms:.2f}" for ms in result.parts.values()), f"{result.loss_share:.0%}", memory)
+        memory = "" if result.peak_memory is None else f"{result.peak_memory / 1e6:.0f}"
+        parts.add_row(case.size, *(f"{ms:.1f}" for ms in result.parts.values()), f"{result.loss_share:.0%}", memory)
     console = Console()
     console.print(times, parts)
     for result in results:
