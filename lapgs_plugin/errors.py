@@ -6,7 +6,7 @@ from typing import ClassVar
 
 
 class LapgsError(Exception):
-    """Something went wrong that one clear line can explain; the command line prints that line and exits with `exit_code`.
+    """Something went wrong that one clear line explains; the command line prints it and exits with `exit_code`.
 
     The message says what was wrong, the value received, what was expected and what to do next.
     """

@@ -65,12 +65,13 @@ def inherit(
     """The residual field that continues from the field of the next coarser level (paper, "Initialization and
     inheritance" and the supplement's ablation).
 
-    "geometry", ours, keeps positions, shapes and opacities and starts with zero colour, so that the residual renders
-    exactly zero where the paper's would too, but by Gaussians that already follow the scene's surfaces. "xyz", the
-    paper's default, keeps the positions and starts everything else afresh: scale from the nearest neighbours among the
-    kept Gaussians, opacity 0.1, no rotation, and zero colour. "full" keeps every parameter, colours included, as the paper ("retains all parameters") and its authors' release do; `kept` tells which
-    rows of the optimizer state go with it. As a residual's colour is the raw SH value, what inherits fully from a base
-    starts as the base's image minus 0.5 wherever that is opaque, and has to unlearn it.
+    "geometry", ours, keeps positions, shapes and opacities and starts with zero colour: the residual renders exactly
+    zero, by Gaussians that already follow the scene's surfaces. "xyz", the paper's default, keeps the positions and
+    starts everything else afresh: scale from the nearest neighbours among the kept Gaussians, opacity 0.1, no rotation,
+    and zero colour. "full" keeps every parameter, colours included, as the paper ("retains all parameters") and its
+    authors' release do; `kept` tells which rows of the optimizer state go with it. As a residual's colour is the raw SH
+    value, what inherits fully from a base starts as the base's image minus 0.5 wherever that is opaque, and has to
+    unlearn it.
 
     Args:
         field: of the coarser level; not modified.

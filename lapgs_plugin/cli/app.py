@@ -8,9 +8,12 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin import __version__
+from lapgs_plugin.cli import patch
 from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.cli.report import report
 from lapgs_plugin.cli.sample import sample
@@ -45,11 +48,14 @@ def options(
 
 
 app.command("sample")(sample)
+app.command("prepare")(prepare)
 app.command("train")(train)
 app.command("eval")(evaluate)
 app.command("render")(render)
 app.command("report")(report)
 app.add_typer(bench_app, name="bench")
+app.command("conformance")(conformance)
+app.add_typer(patch.app, name="patch")
 app.command("doctor")(doctor)
 
 

@@ -46,7 +46,7 @@ def train(
         str | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of the iterations of each stage, coarsest first. Default: the paper's, 1/3,2/3 for two levels.",
+            help="Share of the iterations of each stage, coarsest first. Default for two levels: 1/2,1/2 (the paper: 1/3,2/3).",
         ),
     ] = None,
     supervision: Annotated[
@@ -176,7 +176,7 @@ def _inheritance(text: str) -> dict[str, Any]:
         return {"inherit": mode, "inherit_ratio": float(ratio or 1.0)}
     except ValueError as error:
         raise UserInputError(
-            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1] such as 0.5, or both as xyz:0.5"
+            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
         ) from error
 
 

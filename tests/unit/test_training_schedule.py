@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import StagePlan
+from lapgs_plugin.plan import StagePlan, parse_split
 from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
 from lapgs_plugin.training.views import view_index
 
 
 def schedules(settings: TrainSettings) -> list[StageSchedule]:
-    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels)
+    split = None if settings.split is None else parse_split(",".join(settings.split))
+    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, split)
     return [StageSchedule.create(settings, stage) for stage in plan]
 
 
@@ -31,7 +32,7 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
 
 
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
-    base, residual = schedules(TrainSettings(levels=2))
+    base, residual = schedules(TrainSettings(levels=2, split=("1/3", "2/3")))
     assert (base.densify_until, residual.densify_until) == (5000, 10_000)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
@@ -40,7 +41,7 @@ def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
 
 def test_given_constants_are_kept_in_short_runs() -> None:
     chosen = Densification(start=7, until=600, every=11, reset_every=13)
-    base, residual = schedules(TrainSettings(iterations=900, densification=chosen, sh_every=5))
+    base, residual = schedules(TrainSettings(iterations=900, split=("1/3", "2/3"), densification=chosen, sh_every=5))
     assert (base.densify_until, residual.densify_until) == (200, 400)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (7, 11, 13)
