@@ -134,7 +134,9 @@ class CudaExtension:
         n, height, width = len(field), camera.height, camera.width
         inputs = {
             "means3D": field.means,
-            "means2D": _Screen.apply(means2d, width, height, 4 if self._absolute else 3, absgrad2d),
+            "means2D": _Screen.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
+                means2d, width, height, 4 if self._absolute else 3, absgrad2d
+            ),
             "opacities": torch.sigmoid(field.opacity_logits)[:, None],  # (n, 1)
             "scales": torch.exp(field.log_scales),
             "rotations": torch.nn.functional.normalize(
@@ -150,7 +152,8 @@ class CudaExtension:
         # Without Gaussians the kernels leave out the background, and without any in view some launch an empty grid.
         empty = background[:, None, None].expand(3, height, width)
         radii = torch.zeros(n, dtype=torch.int32, device=field.means.device)
-        return _Untouched.apply(empty, *inputs.values()), radii
+        untouched = _Untouched.apply(empty, *inputs.values())  # type: ignore[no-untyped-call]  # as above
+        return untouched, radii
 
     def _check(self, field: GaussianField, background: Tensor) -> None:
         for name, tensor in {**field.parameters, "background": background}.items():
@@ -202,7 +205,7 @@ class _Screen(torch.autograd.Function):
         return means2d.new_zeros(len(means2d), columns)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.absgrad2d is not None:
             ctx.absgrad2d.copy_(gradient[:, 2:4] * ctx.pixel)
@@ -218,7 +221,7 @@ class _Untouched(torch.autograd.Function):
         return image.clone()
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
         return gradient, *(torch.zeros_like(value) for value in ctx.saved_tensors)
 

@@ -46,7 +46,7 @@ def train(
         str | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of the iterations of each stage, coarsest first. Default for two levels: 1/2,1/2 (the paper: 1/3,2/3).",
+            help="Share of the iterations of each stage, coarsest first. Two levels: 1/2,1/2 (paper: 1/3,2/3).",
         ),
     ] = None,
     supervision: Annotated[

@@ -60,7 +60,7 @@ def gradients(rasterizer: Rasterizer, case: Case, weights: Tensor) -> dict[str, 
     """Gradients of sum(weights * image): by parameter name, and as `means2d` and (where offered) `absgrad2d`."""
     case = case.with_leaves()
     result = case.render(rasterizer)
-    (result.image * weights).sum().backward()
+    (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     found = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
     if result.absgrad2d is not None:
         found["absgrad2d"] = result.absgrad2d.clone()

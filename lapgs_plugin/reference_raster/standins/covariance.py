@@ -107,7 +107,7 @@ class _Antialiasing(torch.autograd.Function):
         return factors
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    @once_differentiable
     def backward(ctx: Any, grad_factors: Tensor) -> Tensor:
         wide, share, factors = ctx.saved_tensors
         x, z, y = wide.unbind(1)

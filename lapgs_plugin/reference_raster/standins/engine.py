@@ -258,7 +258,7 @@ class _Rasterize(torch.autograd.Function):
         return image, inverse_depths, radii
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch leaves it without types
+    @once_differentiable
     def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
         tensors: tuple[Tensor | None, ...] = ctx.saved_tensors
