@@ -4,14 +4,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
-DEMO_ITERATIONS := 1000
+DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
 .PHONY: demo test check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
-	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/baseline --levels 1 --iterations $(DEMO_ITERATIONS) --eval --overwrite
-	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/hierarchy --levels 2 --iterations $(DEMO_ITERATIONS) --eval --overwrite
+	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/baseline --levels 1 $(DEMO_OPTIONS)
+	$(BIN)/lapgs train $(DEMO)/scene -o $(DEMO)/hierarchy --levels 2 $(DEMO_OPTIONS)
 	$(BIN)/lapgs eval $(DEMO)/baseline
 	$(BIN)/lapgs eval $(DEMO)/hierarchy
 	$(BIN)/lapgs render $(DEMO)/hierarchy

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
+from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import HookDispatcher, StageHook
@@ -22,7 +23,7 @@ from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.supervision import Supervision, parse_supervision
+from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.model import TrainableField
@@ -43,6 +44,17 @@ def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
     """
     split = None if settings.split is None else parse_split(",".join(settings.split))
     return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split)
+
+
+def warm_up(rasterizer: Rasterizer) -> None:
+    """Run every kernel of an iteration once, so that compiling them is not taken for training."""
+    settings = TrainSettings(sh_degree=0)
+    ahead = torch.tensor([[0.0, 0.0, 1.0]])
+    model = TrainableField.create(field_from_points(ahead, ahead, 0), settings.learning_rates, extent=1.0)
+    camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
+    image = rasterizer(model.field, camera, background=torch.zeros(3)).image
+    photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
+    model.step(means_rate=0.0, active_coefficients=1)
 
 
 @dataclass
@@ -91,6 +103,7 @@ class Trainer:
         checkpoint = self.archive.load_checkpoint() if resume else None
         with stop_request() as stop:
             try:
+                warm_up(self.rasterizer)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
                         continue
