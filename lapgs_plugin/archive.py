@@ -576,16 +576,21 @@ class PredictionCache:
     """
 
     def __init__(self, where: str = "memory", precision: str = "float32", folder: Path | None = None) -> None:
-        if where not in ("memory", "disk"):
-            raise UserInputError(f"--cache {where}: expected memory or disk")
-        if precision not in PRECISIONS:
-            raise UserInputError(f"--cache-precision {precision}: expected {', '.join(PRECISIONS)}")
+        self.check(where, precision)
         assert where == "memory" or folder is not None, "a cache on disk needs a folder"
         self._dtype = np.dtype(PRECISIONS[precision])
         self._folder = folder if where == "disk" else None
         self._images: dict[str, _CachedImage] = {}
         self._coming: dict[str, Future[NDArray[np.float32]]] = {}
         self._loader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prediction-cache")
+
+    @staticmethod
+    def check(where: str, precision: str) -> None:
+        """Raise what the constructor would about its first two arguments."""
+        if where not in ("memory", "disk"):
+            raise UserInputError(f"--cache {where}: expected memory or disk")
+        if precision not in PRECISIONS:
+            raise UserInputError(f"--cache-precision {precision}: expected {', '.join(PRECISIONS)}")
 
     def put(self, name: str, image: Tensor) -> None:
         """Keep the prediction of a view.

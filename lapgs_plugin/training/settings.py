@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from lapgs_plugin.archive import Manifest, PredictionCache
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.plan import Stage
-
-if TYPE_CHECKING:
-    from lapgs_plugin.archive import Manifest
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.supervision import parse_supervision
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
@@ -68,6 +68,9 @@ class TrainSettings:
     densification: Densification = field(default_factory=Densification)
 
     def __post_init__(self) -> None:
+        parse_supervision(self.supervision)
+        Pyramid(self.grid)
+        PredictionCache.check(self.cache, self.cache_precision)
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
         if not 0.0 < self.inherit_ratio <= 1.0:

@@ -1,0 +1,91 @@
+"""`lapgs train` as a person meets it: one line for each mistake, nothing written by one, Ctrl-C and --resume."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.scenes.sample import make_sample_scene
+
+SHORT = ("--iterations", "40", "--sh-degree", "1")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "sample"
+    make_sample_scene(path, width=64, height=48, views=10, points=300, progress=False)
+    return path
+
+
+def lapgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path: Path) -> None:
+    done = lapgs("train", scene, "-o", tmp_path / "run", "--eval", *SHORT)
+    assert done.returncode == 0, done.stderr
+    archive = RunArchive.open(tmp_path / "run")
+    assert archive.manifest.complete
+    before = archive.field_path(0).read_bytes()
+    again = lapgs("train", scene, "-o", tmp_path / "run", *SHORT)
+    assert again.returncode == 2
+    assert "--resume" in again.stderr.strip().splitlines()[-1]
+    assert archive.field_path(0).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--levels", "3"), "level 2 of 3 would be 16x12 pixels"),
+        (("--split", "1/3,1/3"), "sum to 1"),
+        (("--levels", "1", "--split", "1/3,2/3"), "--split has 2 shares, expected 1"),
+        (("--inherit", "1.5"), "above 0 and at most 1"),
+        (("--inherit", "colours"), "expected geometry, xyz, full"),
+        (("--supervision", "magic"), "expected reconstructed, online_residual, gt_laplacian"),
+        (("--grid", "odd"), "expected camera or even"),
+        (("--rasterizer", "cuda"), "expected cpu or oracle"),
+        (("--resolution", "8k"), "expected 1k, 2k, 4k"),
+        (("--background", "2,0,0"), "from 0 to 1"),
+        (("--resume",), "is not a run"),
+        (("--resume", "--overwrite"), "contradict"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(
+    scene: Path, tmp_path: Path, options: tuple[str, ...], message: str
+) -> None:
+    result = lapgs("train", scene, "-o", tmp_path / "run", "--iterations", "40", *options)
+    assert result.returncode == 2
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("lapgs: ")
+    assert message in last
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "run" / "manifest.json").exists()
+
+
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bits(scene: Path, tmp_path: Path) -> None:
+    options = (scene, "--iterations", "400", "--sh-degree", "1", "--densify-every", "50")
+    assert lapgs("train", *options, "-o", tmp_path / "whole").returncode == 0
+    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "train", *map(str, options)]
+    with subprocess.Popen([*command, "-o", tmp_path / "parts"], stderr=subprocess.PIPE, text=True) as process:
+        history = tmp_path / "parts" / "history.jsonl"
+        deadline = time.monotonic() + 60
+        while not (history.exists() and history.stat().st_size > 0) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "--resume continues" in errors.replace("\n", " ")
+    other = lapgs("train", scene, "-o", tmp_path / "parts", "--resume", "--iterations", "500")
+    assert other.returncode == 2
+    assert "--iterations asks for 500" in other.stderr
+    assert lapgs("train", *options, "-o", tmp_path / "parts", "--resume").returncode == 0
+    whole, parts = RunArchive.open(tmp_path / "whole"), RunArchive.open(tmp_path / "parts")
+    for level in (1, 0):
+        assert whole.field_path(level).read_bytes() == parts.field_path(level).read_bytes()
