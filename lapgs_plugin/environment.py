@@ -24,6 +24,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import packaging.requirements
+
 PACKAGE = "lapgs_plugin"
 PROBE_TIMEOUT = 60.0
 """Seconds that one import or one foreign program may take; a first import from a network disk takes tens."""
@@ -248,12 +250,19 @@ def extra_findings(requirements: Sequence[Requirement]) -> list[Finding]:
 
 
 def own_requirements() -> list[Requirement]:
-    """What this package's metadata asks for; empty when it is not installed."""
+    """What this package's metadata asks for on this Python; empty when it is not installed."""
     try:
         texts = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
         return []
-    return [_parse_requirement(text) for text in texts]
+    return [_parse_requirement(text) for text in texts if _applies(text)]
+
+
+def _applies(text: str) -> bool:
+    """Whether a requirement's marker, extras aside, holds here."""
+    marker = packaging.requirements.Requirement(text).marker
+    extra = _parse_requirement(text).extra
+    return marker is None or marker.evaluate({"extra": extra})
 
 
 def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:

@@ -43,7 +43,7 @@ class Case:
 
     @property
     def background_tensor(self) -> Tensor:
-        return torch.tensor(self.background).to(self.field.means)
+        return torch.tensor(self.background, dtype=self.field.means.dtype, device=self.field.means.device)
 
     def render(self, rasterizer: Rasterizer) -> RenderResult:
         return rasterizer(self.field, self.camera, background=self.background_tensor, sh_degree=self.sh_degree)
