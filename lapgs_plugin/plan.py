@@ -20,7 +20,7 @@ DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
 """Share of the iterations of each stage, coarsest first.
 
 Three and four levels are split as in the paper. Its main tables give two levels 1/3, 2/3; halves gave it 0.12 dB more
-in 3.5 % more time (its ablation on the split), and 0.55 dB more in the same time on the scene in docs/training.md.
+in 3.5 % more time (its ablation on the split). On the one scene of docs/training.md: +0.55 dB at 1/4, -0.29 at 1/8.
 """
 
 
