@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import math
 from types import ModuleType
 from typing import Any
 
@@ -20,6 +21,7 @@ from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.raster import RenderResult, Semantics
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 
 SEMANTICS = {
     "diff_gaussian_rasterization": Semantics(
@@ -50,6 +52,15 @@ NEAR, FAR = 0.01, 100.0
 """Clipping planes of the projection matrix; the kernels use its other rows only."""
 SH_REST_COUNT = 15
 """Coefficients above the first at degree 3."""
+LOOKED_AT = 65536
+"""Gaussians looked at, about, for one that is certain to be in a tile."""
+MARGIN = 0.01
+"""How far inside the image, in pixels, a centre counts as certain to be."""
+MODERATE = 100.0
+"""Largest standard deviation, in pixels on the optical axis, of a Gaussian that counts as certain to be in a tile."""
+VISIBLE_LOGIT = math.log(2.4 / (255 - 2.4))
+"""Opacity over exp(5/6) / 255, and still under the 0.01 that training resets opacities to."""
+COMPANION_OPACITY = 1.05 / 255
 
 
 def installed_extensions() -> list[str]:
@@ -80,6 +91,8 @@ class CudaExtension:
         self._device = torch.device(device)
         self._settings = _known_settings(module)
         self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
+        # The first rasterizer to take DC apart also was the first to blend a tile's Gaussians in buckets of 32.
+        self._in_buckets = self._takes_dc
         # One that also sums absolute gradients puts them behind the ordinary ones.
         self._absolute = "metric_map" in self._settings
         self._module = module
@@ -131,11 +144,11 @@ class CudaExtension:
         absgrad2d: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """(3, h, w) image and (n,) radii."""
-        n, height, width = len(field), camera.height, camera.width
+        n = len(field)
         inputs = {
             "means3D": field.means,
             "means2D": _Screen.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
-                means2d, width, height, 4 if self._absolute else 3, absgrad2d
+                means2d, camera.width, camera.height, 4 if self._absolute else 3, absgrad2d
             ),
             "opacities": torch.sigmoid(field.opacity_logits)[:, None],  # (n, 1)
             "scales": torch.exp(field.log_scales),
@@ -144,16 +157,13 @@ class CudaExtension:
             ),  # the kernels leave that to the caller
             **(self._sh_inputs(field.sh) if colors is None else {"colors_precomp": colors}),
         }
-        if n > 0:
-            rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
-            image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
-            if _blends_something(image):
-                return image, radii
-        # Without Gaussians the kernels leave out the background, and without any in view some launch an empty grid.
-        empty = background[:, None, None].expand(3, height, width)
-        radii = torch.zeros(n, dtype=torch.int32, device=field.means.device)
-        untouched = _Untouched.apply(empty, *inputs.values())  # type: ignore[no-untyped-call]  # as above
-        return untouched, radii
+        # Without Gaussians the kernels leave out the background. With none in any tile, those that blend in buckets
+        # write beyond their tiles' ranges, or launch a grid of no blocks in the backward pass.
+        if n == 0 or (self._in_buckets and not _surely_blends(field, camera)):
+            inputs = _with_companion(inputs, camera)
+        rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
+        image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
+        return image, radii[:n]
 
     def _check(self, field: GaussianField, background: Tensor) -> None:
         for name, tensor in {**field.parameters, "background": background}.items():
@@ -212,20 +222,6 @@ class _Screen(torch.autograd.Function):
         return gradient[:, :2] * ctx.pixel, None, None, None, None
 
 
-class _Untouched(torch.autograd.Function):
-    """(image, *inputs) -> the image, with gradients of zero for inputs that are not in it."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, *inputs: Tensor) -> Tensor:
-        ctx.save_for_backward(*inputs)
-        return image.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        return gradient, *(torch.zeros_like(value) for value in ctx.saved_tensors)
-
-
 def _known_settings(module: ModuleType) -> tuple[str, ...]:
     """Names of the fields of the extension's settings."""
     names: tuple[str, ...] = module.GaussianRasterizationSettings._fields
@@ -238,9 +234,43 @@ def _known_settings(module: ModuleType) -> tuple[str, ...]:
     return names
 
 
-def _blends_something(image: Tensor) -> bool:
-    """Whether any Gaussian was in any tile, as the extension noted it for its backward pass; True if it did not."""
-    return all(getattr(image.grad_fn, name, 1) > 0 for name in ("num_rendered", "num_buckets"))
+def _surely_blends(field: GaussianField, camera: Camera) -> bool:
+    """Whether some Gaussian is certain to be in a tile, however kernels round; False may mean that it was not found.
+
+    A tile takes in a Gaussian whose alpha reaches 1/255 somewhere between its first and last pixels. One whose centre
+    is in the image is at most half a pixel each way from such a place, where with 0.3 px^2 or more of variance alpha
+    is still exp(-5/6) of its opacity.
+    """
+    with torch.no_grad():
+        step = len(field) // LOOKED_AT + 1
+        field = field.with_parameters({name: value[::step] for name, value in field.parameters.items()})
+        pose = camera.world_to_camera.to(field.means)
+        depths = field.means @ pose[2, :3] + pose[2, 3]  # (m,)
+        centres = _centres(field, camera)  # (m, 2)
+        last = centres.new_tensor([camera.width - 1, camera.height - 1])  # (2,)
+        inside = ((centres >= MARGIN) & (centres <= last - MARGIN)).all(1)  # (m,)
+        # A footprint of a few hundred pixels at most: the determinant of its covariance cannot round to 0, which culls.
+        moderate = torch.exp(field.log_scales.amax(1)) * max(camera.fx, camera.fy) < MODERATE * depths  # (m,)
+        visible = field.opacity_logits > VISIBLE_LOGIT  # (m,)
+        return bool((inside & moderate & visible & (depths > 2 * NEAR_DEPTH)).any())
+
+
+def _with_companion(inputs: dict[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    """A rasterizer's inputs with a last Gaussian that is in a tile and in no pixel: no bit of the image is another.
+
+    It is a point between the first four pixels, where its alpha is just over 1/255. At the pixels, which the 0.3 px^2
+    let it reach, it is less than half of that.
+    """
+    rows = {name: value.new_zeros(1, *value.shape[1:]) for name, value in inputs.items()}
+    pose = camera.world_to_camera.to("cpu", torch.float64)
+    # Far enough for float32, which knows the centre to an epsilon of the camera's distance from the origin.
+    depth = 1 + float(pose[:3, 3].norm())
+    point = torch.tensor([(1 - camera.cx) / camera.fx, (1 - camera.cy) / camera.fy, 1.0], dtype=torch.float64) * depth
+    rows["means3D"] = ((point - pose[:3, 3]) @ pose[:3, :3])[None].to(rows["means3D"])  # (1, 3)
+    rows["scales"] += 1e-4 * depth / max(camera.fx, camera.fy)
+    rows["rotations"][:, 0] = 1
+    rows["opacities"] += COMPANION_OPACITY
+    return {name: torch.cat([value, rows[name]]) for name, value in inputs.items()}
 
 
 def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
