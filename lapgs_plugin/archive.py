@@ -1,4 +1,4 @@
-"""Run folders: what a training run leaves behind, and the cache of predictions that the next stage builds on.
+"""Run folders: what a training run leaves behind.
 
     RUN/manifest.json              everything needed to render the run again
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
@@ -15,20 +15,16 @@ from __future__ import annotations
 
 import json
 import shutil
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from lapgs_plugin import __version__
-from lapgs_plugin.errors import FieldError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField, count_gaussians
 from lapgs_plugin.files import LOCK, TEMPORARY_PATTERN, FolderLock, atomic_write, one_line_errors
 
@@ -73,6 +69,7 @@ class LevelRecord:
         train_seconds: iterative optimization alone.
         overhead_seconds: everything else by name, such as "pyramid", "cache", "inheritance", "archive".
         image_size: (width, height) in pixels it was trained at.
+        memory_bytes: on a GPU, "peak" of its memory during training and how much of that were "images".
     """
 
     level: int
@@ -83,6 +80,7 @@ class LevelRecord:
     train_seconds: float
     overhead_seconds: dict[str, float]
     image_size: tuple[int, int]
+    memory_bytes: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -162,7 +160,8 @@ class Manifest:
         values = _only_fields(cls, values)
         scene = _only_fields(SceneReference, values["scene"])
         scene["background"] = tuple(scene["background"])
-        records = [_only_fields(LevelRecord, record) for record in values["records"]]
+        # Runs of the first weeks do not know their memory.
+        records = [_only_fields(LevelRecord, {"memory_bytes": {}, **record}) for record in values["records"]]
         values["scene"] = SceneReference(**scene)
         values["records"] = tuple(LevelRecord(**{**r, "image_size": tuple(r["image_size"])}) for r in records)
         return cls(**values)
@@ -545,143 +544,3 @@ def _remove_scratch(folder: Path) -> None:
     if (folder / HISTORY).exists():
         with (folder / HISTORY).open("r+b") as stream:
             stream.truncate(stream.read().rfind(b"\n") + 1)
-
-
-PRECISIONS = {"float32": np.float32, "float16": np.float16, "uint8": np.uint8}
-
-
-@dataclass(frozen=True)
-class _CachedImage:
-    """An encoded image: value = low + step * stored. On disk `stored` is None and `path` holds the bytes."""
-
-    shape: tuple[int, ...]
-    low: float
-    step: float
-    num_bytes: int
-    stored: NDArray[Any] | None
-    path: Path | None
-
-
-class PredictionCache:
-    """Up(I_hat^l) of every training view, kept for the next stage.
-
-    Args:
-        where: "memory", or "disk" for scenes larger than that.
-        precision: what a value is stored as: "float32" exact, "float16", or "uint8" in 256 steps over the range of
-            each image (predictions are not confined to [0, 1] between levels).
-        folder: for "disk", where to keep the files; made here and removed by `close`.
-
-    Raises:
-        UserInputError: an unknown place or precision.
-    """
-
-    def __init__(self, where: str = "memory", precision: str = "float32", folder: Path | None = None) -> None:
-        self.check(where, precision)
-        assert where == "memory" or folder is not None, "a cache on disk needs a folder"
-        self._dtype = np.dtype(PRECISIONS[precision])
-        self._folder = folder if where == "disk" else None
-        self._images: dict[str, _CachedImage] = {}
-        self._coming: dict[str, Future[NDArray[np.float32]]] = {}
-        self._loader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prediction-cache")
-
-    @staticmethod
-    def check(where: str, precision: str) -> None:
-        """Raise what the constructor would about its first two arguments."""
-        if where not in ("memory", "disk"):
-            raise UserInputError(f"--cache {where}: expected memory or disk")
-        if precision not in PRECISIONS:
-            raise UserInputError(f"--cache-precision {precision}: expected {', '.join(PRECISIONS)}")
-
-    def put(self, name: str, image: Tensor) -> None:
-        """Keep the prediction of a view.
-
-        Args:
-            name: of the view.
-            image: (3, h, w), any float type and device, not clamped.
-
-        Raises:
-            TrainingDivergedError: it holds NaN or inf.
-            RunFolderError: the disk is full or the folder not writable.
-        """
-        values = image.detach().to("cpu", torch.float32).contiguous().numpy()
-        low, high = float(values.min()), float(values.max())
-        if not np.isfinite(high - low):
-            raise TrainingDivergedError(
-                f"the prediction of view {name} holds NaN or inf; the levels finished before are kept"
-            )
-        if self._dtype == np.uint8:
-            step = (high - low) / 255 or 1.0  # a constant image is all zeros, whatever the step
-            stored = np.rint((values - np.float32(low)) / np.float32(step)).astype(np.uint8)
-        else:
-            low, step = 0.0, 1.0
-            stored = values.astype(self._dtype)  # a copy: the caller may go on using the image's memory
-        path = self._store(name, stored) if self._folder is not None else None
-        self._images[name] = _CachedImage(
-            values.shape, low, step, stored.nbytes, stored if path is None else None, path
-        )
-
-    def prefetch(self, name: str) -> None:
-        """Start loading, in the background, what `get` will be asked for next."""
-        if name not in self._coming:
-            self._coming[name] = self._loader.submit(self._load, self._images[name])
-
-    def get(self, name: str) -> Tensor:
-        """The prediction of a view, (3, h, w) float32 on the CPU; not to be modified.
-
-        Raises:
-            KeyError: it was never put.
-            RunFolderError: its file cannot be read any more.
-        """
-        coming = self._coming.pop(name, None)
-        return torch.from_numpy(self._load(self._images[name]) if coming is None else coming.result())
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of all predictions, in memory or on disk."""
-        return sum(image.num_bytes for image in self._images.values())
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def close(self) -> None:
-        """Forget everything and remove the files."""
-        self._loader.shutdown(wait=True, cancel_futures=True)
-        self._coming.clear()
-        self._images.clear()
-        if self._folder is not None and self._folder.is_dir():
-            shutil.rmtree(self._folder)
-
-    def __enter__(self) -> PredictionCache:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _store(self, name: str, stored: NDArray[Any]) -> Path:
-        assert self._folder is not None
-        known = self._images.get(name)
-        # Numbered, because view names may hold slashes or what a file system refuses.
-        path = known.path if known and known.path else self._folder / f"{len(self._images):06d}.bin"
-        with one_line_errors(path):
-            self._folder.mkdir(parents=True, exist_ok=True)
-            try:
-                path.write_bytes(stored.data)
-            except OSError:
-                path.unlink(missing_ok=True)  # half an image would only keep a full disk full
-                raise
-        return path
-
-    def _load(self, image: _CachedImage) -> NDArray[np.float32]:
-        # NumPy and not torch: this may run in the background thread, where torch would start a second thread pool.
-        stored = image.stored
-        if stored is None:
-            assert image.path is not None
-            with one_line_errors(image.path, "read"):
-                stored = np.fromfile(image.path, self._dtype).reshape(image.shape)
-        values = stored.astype(np.float32, copy=False)
-        if self._dtype == np.uint8:
-            values *= np.float32(image.step)
-            values += np.float32(image.low)
-        return values

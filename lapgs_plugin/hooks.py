@@ -171,6 +171,12 @@ class HookDispatcher:
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
         """The sum of all hooks' terms, a scalar."""
+        total = self.extra_loss(context, image)
+        assert total is not None, "no hook supervises"
+        return total
+
+    def extra_loss(self, context: StageContext, image: Tensor) -> Tensor | None:
+        """The sum of all hooks' terms, a scalar; None if none has one."""
         total: Tensor | None = None
         for hook in self._hooks:
             term = hook.loss(context, image)
@@ -181,7 +187,6 @@ class HookDispatcher:
                     f"hook {type(hook).__qualname__}: loss returned {_describe(term)}, expected a scalar Tensor or None"
                 )
             total = term if total is None else total + term
-        assert total is not None, "no hook supervises"
         return total
 
     def after_backward(self, context: StageContext) -> None:

@@ -24,6 +24,23 @@ SMALLEST_SQUARED_DISTANCE = 1e-7
 """Floor of the mean squared distance to the neighbours, in squared world units: points may coincide."""
 
 
+def parse_inheritance(text: str) -> tuple[str, float]:
+    """A mode and a ratio from what --inherit takes: MODE, RATIO or MODE:RATIO.
+
+    Raises:
+        UserInputError: it is none of these.
+    """
+    mode, _, ratio = text.partition(":")
+    try:
+        if mode not in INHERIT_MODES:
+            mode, ratio = "geometry", text
+        return mode, float(ratio or 1.0)
+    except ValueError as error:
+        raise UserInputError(
+            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
+        ) from error
+
+
 class Inherited(NamedTuple):
     """A new field and the Gaussians of the old one that it came from.
 

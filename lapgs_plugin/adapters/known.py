@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from lapgs_plugin.adapters.base import BackboneAdapter
 
 
 @dataclass(frozen=True)
@@ -13,18 +20,22 @@ class KnownCheckout:
     Attributes:
         name: as its authors write it.
         files: what its checkout has, relative to its root; all of them must be there.
+        key: what `--backbone` calls it; None where `lapgs run` does not drive it.
+        adapter: module and class that drive it.
     """
 
     name: str
     files: tuple[str, ...]
+    key: str | None = None
+    adapter: str = ""
 
 
 GRAPHDECO_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
 
 KNOWN_CHECKOUTS = (
-    KnownCheckout("FastGS", (*GRAPHDECO_FILES, "utils/fast_utils.py")),
-    KnownCheckout("Taming-3DGS", (*GRAPHDECO_FILES, "utils/taming_utils.py")),
-    KnownCheckout("graphdeco 3DGS or a fork of it", GRAPHDECO_FILES),
+    KnownCheckout("FastGS", (*GRAPHDECO_FILES, "utils/fast_utils.py"), "fastgs", "fastgs:FastGSAdapter"),
+    KnownCheckout("Taming-3DGS", (*GRAPHDECO_FILES, "utils/taming_utils.py"), "taming", "taming:TamingAdapter"),
+    KnownCheckout("graphdeco 3DGS or a fork of it", GRAPHDECO_FILES, "graphdeco", "graphdeco:GraphdecoAdapter"),
     KnownCheckout("gsplat", ("gsplat/rendering.py", "examples/simple_trainer.py")),
 )
 """Most specific first: FastGS and Taming-3DGS are forks of graphdeco's code, and FastGS took over files of Taming's."""
@@ -44,3 +55,23 @@ def recognise_checkout(folder: Path) -> KnownCheckout | None:
         if all((folder / name).is_file() for name in checkout.files):
             return checkout
     return None
+
+
+def adapter_class(folder: Path, key: str | None = None) -> type[BackboneAdapter]:
+    """The adapter for the checkout whose root is `folder`, or the one called `key`.
+
+    Raises:
+        UserInputError: the checkout is none that is known, or no adapter is called that.
+    """
+    drivable = {checkout.key: checkout for checkout in KNOWN_CHECKOUTS if checkout.key is not None}
+    if key is not None and key not in drivable:
+        raise UserInputError(f"--backbone {key}: expected {', '.join(drivable)}")
+    found = recognise_checkout(folder) if key is None else drivable[key]
+    if found is None or found.key is None:
+        raise UserInputError(
+            f"{folder} is not the root of a checkout that `lapgs run` knows (FastGS, Taming-3DGS, "
+            f"graphdeco 3DGS), which have {', '.join(GRAPHDECO_FILES)}; name it with --backbone, or use `lapgs train` without a checkout"
+        )
+    module, name = found.adapter.split(":")
+    adapter: Any = getattr(import_module(f"lapgs_plugin.adapters.{module}"), name)
+    return adapter  # type: ignore[no-any-return]  # found by name

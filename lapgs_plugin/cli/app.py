@@ -16,6 +16,8 @@ from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.cli.report import report
+from lapgs_plugin.cli.run import CONTEXT as RUN_CONTEXT
+from lapgs_plugin.cli.run import run as run_backbone
 from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError
@@ -50,6 +52,7 @@ def options(
 app.command("sample")(sample)
 app.command("prepare")(prepare)
 app.command("train")(train)
+app.command("run", context_settings=RUN_CONTEXT)(run_backbone)
 app.command("eval")(evaluate)
 app.command("render")(render)
 app.command("report")(report)

@@ -125,17 +125,20 @@ def train(
     from rich.console import Console
 
     from lapgs_plugin.archive import SceneReference
+    from lapgs_plugin.inheritance import parse_inheritance
     from lapgs_plugin.training.settings import Densification, TrainSettings
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
+    mode, ratio = parse_inheritance(inherit)
     settings = TrainSettings(
         iterations=iterations,
         levels=levels,
         split=None if split is None else tuple(part.strip() for part in split.split(",")),
         grid=grid,
         supervision=supervision,
-        **_inheritance(inherit),
+        inherit=mode,
+        inherit_ratio=ratio,
         sh_degree=sh_degree,
         seed=seed,
         cache=cache,
@@ -161,23 +164,6 @@ def train(
             resume=resume,
         )
     console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
-
-
-def _inheritance(text: str) -> dict[str, Any]:
-    """--inherit as settings: MODE, RATIO or MODE:RATIO."""
-    from lapgs_plugin.inheritance import INHERIT_MODES
-
-    mode, colon, ratio = text.partition(":")
-    if mode not in INHERIT_MODES and not colon:
-        mode, ratio = INHERIT_MODES[0], text
-    try:
-        if mode not in INHERIT_MODES:
-            raise ValueError(mode)
-        return {"inherit": mode, "inherit_ratio": float(ratio or 1.0)}
-    except ValueError as error:
-        raise UserInputError(
-            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
-        ) from error
 
 
 def _color(text: str) -> tuple[float, float, float]:

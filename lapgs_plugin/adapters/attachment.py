@@ -1,0 +1,100 @@
+"""Replacing symbols of somebody else's modules for a while: checked before, logged, restored by identity."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType, TracebackType
+from typing import Any
+
+from lapgs_plugin.errors import UserInputError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Replacement:
+    """One symbol to replace.
+
+    Attributes:
+        owner: the module or class that holds it.
+        name: of the attribute.
+        make: from the original to what takes its place.
+        parameters: names that the original's first parameters must have; None checks nothing but that it is there.
+        consumed_by: who looks it up there, for the log.
+    """
+
+    owner: Any
+    name: str
+    make: Callable[[Any], Any]
+    parameters: tuple[str, ...] | None
+    consumed_by: str
+
+    @property
+    def label(self) -> str:
+        owner = self.owner
+        place = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
+        return f"{place}.{self.name}"
+
+
+class Attachment:
+    """Context manager over replacements: all are verified before the first is made, all are undone on leaving.
+
+    Args:
+        replacements: in the order they are made; undone in reverse.
+
+    Raises:
+        UserInputError: on entering, a symbol is missing or takes other parameters; names it.
+    """
+
+    def __init__(self, replacements: Sequence[Replacement]) -> None:
+        self._replacements = tuple(replacements)
+        self._originals: list[Any] = []
+
+    def __enter__(self) -> Attachment:
+        for replacement in self._replacements:
+            _verify(replacement)
+        try:
+            for replacement in self._replacements:
+                # The class's own entry, not what attribute access makes of it: only that restores by identity.
+                original = vars(replacement.owner)[replacement.name]
+                self._originals.append(original)
+                setattr(replacement.owner, replacement.name, replacement.make(original))
+                logger.info("replaced %s, which %s uses", replacement.label, replacement.consumed_by)
+        except BaseException:
+            self._restore()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
+        for replacement in reversed(self._replacements[: len(self._originals)]):
+            setattr(replacement.owner, replacement.name, self._originals.pop())
+
+
+def _verify(replacement: Replacement) -> None:
+    changed = "this checkout differs from the versions that this adapter was written for"
+    if replacement.name not in vars(replacement.owner):
+        raise UserInputError(
+            f"{replacement.label} is missing, expected what {replacement.consumed_by} uses; {changed}: "
+            "choose another with --backbone, or train with `lapgs run --off`"
+        )
+    if replacement.parameters is None:
+        return
+    original = vars(replacement.owner)[replacement.name]
+    try:
+        found = tuple(inspect.signature(original).parameters)
+    except (TypeError, ValueError):
+        found = ()
+    if found[: len(replacement.parameters)] != replacement.parameters:
+        raise UserInputError(
+            f"{replacement.label} takes ({', '.join(found)}), expected it to begin with "
+            f"({', '.join(replacement.parameters)}); {changed}: choose another with --backbone, or train with "
+            "`lapgs run --off`"
+        )

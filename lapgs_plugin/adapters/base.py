@@ -1,0 +1,275 @@
+"""What every backbone of the 3DGS family has in common, and what an adapter has to say about one of them.
+
+An adapter answers for one code base: how to recognise it, which of its symbols are wrapped and who uses them, what a
+stage's arguments are, how a field gets in and out. `driver.py` does the rest and knows no backbone by name.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from lapgs_plugin.adapters.attachment import Replacement
+from lapgs_plugin.adapters.script import Script
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.plan import Stage
+
+logger = logging.getLogger(__name__)
+
+LARGEST_OPACITY = 1 - 1e-6
+"""Opacities are archived as logits; an activation without an upper limit is cut here."""
+
+PARAMETERS = {
+    "_xyz": "means",
+    "_rotation": "quaternions",
+    "_scaling": "log_scales",
+    "_opacity": "opacity_logits",
+    "_features_dc": "sh",
+    "_features_rest": "sh",
+}
+"""Attributes of the family's GaussianModel that hold parameters, and the tensor of a GaussianField they come from."""
+
+
+@dataclass(frozen=True)
+class BackboneInfo:
+    """What identifies a backbone.
+
+    Attributes:
+        name: for `--backbone` and the manifest.
+        title: as its authors write it.
+        rasterizer: the CUDA module it renders with.
+        stand_in: the variant of `reference_raster.standins` that takes that module's place on a CPU.
+        density_control: methods of its GaussianModel that add, remove or reset Gaussians.
+        color_rates: its options that are learning rates of SH coefficients.
+    """
+
+    name: str
+    title: str
+    rasterizer: str
+    stand_in: str
+    density_control: tuple[str, ...]
+    color_rates: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TrainingCall:
+    """A call of the script's `training`, by parameter name."""
+
+    function: Callable[..., Any]
+    values: Mapping[str, Any]
+
+    @classmethod
+    def bind(cls, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> TrainingCall:
+        bound = inspect.signature(function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        return cls(function, dict(bound.arguments))
+
+    @property
+    def dataset(self) -> Any:
+        return self.values["dataset"]
+
+    @property
+    def opt(self) -> Any:
+        return self.values["opt"]
+
+    @property
+    def pipe(self) -> Any:
+        return self.values["pipe"]
+
+    def changed(self, **values: Any) -> TrainingCall:
+        return replace(self, values={**self.values, **values})
+
+    def run(self) -> None:
+        self.function(**self.values)
+
+
+@dataclass(frozen=True)
+class StageWindow:
+    """A stage and its place in the whole run.
+
+    Attributes:
+        stage: what is trained.
+        start: iterations of the stages before it.
+        total: iterations of the whole run, as the user asked for.
+        levels: of the whole run.
+        residual_color_rate: factor on the SH learning rates of residual stages.
+    """
+
+    stage: Stage
+    start: int
+    total: int
+    levels: int
+    residual_color_rate: float
+
+    def scaled(self, iterations: int) -> int:
+        """A constant of the whole run's schedule, as the same share of this stage."""
+        return round(iterations * self.stage.iterations / self.total)
+
+    def local(self, iterations: Iterable[int]) -> list[int]:
+        """Those iterations of the whole run that fall into this stage, counted from its beginning."""
+        return [i - self.start for i in iterations if self.start < i <= self.start + self.stage.iterations]
+
+
+class BackboneAdapter(ABC):
+    """One backbone, driven through the definitions of its training script.
+
+    Args:
+        script: its train.py, definitions executed.
+    """
+
+    info: ClassVar[BackboneInfo]
+
+    def __init__(self, script: Script) -> None:
+        self.script = script
+
+    @property
+    def train(self) -> ModuleType:
+        """The training script's namespace."""
+        return self.script.module
+
+    @abstractmethod
+    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
+        """Render a view as the script's training loop does; the image is picked up at the rasterizer."""
+
+    @abstractmethod
+    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
+        """Settings of the rasterizer that the images depend on, for whoever renders the run later."""
+
+    def refuse(self, call: TrainingCall, levels: int) -> None:
+        """Check that a hierarchy can honour the options of this call.
+
+        Raises:
+            UserInputError: it cannot; names the option, why, and what to do.
+        """
+        if call.values.get("checkpoint"):
+            raise UserInputError(
+                f"--start_checkpoint {call.values['checkpoint']}: a checkpoint holds one field, not a hierarchy; "
+                "continue a run of ours with `lapgs run --resume`, or train with `lapgs run --off`"
+            )
+        if levels > 1 and getattr(call.opt, "random_background", False):
+            raise UserInputError(
+                "--random_background: residual stages build on images rendered over one background; "
+                "leave it out, or train with --levels 1"
+            )
+
+    def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
+        """The arguments of one stage: the schedule scaled to its length, its own output folder, its color rates."""
+        dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
+        dataset.model_path = model_path
+        opt.iterations = window.stage.iterations
+        opt.densify_until_iter = window.scaled(opt.densify_until_iter)
+        opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
+        if window.stage.signed:
+            # A white background would be added a second time, and would trigger an opacity reset of its own.
+            dataset.white_background = False
+            # The checkout's own conversion of SH in Python has no signed colour.
+            pipe.convert_SHs_python = False
+            for name in self.info.color_rates:
+                setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
+        values: dict[str, Any] = {"dataset": dataset, "opt": opt, "pipe": pipe, "checkpoint": None}
+        for name in ("testing_iterations", "saving_iterations", "checkpoint_iterations"):
+            values[name] = window.local(call.values[name])
+        debug_from = call.values["debug_from"]
+        pipe.debug = pipe.debug or 0 <= debug_from < window.start
+        values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
+        return call.changed(**values)
+
+    def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        """Symbols to replace besides those that the driver replaces in every backbone.
+
+        Args:
+            iteration_of: the running stage, None between stages.
+        """
+        return []
+
+    def level_view(self, view: Any, original: Any, size: tuple[int, int], signed: bool) -> None:
+        """Bring everything of a view besides its image to a level's size.
+
+        Args:
+            view: a copy of `original` with the level's width and height, to be changed.
+            original: the checkout's camera of the full-size image.
+            size: (width, height) of the level.
+            signed: whether a residual is trained.
+        """
+        return None
+
+    def first_points(self, count: int) -> None:
+        """Told how many points the scene comes with, before the first stage."""
+        return None
+
+    def stage_scene(self, scene: Any) -> None:
+        """Told of the scene that a stage trains on, before its first iteration."""
+        return None
+
+    def new_model(self, call: TrainingCall) -> Any:
+        """A GaussianModel without Gaussians, as the script makes it."""
+        return self.train.GaussianModel(call.dataset.sh_degree, call.opt.optimizer_type)
+
+    @torch.no_grad()
+    def export_field(self, gaussians: Any, signed: bool) -> GaussianField:
+        """The model's parameters as a field on their device; shares no memory with the model."""
+        if gaussians.opacity_activation is torch.sigmoid:
+            logits = gaussians._opacity
+        else:
+            opacity = gaussians.get_opacity
+            if cut := int((opacity > LARGEST_OPACITY).sum()):
+                logger.warning(
+                    "%d of %d Gaussians have opacities above 1, which a 3DGS PLY cannot hold: archived as 1",
+                    cut,
+                    len(opacity),
+                )
+            logits = torch.logit(opacity.clamp(1e-6, LARGEST_OPACITY))
+        return GaussianField(
+            means=gaussians._xyz.detach().clone(),
+            quaternions=gaussians._rotation.detach().clone(),
+            log_scales=gaussians._scaling.detach().clone(),
+            opacity_logits=logits.detach().clone().squeeze(-1),
+            sh=torch.cat([gaussians._features_dc, gaussians._features_rest], dim=1),
+            signed=signed,
+        )
+
+    @torch.no_grad()
+    def import_field(self, gaussians: Any, field: GaussianField, attributes: Iterable[str] = tuple(PARAMETERS)) -> None:
+        """Make parameters of the model those of a field.
+
+        Args:
+            gaussians: its optimizer is not set up yet.
+            attributes: which, of `PARAMETERS`.
+        """
+        values = {
+            "_xyz": field.means,
+            "_rotation": field.quaternions,
+            "_scaling": field.log_scales,
+            "_opacity": field.opacity_logits[:, None],
+            "_features_dc": field.sh[:, :1],
+            "_features_rest": field.sh[:, 1:],
+        }
+        for name in attributes:
+            setattr(gaussians, name, nn.Parameter(values[name].detach().clone().contiguous().requires_grad_(True)))
+        gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
+
+    def carried_over(self, gaussians: Any) -> dict[str, Any]:
+        """What the next stage's model takes over besides its Gaussians."""
+        return {}
+
+    def optimizers(self, gaussians: Any) -> list[torch.optim.Optimizer]:
+        """The optimizers that step Gaussians."""
+        found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
+        return [optimizer for optimizer in found if optimizer is not None]
+
+
+def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """(..., h, w) averaged down to (width, height) `size`."""
+    width, height = size
+    result: Tensor = nn.functional.interpolate(image[None].float(), (height, width), mode="area")[0]
+    return result

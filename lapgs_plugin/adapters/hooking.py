@@ -1,0 +1,102 @@
+"""Users' hooks in a checkout's training loop, which knows nothing of them.
+
+The loop renders, makes its loss, goes backward and densifies; the hooks' methods are called where those happen:
+
+    before_render, compose, loss    when the rasterizer has rendered a training view with gradients
+    after_backward                  when the gradients of that image's graph are there
+    on_densify                      after density control
+
+A hook's loss is added without touching the loop's: the image passes through a function whose backward pass gives the
+hook's term a gradient of one, as if it had been added to the loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
+from lapgs_plugin.plan import Stage
+
+if TYPE_CHECKING:
+    from lapgs_plugin.adapters.shim import StageRendering
+
+
+class HookCaller:
+    """Calls users' hooks; false when there are none, so that a run without hooks pays nothing.
+
+    Args:
+        hooks: given besides those registered by entry point.
+
+    Raises:
+        UserInputError: a hook is not usable.
+    """
+
+    def __init__(self, hooks: Sequence[StageHook] = ()) -> None:
+        found = (*entry_point_hooks(), *hooks)
+        self._hooks = HookDispatcher(found) if found else None
+        self._stage: Stage | None = None
+        self._rendering: StageRendering | None = None
+        self._iteration = 0
+        self._context: StageContext | None = None
+
+    def __bool__(self) -> bool:
+        return self._hooks is not None
+
+    def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
+        self._stage, self._rendering = stage, rendering
+        if self._hooks is not None:
+            self._hooks.on_stage_start(stage)
+
+    def stage_ends(self, stage: Stage) -> None:
+        if self._hooks is not None:
+            self._hooks.on_stage_end(stage)
+
+    def iteration_begins(self, stage: Stage, iteration: int) -> None:
+        self._iteration = iteration
+
+    def on_image(self, key: str, image: Tensor) -> Tensor:
+        """(3, h, w) the composed image of a training view -> what the loop compares with the ground truth."""
+        assert self._hooks is not None
+        assert self._stage is not None
+        assert self._rendering is not None
+        accumulated = self._rendering.accumulated
+        self._context = StageContext(
+            stage=self._stage,
+            iteration=self._iteration,
+            view=key.partition("-")[2],
+            target=self._rendering.targets.get(key),
+            accumulated=None if accumulated is None else accumulated.get(key),
+        )
+        self._hooks.before_render(self._context)
+        image = self._hooks.compose(self._context, image)
+        term = self._hooks.extra_loss(self._context, image)
+        result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
+        return result
+
+    def densified(self) -> None:
+        if self._hooks is not None and self._context is not None:
+            self._hooks.on_densify(self._context)
+
+    def _after_backward(self) -> None:
+        assert self._hooks is not None
+        assert self._context is not None
+        self._hooks.after_backward(self._context)
+
+
+class _WithTerm(torch.autograd.Function):
+    """(image, term) -> image; backward gives the term a gradient of one."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, term: Tensor | None, done: Any) -> Tensor:
+        ctx.term, ctx.done = term is not None, done
+        return image.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        # Runs the callback when this whole backward pass has ended, as data-parallel training does.
+        torch.autograd.Variable._execution_engine.queue_callback(ctx.done)
+        return gradient, gradient.new_ones(()) if ctx.term else None, None

@@ -1,0 +1,136 @@
+"""The views of a checkout's scene at the size of a level, their images in an ImageStore instead of in the cameras."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.imagestore import ImageStore
+
+BYTE_TOLERANCE = 1e-3
+"""How far 255 times a value may be from a whole number to count as a pixel of an 8-bit image: float32 gives 2e-5."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A full-size image on the CPU: (3, h, w) uint8 where its values are k/255, float16 where not."""
+
+    stored: Tensor  # (3, h, w)
+
+    @classmethod
+    def of(cls, image: Tensor) -> Photo:
+        levels = image * 255
+        rounded = levels.round()
+        if bool(((levels - rounded).abs() <= BYTE_TOLERANCE).all()):
+            return cls(rounded.to("cpu", torch.uint8))
+        return cls(image.to("cpu", torch.float16))
+
+    @property
+    def exact(self) -> bool:
+        return self.stored.dtype == torch.uint8
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)"""
+        return self.stored.shape[2], self.stored.shape[1]
+
+    def image(self, device: torch.device) -> Tensor:
+        """(3, h, w) float32."""
+        moved = self.stored.to(device)
+        return moved / 255 if self.exact else moved.float()
+
+
+class PhotoAlbum:
+    """The images of a scene, taken out of its cameras while those are made.
+
+    A camera keeps everything but its image; `key` says which image was its. Keys are unique where names need not be:
+    Blender scenes have an r_0 for training and another for testing.
+    """
+
+    def __init__(self) -> None:
+        self._photos: dict[str, Photo] = {}
+        self._keys: dict[int, str] = {}
+        self._cameras: list[Any] = []  # keeps the identities in `_keys` from being given to other objects
+
+    def adopting(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """A replacement of the checkout's Camera class, under the name that its loader calls."""
+
+        def make_camera(*args: Any, **kwargs: Any) -> Any:
+            # The image would be copied to the GPU only to be taken from there.
+            camera = original(*args, **{**kwargs, "data_device": "cpu"})
+            key = f"{len(self._photos):05d}-{camera.image_name}"
+            self._photos[key] = Photo.of(camera.original_image)
+            del camera.original_image
+            self._keys[id(camera)] = key
+            self._cameras.append(camera)
+            return camera
+
+        return make_camera
+
+    def __len__(self) -> int:
+        return len(self._photos)
+
+    @property
+    def exact(self) -> bool:
+        """Whether all images are 8-bit ones."""
+        return all(photo.exact for photo in self._photos.values())
+
+    def key(self, camera: Any) -> str:
+        try:
+            return self._keys[id(camera)]
+        except KeyError:
+            raise UserInputError(
+                f"camera {getattr(camera, 'image_name', '?')} of the checkout was not made by "
+                "utils.camera_utils.Camera, expected of every camera of the scene; this checkout loads scenes in another "
+                "way: use `lapgs run --off`"
+            ) from None
+
+    def photo(self, key: str) -> Photo:
+        return self._photos[key]
+
+    def smallest_size(self) -> tuple[int, int]:
+        """(width, height) of the image with the fewest pixels."""
+        return min((photo.size for photo in self._photos.values()), key=lambda size: size[0] * size[1])
+
+
+def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tensor]) -> Any:
+    """A camera with another size whose `original_image` is asked for whenever it is looked at.
+
+    Args:
+        camera: the checkout's; shared with the copy is everything but the size.
+        size: (width, height).
+        image: gives (3, height, width).
+    """
+    view = copy.copy(camera)
+    view.__class__ = _level_class(type(camera))
+    view.image_width, view.image_height = size
+    view.lapgs_image = image
+    return view
+
+
+_LEVEL_CLASSES: dict[type, type] = {}
+
+
+def _level_class(kind: type) -> type:
+    if kind not in _LEVEL_CLASSES:
+        read = property(lambda view: view.lapgs_image(), doc="(3, h, w) the level's ground truth, float32.")
+        _LEVEL_CLASSES[kind] = type(f"Level{kind.__name__}", (kind,), {"original_image": read})
+    return _LEVEL_CLASSES[kind]
+
+
+@contextmanager
+def closing(*stores: ImageStore | None) -> Iterator[None]:
+    """Close stores on leaving."""
+    try:
+        yield
+    finally:
+        for store in stores:
+            if store is not None:
+                store.close()

@@ -1,0 +1,110 @@
+"""A checkout's training script as Python would run it, with a pause between its definitions and its main block.
+
+The pause is where symbols are wrapped: everything the script defines and imports is there, nothing has run yet.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType, ModuleType
+
+from lapgs_plugin.errors import UserInputError
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script whose definitions have been executed.
+
+    Attributes:
+        path: the script, absolute; its folder is the checkout.
+        module: what `__main__` is while the script is loaded.
+    """
+
+    path: Path
+    module: ModuleType
+    _main: CodeType
+
+    @property
+    def checkout(self) -> Path:
+        return self.path.parent
+
+    def run_main(self) -> None:
+        """Execute the main block. Whatever it raises, SystemExit and KeyboardInterrupt included, comes out as it is."""
+        exec(self._main, self.module.__dict__)
+
+
+def require_script(path: Path) -> Path:
+    """The absolute path of a script.
+
+    Raises:
+        UserInputError: it is not a file.
+    """
+    if not path.is_file():
+        raise UserInputError(
+            f"{path} is not a file; expected the training script of a checkout, as in `lapgs run train.py -s SCENE`"
+        )
+    return path.absolute()
+
+
+@contextmanager
+def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
+    """Execute the definitions of a script in a fresh `__main__`, with its arguments in `sys.argv`.
+
+    On leaving, `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are as before,
+    and the checkout's modules are forgotten, so that another checkout with modules of the same names can follow.
+
+    Raises:
+        UserInputError: it is not Python, or has no main block.
+    """
+    path = require_script(path)
+    definitions, main = _split(path)
+    module = ModuleType("__main__")
+    module.__file__ = str(path)
+    before = sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"]
+    known = set(sys.modules)
+    sys.argv, sys.path[:0] = [str(path), *arguments], [str(path.parent)]
+    sys.modules["__main__"] = module
+    try:
+        exec(definitions, module.__dict__)
+        yield Script(path, module, main)
+    finally:
+        sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
+        for name in set(sys.modules) - known:
+            if _is_under(sys.modules[name], path.parent):
+                del sys.modules[name]
+
+
+def _split(path: Path) -> tuple[CodeType, CodeType]:
+    """The script without its main block, and the main block, both with the script's line numbers."""
+    try:
+        tree = ast.parse(path.read_bytes(), str(path))
+    except (SyntaxError, ValueError) as error:
+        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
+    blocks = [node for node in tree.body if _is_main_block(node)]
+    if not blocks:
+        raise UserInputError(
+            f'{path} has no `if __name__ == "__main__":` block; expected the training script of a 3DGS checkout'
+        )
+    main = ast.Module(body=list(blocks), type_ignores=[])
+    tree.body = [node for node in tree.body if node not in blocks]
+    # dont_inherit: this file's future statements are not the script's.
+    return compile(tree, str(path), "exec", dont_inherit=True), compile(main, str(path), "exec", dont_inherit=True)
+
+
+def _is_main_block(node: ast.stmt) -> bool:
+    if not isinstance(node, ast.If) or not isinstance(node.test, ast.Compare):
+        return False
+    sides = [node.test.left, *node.test.comparators]
+    names = [side.id for side in sides if isinstance(side, ast.Name)]
+    values = [side.value for side in sides if isinstance(side, ast.Constant)]
+    return names == ["__name__"] and values == ["__main__"]
+
+
+def _is_under(module: ModuleType | None, folder: Path) -> bool:
+    places = [getattr(module, "__file__", None), *getattr(module, "__path__", [])]
+    return any(place is not None and Path(place).is_relative_to(folder) for place in places)

@@ -1,0 +1,137 @@
+"""Between a checkout's `render` and its CUDA rasterizer: signed colour, a zero background, and composition.
+
+The two names that every `render` of the family looks up in its own module are replaced. So whoever renders - the
+training loop, score functions, reports - gets composed images, and no consumer of `render` has to be known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.imagestore import ImageStore
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+from lapgs_plugin.signed_color import ColorPath, signed_degree
+
+GREY = 0.5
+"""Around which a residual is shown to a camera that is no view of the scene, such as a viewer's."""
+
+
+@dataclass
+class StageRendering:
+    """What has to be known of the running stage whenever something is rendered.
+
+    Attributes:
+        signed: whether residuals are rendered.
+        path: how signed colour is evaluated.
+        views: key of each view by the identity of its world-to-camera matrix, which level views share with the
+            checkout's cameras.
+        accumulated: Up(I_hat^(l+1)) by key; None for the base.
+        targets: the level's images by key.
+        composed: keys of the views that composition is done for.
+        on_image: called with key and composed image when gradients are recorded; what it returns takes its place.
+    """
+
+    signed: bool
+    path: ColorPath
+    views: Mapping[int, str]
+    targets: ImageStore
+    accumulated: ImageStore | None = None
+    composed: frozenset[str] = frozenset()
+    on_image: Callable[[str, Tensor], Tensor] | None = None
+    last_image: Tensor | None = field(default=None, repr=False)
+
+    def key(self, settings: Any) -> str | None:
+        return self.views.get(id(settings.viewmatrix))
+
+    def announce(self, key: str) -> None:
+        """Bring a view's images while it is being rendered."""
+        self.targets.announce(key)
+        if self.accumulated is not None:
+            self.accumulated.announce(key)
+
+    def compose(self, key: str | None, image: Tensor) -> Tensor:
+        """(3, h, w) what a rasterizer made of a view -> what `render` returns of it."""
+        if key is None:
+            return image + GREY if self.signed else image
+        if self.accumulated is not None and key in self.composed:
+            image = image + self.accumulated.get(key, dtype=None)
+        if self.on_image is not None and torch.is_grad_enabled():
+            image = self.on_image(key, image)
+        return image
+
+
+class RasterizerShim:
+    """Makes the replacements of `GaussianRasterizationSettings` and `GaussianRasterizer`.
+
+    Attributes:
+        stage: the running stage; None lets every call through unchanged.
+    """
+
+    def __init__(self) -> None:
+        self.stage: StageRendering | None = None
+        self._zeros: Tensor | None = None
+
+    def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def make_settings(*args: Any, **kwargs: Any) -> Any:
+            settings = original(*args, **kwargs)
+            stage = self.stage
+            if stage is None:
+                return settings
+            if (key := stage.key(settings)) is not None:
+                stage.announce(key)
+            if not stage.signed:
+                return settings
+            degree = settings.sh_degree
+            if stage.path is ColorPath.NATIVE:
+                degree = signed_degree(degree)
+            return settings._replace(bg=self._zero_background(settings.bg), sh_degree=degree)
+
+        return make_settings
+
+    def rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def make_rasterizer(raster_settings: Any) -> Any:
+            made = original(raster_settings=raster_settings)
+            return made if self.stage is None else _ComposingRasterizer(made, raster_settings, self.stage)
+
+        return make_rasterizer
+
+    def _zero_background(self, like: Tensor) -> Tensor:
+        if self._zeros is None or self._zeros.device != like.device:
+            self._zeros = torch.zeros_like(like)
+        return self._zeros
+
+
+class _ComposingRasterizer:
+    """A rasterizer of the checkout for one view; everything but the call is the original's."""
+
+    def __init__(self, original: Any, settings: Any, stage: StageRendering) -> None:
+        self._original, self._settings, self._stage = original, settings, stage
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._original, name)
+
+    def __call__(self, **inputs: Any) -> tuple[Any, ...]:
+        stage = self._stage
+        if stage.signed and stage.path is ColorPath.PRECOMPUTED:
+            inputs = _with_signed_colors(inputs, self._settings)
+        image, *others = self._original(**inputs)
+        image = stage.compose(stage.key(self._settings), image)
+        stage.last_image = image.detach()
+        return (image, *others)
+
+
+def _with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]:
+    """The inputs with SH evaluated here, as the patched kernels do it."""
+    if inputs.get("colors_precomp") is not None:
+        return inputs
+    dc, rest, means = inputs.get("dc"), inputs["shs"], inputs["means3D"]
+    sh = rest if dc is None else torch.cat([dc, rest], dim=1)  # (n, k, 3)
+    directions = torch.nn.functional.normalize(means - settings.campos, dim=-1)  # (n, 3)
+    colors = sh_to_color(sh, directions, settings.sh_degree, signed=True)  # (n, 3)
+    others = {name: value for name, value in inputs.items() if name not in ("dc", "shs")}
+    return {**others, "colors_precomp": colors}

@@ -1,0 +1,79 @@
+"""Taming-3DGS: densification to a budget of Gaussians, opacities without an upper limit towards the end."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from typing import Any
+
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.errors import UserInputError
+
+logger = logging.getLogger(__name__)
+
+BASE_SHARE, FINEST_SHARE = 0.4, 0.6
+"""Share of the budget that the base and the finest residual end with; stages between lie between.
+
+Both end below the whole budget, so that every iteration is cheaper than the backbone's own at the same progress, and
+each residual has room to grow from what it inherits: the checkout cannot densify by nothing.
+"""
+
+
+class TamingAdapter(BackboneAdapter):
+    """Drives a Taming-3DGS checkout. Its budget counts from a stage's first number of Gaussians in one of two modes;
+    both are turned into a final count for each stage.
+    """
+
+    info = BackboneInfo(
+        name="taming",
+        title="Taming-3DGS",
+        rasterizer="diff_gaussian_rasterization",
+        stand_in="taming",
+        density_control=("densify_with_score", "reset_opacity"),
+        color_rates=("feature_lr", "shfeature_lr"),
+    )
+
+    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
+        self.train.render(view, gaussians, call.pipe, background)
+
+    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
+        return {}
+
+    def refuse(self, call: TrainingCall, levels: int) -> None:
+        super().refuse(call, levels)
+        if levels > 1 and call.values["args"].benchmark_dir:
+            raise UserInputError(
+                f"--benchmark_dir {call.values['args'].benchmark_dir}: the checkout would write every stage's timings "
+                "over the last one's; leave it out, the manifest holds the time of each stage"
+            )
+
+    def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
+        changed = super().stage_call(call, window, model_path)
+        args, opt = copy.copy(call.values["args"]), changed.opt
+        args.ho_iteration = window.scaled(args.ho_iteration)
+        # Its table of counts has one entry an interval; a last, shorter interval would be looked up beyond the end.
+        intervals = (opt.densify_until_iter - opt.densify_from_iter) // opt.densification_interval
+        if intervals < 1:
+            raise UserInputError(
+                f"level {window.stage.level} would stop densifying at iteration {opt.densify_until_iter} and start "
+                f"after {opt.densify_from_iter}, but a budget needs at least one interval of "
+                f"{opt.densification_interval} between; raise --iterations, or lower --densify_from_iter or --densification_interval"
+            )
+        opt.densify_until_iter = opt.densify_from_iter + intervals * opt.densification_interval
+        args.mode, args.budget = "final_count", self._budget(call, window)
+        logger.info("level %d may grow to %d Gaussians", window.stage.level, args.budget)
+        return changed.changed(args=args)
+
+    def _budget(self, call: TrainingCall, window: StageWindow) -> int:
+        """Number of Gaussians that a stage may grow to."""
+        given = call.values["args"]
+        whole = given.budget * self._points if given.mode == "multiplier" else given.budget
+        if window.levels == 1:
+            return int(whole)
+        progress = 1 - window.stage.level / (window.levels - 1)  # 0 for the base, 1 for the finest
+        return int(whole * (BASE_SHARE + (FINEST_SHARE - BASE_SHARE) * progress))
+
+    def first_points(self, count: int) -> None:
+        self._points = count

@@ -1,0 +1,156 @@
+"""`lapgs run`: a backbone's own training script, trained as a hierarchy."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from lapgs_plugin.adapters.base import BackboneAdapter
+
+HIERARCHY = "Hierarchy"
+MEMORY = "Memory and speed"
+
+CONTEXT = {"allow_interspersed_args": False}
+"""Everything after the script belongs to the script, options included."""
+
+
+def run(
+    script: Annotated[Path, typer.Argument(help="The training script of a checkout: its train.py.", metavar="SCRIPT")],
+    arguments: Annotated[
+        list[str] | None, typer.Argument(help="The script's own arguments, as without lapgs.", metavar="ARGUMENTS...")
+    ] = None,
+    off: Annotated[bool, typer.Option("--off", help="Replace nothing: the script as Python would run it.")] = False,
+    backbone: Annotated[
+        str | None, typer.Option(help="fastgs, taming or graphdeco; recognised from the checkout when not given.")
+    ] = None,
+    device: Annotated[
+        str,
+        typer.Option(
+            help="cuda, or cpu: the unmodified checkout on CPU stand-ins of its CUDA modules. auto: what is there."
+        ),
+    ] = "auto",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in -m after its last finished level.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -m.")] = False,
+    levels: Annotated[
+        int,
+        typer.Option(
+            min=1, rich_help_panel=HIERARCHY, help="Number of levels; 1 is the backbone alone, archived as a run."
+        ),
+    ] = 2,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Share of the iterations of each stage, coarsest first. Two levels: 1/3,2/3.",
+        ),
+    ] = None,
+    supervision: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="reconstructed (composed image against the photo), online_residual or gt_laplacian.",
+        ),
+    ] = "reconstructed",
+    inherit: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="What the next level starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
+            "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
+        ),
+    ] = "geometry",
+    grid: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Pixel grid of the pyramid: camera (where the cameras see) or even (every second pixel, as OpenCV).",
+        ),
+    ] = "camera",
+    residual_color_rate: Annotated[
+        float, typer.Option(rich_help_panel=HIERARCHY, help="Factor on the SH learning rates of residual stages.")
+    ] = 4.0,
+    seed: Annotated[
+        int,
+        typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),
+    ] = 0,
+    images_on: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=MEMORY,
+            help="Where level images and predictions are kept: gpu, memory (page-locked), disk, or auto by their size.",
+        ),
+    ] = "auto",
+    prediction_precision: Annotated[
+        str, typer.Option(rich_help_panel=MEMORY, help="Of cached predictions: float32, float16 or uint8.")
+    ] = "float16",
+    fused_adam: Annotated[
+        bool,
+        typer.Option(
+            "--fused-adam/--no-fused-adam",
+            rich_help_panel=MEMORY,
+            help="Step the backbone's plain Adam optimizers in one kernel a tensor.",
+        ),
+    ] = True,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say which symbols are replaced, and who uses them.")
+    ] = False,
+) -> None:
+    """Train a backbone's checkout as a hierarchy: one word before the command you type today.
+
+    lapgs run train.py -s data/garden -i images --eval
+
+    Recognised are FastGS, Taming-3DGS and the graphdeco 3DGS repository, each unmodified. Everything after the script
+    is handed to it. The run goes into the script's own output folder (-m), one folder a level, and `lapgs render`,
+    `eval` and `report` work on it. After Ctrl-C the finished levels are kept; the same command with --resume goes on
+    after them.
+    """
+    import logging
+
+    import torch
+
+    from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+    from lapgs_plugin.adapters.driver import HierarchyDriver, HierarchyOptions
+    from lapgs_plugin.adapters.known import adapter_class
+    from lapgs_plugin.adapters.script import loaded_script, require_script
+    from lapgs_plugin.inheritance import parse_inheritance
+
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
+    logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
+    mode, ratio = parse_inheritance(inherit)
+    options = HierarchyOptions(
+        levels=levels,
+        split=split,
+        grid=grid,
+        supervision=supervision,
+        inherit=mode,
+        inherit_ratio=ratio,
+        residual_color_rate=residual_color_rate,
+        images_on=images_on,
+        prediction_precision=prediction_precision,
+        fused_adam=fused_adam,
+        seed=seed,
+    )
+    if device not in ("auto", "cuda", "cpu"):
+        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise UserInputError(
+            "--device cuda: PyTorch sees no CUDA device here; --device cpu runs the checkout on stand-ins"
+        )
+    chosen = device if device != "auto" else "cuda" if available else "cpu"
+    kind: type[BackboneAdapter] = adapter_class(require_script(script).parent, backbone)
+    on_device = cuda_on_cpu(kind.info.stand_in) if chosen == "cpu" else nullcontext()
+    with on_device, loaded_script(script, arguments or []) as loaded:
+        if off:
+            loaded.run_main()
+            return
+        HierarchyDriver(kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite).run()
