@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from lapgs_plugin.camera import Camera
@@ -17,17 +18,18 @@ class RenderResult:
 
     Attributes:
         image: (3, height, width) colour, background blended in, not clamped.
-        transmittance: (height, width) what is left of the background's weight in each pixel, in [0, 1].
+        transmittance: (height, width) what is left of the background's weight in each pixel, in [0, 1]; None where it
+            is not for free, since neither training nor rendering looks at it: `render_transmittance` gets it.
         radii: (n,) int32, three-sigma radius in pixels of each Gaussian's footprint; 0 where it was culled.
         means2d: (n, 2) projected centres in pixels, x then y. When the field's parameters require gradients,
             `means2d.grad` holds after `backward()` the gradient of the loss with respect to the screen position, in
             loss per pixel: what densification thresholds. Zeros where culled.
         absgrad2d: (n, 2) buffer that after `backward()` holds the sum over pixels of the absolute value of that
-            gradient (AbsGS), or None where the rasterizer does not offer it.
+            gradient (AbsGS); None where the rasterizer does not offer it.
     """
 
     image: Tensor
-    transmittance: Tensor
+    transmittance: Tensor | None
     radii: Tensor
     means2d: Tensor
     absgrad2d: Tensor | None = None
@@ -40,10 +42,14 @@ class Semantics:
     Attributes:
         three_sigma_cut: False where a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one
             that is blended in no pixel may then have radius 0.
+        expanded_conic_gradient: True where the backward pass takes the gradient of the inverse 2D covariance to that of
+            the covariance with the matrix products multiplied out. In float32 that loses the gradients of Gaussians
+            that are very long on screen; see `evaluation.conformance.EXPANDED_CONIC`.
         note: the departures in words, for reports.
     """
 
     three_sigma_cut: bool = True
+    expanded_conic_gradient: bool = False
     note: str = ""
 
 
@@ -67,3 +73,13 @@ class Rasterizer(Protocol):
             sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
         """
         ...
+
+
+@torch.no_grad()
+def render_transmittance(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> Tensor:
+    """What any rasterizer leaves of the background's weight in each pixel: (height, width), in [0, 1].
+
+    It renders black Gaussians before white.
+    """
+    black = replace(field.with_parameters({"sh": torch.zeros_like(field.sh[:, :1])}), signed=True)
+    return rasterizer(black, camera, background=torch.ones(3).to(field.means), sh_degree=0).image[0]

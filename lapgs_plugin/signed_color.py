@@ -151,8 +151,11 @@ def has_signed_color(extension: Extension) -> bool:
             sh_degree=signed_degree(degree),
         )
         (gradient,) = torch.autograd.grad(result.image.sum(), sh)
-    weight = 1 - result.transmittance.detach()  # (h, w) of the only Gaussian
-    image_error = (result.image - weight * expected[:, None, None]).abs().max()
+    black, white = torch.zeros(1, 3, device=extension.device), torch.ones(3, device=extension.device)
+    with torch.no_grad():
+        unseen = extension.render(field, camera, background=white, sh_degree=0, colors=black).image[0]  # (h, w)
+    weight = 1 - unseen  # of the only Gaussian
+    image_error = (result.image.detach() - weight * expected[:, None, None]).abs().max()
     # The image is weight * C0 * sh_0 in each channel, so all have the same gradient unless a clamp is remembered in the
     # negative ones. Its size is not looked at: an extension whose backward pass loses part of it still has the colours.
     slope = float(weight.sum()) / math.sqrt(4 * math.pi)

@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import math
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
@@ -25,10 +26,15 @@ from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 
 SEMANTICS = {
     "diff_gaussian_rasterization": Semantics(
-        note="some builds leave out tiles where alpha stays under 1/255, which no image shows"
+        expanded_conic_gradient=True,
+        note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of needles are "
+        "rounded to a few hundredths",
     ),
     "diff_gaussian_rasterization_fastgs": Semantics(
-        three_sigma_cut=False, note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma"
+        three_sigma_cut=False,
+        expanded_conic_gradient=True,
+        note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are rounded to a "
+        "few hundredths",
     ),
 }
 """The modules, and where each departs from the oracle by design."""
@@ -37,12 +43,12 @@ CONSTANTS: dict[str, Any] = {
     "scale_modifier": 1.0,
     "prefiltered": False,
     "debug": False,
-    "antialiasing": False,  # another image than the paper's, and not what residuals were trained for
+    "antialiasing": False,  # another image than the paper's
     "mult": 1.0,  # the ellipse alpha = 1/255 whole: less cuts off visible borders of Gaussians
     "get_flag": False,
     "pixel_weights": None,
 }
-"""Settings that are the same in every call."""
+"""Settings that are the same in every call, unless a run was trained with others."""
 VARYING = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
     "metric_map",
@@ -61,6 +67,8 @@ MODERATE = 100.0
 VISIBLE_LOGIT = math.log(2.4 / (255 - 2.4))
 """Opacity over exp(5/6) / 255, and still under the 0.01 that training resets opacities to."""
 COMPANION_OPACITY = 1.05 / 255
+POINT_DIMMING = 0.005
+"""What antialiasing leaves of the opacity of a Gaussian that is a point."""
 
 
 def installed_extensions() -> list[str]:
@@ -74,22 +82,33 @@ class CudaExtension:
     Args:
         name: of its module, one of `SEMANTICS`.
         device: where it renders; a stand-in for the CPU renders there.
+        settings: what to set instead of `CONSTANTS`, such as {"mult": 0.5}.
+        module: the module of that name; None imports it.
 
     Raises:
         MissingExtraError: it is not installed, or was built for another PyTorch.
-        UserInputError: its settings have a field that is not known.
+        UserInputError: its settings have a field that is not known, or lack one of `settings`.
     """
 
-    def __init__(self, name: str, device: torch.device | str = "cuda") -> None:
-        try:
-            module = importlib.import_module(name)
-        except ImportError as error:
-            raise MissingExtraError(
-                f"{name} cannot be imported ({error}); install it as the README of its backbone says"
-            ) from error
+    def __init__(
+        self,
+        name: str,
+        device: torch.device | str = "cuda",
+        *,
+        settings: Mapping[str, Any] | None = None,
+        module: ModuleType | None = None,
+    ) -> None:
+        module = _imported(name) if module is None else module
         self._name = name
         self._device = torch.device(device)
         self._settings = _known_settings(module)
+        self._constants = {**CONSTANTS, **(settings or {})}
+        unknown = [key for key in settings or {} if key not in options_of(module)]
+        if unknown:
+            raise UserInputError(
+                f"{name} as it is installed has no setting {', '.join(unknown)}; expected some of "
+                f"{', '.join(sorted(options_of(module)))}"
+            )
         self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
         # The first rasterizer to take DC apart also was the first to blend a tile's Gaussians in buckets of 32.
         self._in_buckets = self._takes_dc
@@ -115,23 +134,19 @@ class CudaExtension:
     ) -> RenderResult:
         """Render without looking at `field.signed`; see `lapgs_plugin.signed_color.Extension`.
 
-        The extension does not return the transmittance: a second forward pass, of black Gaussians before white, does.
-        It has no gradient.
+        The result has no transmittance, which the extension does not return.
 
         Raises:
             UserInputError: a tensor is not float32, or not on `device`.
         """
         self._check(field, background)
         n = len(field)
-        absgrad2d = field.means.new_zeros(n, 2) if self._absolute else None
+        absgrad2d = field.means.new_zeros(n, 2) if self._absolute and torch.is_grad_enabled() else None
         means2d = field.means.new_zeros(n, 2).requires_grad_(torch.is_grad_enabled())  # (n, 2)
         image, radii = self._rasterize(field, camera, background, sh_degree, colors, means2d, absgrad2d)
         with torch.no_grad():
-            black, white = torch.zeros_like(field.means), torch.ones_like(background)
-            unseen = torch.zeros_like(means2d)
-            transmittance = self._rasterize(field, camera, white, 0, black, unseen, None)[0][0]  # (h, w)
             means2d.copy_(_centres(field, camera) * (radii > 0)[:, None])
-        return RenderResult(image, transmittance, radii, means2d, absgrad2d)
+        return RenderResult(image, None, radii, means2d, absgrad2d)
 
     def _rasterize(
         self,
@@ -159,8 +174,9 @@ class CudaExtension:
         }
         # Without Gaussians the kernels leave out the background. With none in any tile, those that blend in buckets
         # write beyond their tiles' ranges, or launch a grid of no blocks in the backward pass.
-        if n == 0 or (self._in_buckets and not _surely_blends(field, camera)):
-            inputs = _with_companion(inputs, camera)
+        antialiasing = "antialiasing" in self._settings and bool(self._constants["antialiasing"])
+        if n == 0 or (self._in_buckets and (antialiasing or not _surely_blends(field, camera))):
+            inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
         rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
         image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
         return image, radii[:n]
@@ -194,7 +210,7 @@ class CudaExtension:
             "projmatrix": projection,
             "sh_degree": sh_degree,
             "campos": camera.position.to(background).contiguous(),
-            **CONSTANTS,
+            **self._constants,
         }
         if "metric_map" in self._settings:
             values["metric_map"] = torch.zeros(
@@ -220,6 +236,20 @@ class _Screen(torch.autograd.Function):
         if ctx.absgrad2d is not None:
             ctx.absgrad2d.copy_(gradient[:, 2:4] * ctx.pixel)
         return gradient[:, :2] * ctx.pixel, None, None, None, None
+
+
+def options_of(module: ModuleType) -> frozenset[str]:
+    """Which of `CONSTANTS` the extension knows."""
+    return frozenset(CONSTANTS) & frozenset(module.GaussianRasterizationSettings._fields)
+
+
+def _imported(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{name} cannot be imported ({error}); install it as the README of its backbone says"
+        ) from error
 
 
 def _known_settings(module: ModuleType) -> tuple[str, ...]:
@@ -255,11 +285,11 @@ def _surely_blends(field: GaussianField, camera: Camera) -> bool:
         return bool((inside & moderate & visible & (depths > 2 * NEAR_DEPTH)).any())
 
 
-def _with_companion(inputs: dict[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+def _with_companion(inputs: dict[str, Tensor], camera: Camera, opacity: float) -> dict[str, Tensor]:
     """A rasterizer's inputs with a last Gaussian that is in a tile and in no pixel: no bit of the image is another.
 
-    It is a point between the first four pixels, where its alpha is just over 1/255. At the pixels, which the 0.3 px^2
-    let it reach, it is less than half of that.
+    It is a point between the first four pixels, where its alpha, of that opacity, is just over 1/255. At the pixels,
+    which the 0.3 px^2 let it reach, it is less than half of that.
     """
     rows = {name: value.new_zeros(1, *value.shape[1:]) for name, value in inputs.items()}
     pose = camera.world_to_camera.to("cpu", torch.float64)
@@ -269,7 +299,7 @@ def _with_companion(inputs: dict[str, Tensor], camera: Camera) -> dict[str, Tens
     rows["means3D"] = ((point - pose[:3, 3]) @ pose[:3, :3])[None].to(rows["means3D"])  # (1, 3)
     rows["scales"] += 1e-4 * depth / max(camera.fx, camera.fy)
     rows["rotations"][:, 0] = 1
-    rows["opacities"] += COMPANION_OPACITY
+    rows["opacities"] += opacity
     return {name: torch.cat([value, rows[name]]) for name, value in inputs.items()}
 
 

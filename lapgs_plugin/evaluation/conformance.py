@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, pixel_weights, random_case
-from lapgs_plugin.raster import Rasterizer, RenderResult, Semantics
+from lapgs_plugin.raster import Rasterizer, RenderResult, Semantics, render_transmittance
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
@@ -58,6 +58,25 @@ BOUNDS = {
 }
 """By the rasterizer's float type."""
 
+EXPANDED_CONIC: dict[str, dict[str, dict[str, float]]] = {
+    "needles": {
+        # Worst seen on an H200, and in brackets in the emulation of tests/unit/test_conformance.py.
+        "means": {"element": 1.5e-3, "relative_l2": 1e-3},  # 6e-4 (7e-4), 3e-4 (4e-4)
+        "quaternions": {"element": 1.5e-3, "row": 4e-2, "relative_l2": 2e-3},  # 7e-4 (8e-4), 1e-2 (2e-2), 6e-4 (9e-4)
+        "log_scales": {"element": 5e-2, "row": 1e-1, "relative_l2": 3e-2},  # 2e-2 (3e-2), 3e-2 (5e-2), 8e-3 (1e-2)
+    }
+}
+"""What replaces entries of `Bounds`, by case and gradient, where `Semantics.expanded_conic_gradient` holds.
+
+With C the inverse of the 2D covariance Sigma' and G the loss's gradient by C, the gradient by Sigma' is -C G C. CUDA code
+of the family multiplies that out, entry by entry, as polynomials of Sigma' over its squared determinant. With eigenvalues
+l1 > l2 of Sigma', terms of size l1/l2^2 then cancel, in each entry by itself, to what is at most 1/l2; the part along the
+longer axis, which is all that a needle's long scale sees, is 1/l1. So a relative (l1/l2)^2 epsilon is lost of it. Needles
+reach l1/l2 = 1250: 0.1, of which the random signs of the roundings leave a tenth or so. Taken through the determinant, as
+autograd does, the lost part has the shape of adj(Sigma'), whose own part along the longer axis is only l2, and the loss is
+l1/l2 epsilon: the same float32 gradients by C then give log_scales to 7e-5 instead of 1e-2. Neither the 1e-7 that the CUDA
+code adds to the squared determinant (2e-8 of the largest element) nor the rounding of G (3e-8) plays a part.
+"""
 MAX_BAND = 0.4
 """Largest share of pixels that may be in the band: only `near_plane` reaches a third."""
 KINK_FACTOR = 2.0
@@ -186,9 +205,12 @@ def _render(rasterizer: Rasterizer, case: Case, weights: Tensor, device: str) ->
     gradients = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
     if result.absgrad2d is not None:
         gradients["absgrad2d"] = result.absgrad2d
+    transmittance = result.transmittance
+    if transmittance is None:
+        transmittance = render_transmittance(rasterizer, case.field, case.camera)
     return _Rendered(
         image=_exact(result.image),
-        transmittance=_exact(result.transmittance),
+        transmittance=_exact(transmittance),
         radii=result.radii.detach().cpu().long(),
         means2d=_exact(result.means2d),
         gradients={name: None if value is None else _exact(value) for name, value in gradients.items()},
@@ -245,9 +267,17 @@ def _compared(
     for name, wanted in expected.gradients.items():
         got = actual.gradients.get(name)
         if got is not None and wanted is not None:  # absgrad2d, which not all offer
-            errors[name], found = _compare_gradients(name, got, wanted, mask.kinks, bounds)
+            errors[name], found = _compare_gradients(name, got, wanted, mask.kinks, _bounds(subject, case.name, name))
             problems += found
     return replace(outcome, errors=errors, band_error=band_error, problems=tuple(problems))
+
+
+def _bounds(subject: Subject, case: str, gradient: str) -> Bounds:
+    """How closely this gradient has to follow the oracle's."""
+    bounds = BOUNDS[subject.dtype]
+    if not subject.semantics.expanded_conic_gradient:
+        return bounds
+    return replace(bounds, **EXPANDED_CONIC.get(case, {}).get(gradient, {}))
 
 
 def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance: float) -> Iterator[str]:

@@ -153,7 +153,7 @@ def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: P
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             scene(signed=True).render(rasterizer)
-    assert len(extension.calls) == 4
+    assert len(extension.calls) == 5  # three scenes, and two of the probe
     (record,) = caplog.records
     assert "some_extension has no signed colour" in record.getMessage()
     assert "lapgs patch apply" in record.getMessage()
