@@ -6,8 +6,9 @@ import math
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from lapgs_plugin.archive import Manifest, PredictionCache
+from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import parse_supervision
@@ -70,7 +71,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
-        PredictionCache.check(self.cache, self.cache_precision)
+        ImageStore.check(self.cache, self.cache_precision)
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
         if not 0.0 < self.inherit_ratio <= 1.0:

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import PredictionCache
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.hooks import HookDispatcher, StageContext
+from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.raster import Rasterizer, RenderResult
 from lapgs_plugin.training.densification import Densifier
@@ -62,7 +62,7 @@ class StageRun:
     schedule: StageSchedule
     settings: TrainSettings
     views: Sequence[LevelView]
-    accumulated: PredictionCache | None
+    accumulated: ImageStore | None
     background: Tensor
     extent: float
     rasterizer: Rasterizer
@@ -88,13 +88,13 @@ class StageRun:
             after_iteration(self)
 
     def _iterate(self, iteration: int) -> None:
-        view = self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
+        view = self._view(iteration)
         context = StageContext(
             stage=self.stage,
             iteration=iteration,
             view=view.name,
             target=view.target,
-            accumulated=None if self.accumulated is None else self.accumulated.get(view.name),
+            accumulated=self._prediction(view, iteration),
             coarse_target=view.coarse_target,
         )
         degree = self.schedule.active_sh_degree(iteration)
@@ -109,6 +109,18 @@ class StageRun:
         self._densify(context, result, view)
         if iteration % FINITE_CHECK_EVERY == 0 or iteration == self.stage.iterations:
             self._require_finite(iteration)
+
+    def _view(self, iteration: int) -> LevelView:
+        return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
+
+    def _prediction(self, view: LevelView, iteration: int) -> Tensor | None:
+        """What the finished levels predict for this iteration's view, while the next one's is on its way."""
+        if self.accumulated is None:
+            return None
+        prediction = self.accumulated.get(view.name)
+        if iteration < self.stage.iterations:
+            self.accumulated.announce(self._view(iteration + 1).name)
+        return prediction
 
     def _densify(self, context: StageContext, result: RenderResult, view: LevelView) -> None:
         size = (view.camera.width, view.camera.height)

@@ -12,11 +12,12 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.archive import CACHE, LevelRecord, PredictionCache, RunArchive
+from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
@@ -86,8 +87,8 @@ class Trainer:
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = parse_supervision(self.settings.supervision)
         self._overhead: dict[str, float] = {}
-        self._train_cache: PredictionCache | None = None
-        self._test_cache: PredictionCache | None = None
+        self._train_cache: ImageStore | None = None
+        self._test_cache: ImageStore | None = None
         self._last_tick = (0.0, 0)
 
     def run(self, resume: bool = False) -> None:
@@ -184,10 +185,10 @@ class Trainer:
         with self._timed("evaluation"):
             self._test_cache = self._predictions(stage, self.scene.test, "test")
 
-    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> PredictionCache:
+    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> ImageStore:
         """Up(I_hat^(l+1)) of each view, for the stage of level l."""
         settings, coarser = self.settings, stage.level + 1
-        cache = PredictionCache(settings.cache, settings.cache_precision, self.archive.path(CACHE, name))
+        cache = ImageStore(settings.cache, settings.cache_precision, folder=self.archive.path(CACHE, name))
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer)
             for view in views:

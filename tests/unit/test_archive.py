@@ -1,4 +1,4 @@
-"""Run folders under crashes, full disks, damage and two writers; the prediction cache."""
+"""Run folders under crashes, full disks, damage and two writers."""
 
 from __future__ import annotations
 
@@ -16,20 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor
 
 from lapgs_plugin.archive import (
     FORMAT_VERSION,
     LevelRecord,
     Manifest,
-    PredictionCache,
     RunArchive,
     SceneReference,
 )
-from lapgs_plugin.errors import FieldError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
@@ -409,6 +405,7 @@ def test_a_disk_that_fills_in_the_middle_of_a_file(tmp_path: Path) -> None:
     script = f"""
 import resource, sys
 sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from lapgs_plugin.imagestore import ImageStore
 from tests.unit.test_archive import *
 archive = RunArchive.create({str(tmp_path)!r}, manifest())
 finish(archive, 1)
@@ -417,7 +414,7 @@ before = snapshot(archive.path())
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
 big = {{name: tensor.repeat(100, *[1] * (tensor.ndim - 1)) for name, tensor in level_field(0).parameters.items()}}
 big_record = replace(record(0), num_gaussians=400)
-cache = PredictionCache("disk", folder=archive.path("cache", "train"))
+cache = ImageStore("disk", "float32", folder=archive.path("cache", "train"))
 for write in (
     lambda: archive.finish_level(big_record, GaussianField(**big, signed=True)),
     lambda: archive.save_checkpoint({{"x": torch.zeros(10_000)}}),
@@ -547,87 +544,3 @@ def test_manifest_survives_json() -> None:
 def test_records_out_of_order_are_refused(records: tuple[int, ...]) -> None:
     with pytest.raises(UserInputError, match="coarsest first"):
         replace(manifest(), records=tuple(record(level) for level in records))
-
-
-# Prediction cache
-
-
-def cache(tmp_path: Path, where: str, precision: str) -> PredictionCache:
-    return PredictionCache(where, precision, tmp_path / "cache" if where == "disk" else None)
-
-
-@pytest.mark.parametrize("where", ["memory", "disk"])
-@pytest.mark.parametrize("precision", ["float32", "float16", "uint8"])
-@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(values=arrays(np.float32, array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.floats(-3, 3, width=32)))
-def test_cached_predictions_come_back_within_their_precision(
-    tmp_path: Path, where: str, precision: str, values: np.ndarray
-) -> None:
-    with cache(tmp_path, where, precision) as kept:
-        kept.put("dir/view 1.jpg", torch.from_numpy(values))
-        got = kept.get("dir/view 1.jpg")
-        assert got.dtype == torch.float32
-        assert kept.size_bytes == values.size * {"float32": 4, "float16": 2, "uint8": 1}[precision]
-        if precision == "float32":
-            assert torch.equal(got, torch.from_numpy(values))
-        elif precision == "float16":  # half a unit in the last of 11 bits, or half a subnormal step
-            np.testing.assert_allclose(got.numpy(), values, rtol=2**-11, atol=2**-25)
-        else:  # half of one of 255 steps over the image's own range, and float32 rounding of values up to 3
-            assert np.abs(got.numpy() - values).max() <= np.ptp(values) / 510 + 1e-6
-
-
-@pytest.mark.parametrize("precision", ["float32", "float16", "uint8"])
-def test_a_constant_image_is_exact(tmp_path: Path, precision: str) -> None:
-    with cache(tmp_path, "memory", precision) as kept:
-        kept.put("a", torch.full((3, 4, 5), -0.25))
-        assert torch.equal(kept.get("a"), torch.full((3, 4, 5), -0.25))
-
-
-def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path) -> None:
-    for where in ("memory", "disk"):
-        with cache(tmp_path, where, "float32") as kept:
-            image = torch.ones(3, 2, 2, requires_grad=True)
-            kept.put("a", image)
-            image.data.zero_()
-            assert torch.equal(kept.get("a"), torch.ones(3, 2, 2))
-            kept.put("a", torch.full((3, 3, 1), 2.0, dtype=torch.float64))
-            assert torch.equal(kept.get("a"), torch.full((3, 3, 1), 2.0))
-            assert (len(kept), kept.size_bytes) == (1, 36)
-
-
-def test_prefetching_changes_nothing_but_when_it_is_read(tmp_path: Path) -> None:
-    images = {f"{i}": torch.rand(3, 6, 5) for i in range(8)}
-    with cache(tmp_path, "disk", "float32") as kept:
-        for name, image in images.items():
-            kept.put(name, image)
-        kept.prefetch("3")
-        kept.prefetch("3")
-        assert torch.equal(kept.get("3"), images["3"])
-        assert torch.equal(kept.get("3"), images["3"])
-        for name, following in zip(images, [*list(images)[1:], "0"], strict=True):
-            kept.prefetch(following)
-            assert torch.equal(kept.get(name), images[name])
-        kept.prefetch("5")
-        for file in (tmp_path / "cache").iterdir():
-            if file.name == "000001.bin":
-                file.unlink()
-        with pytest.raises(RunFolderError, match=r"000001\.bin cannot be read"):
-            kept.get("1")
-    assert not (tmp_path / "cache").exists()
-    with pytest.raises(KeyError):
-        kept.get("3")
-
-
-def test_predictions_that_diverged_are_refused(tmp_path: Path) -> None:
-    with cache(tmp_path, "memory", "uint8") as kept:
-        for bad in (torch.nan, torch.inf):
-            with pytest.raises(TrainingDivergedError, match=r"view a\.jpg holds NaN or inf"):
-                kept.put("a.jpg", torch.tensor([0.0, bad]).view(1, 1, 2))
-        assert len(kept) == 0
-
-
-def test_unknown_places_and_precisions_are_named() -> None:
-    with pytest.raises(UserInputError, match="--cache tape: expected memory or disk"):
-        PredictionCache("tape")
-    with pytest.raises(UserInputError, match="--cache-precision int4: expected float32, float16, uint8"):
-        PredictionCache("memory", "int4")

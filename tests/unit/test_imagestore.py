@@ -1,0 +1,337 @@
+"""Images that come back as they were put, wherever they were kept; on a GPU also while it is busy."""
+
+from __future__ import annotations
+
+import gc
+import random
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from torch import Tensor
+
+from lapgs_plugin import imagestore
+from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.imagestore import AHEAD, ImageStore, place
+
+ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
+
+KEPT = [("cpu", "memory"), ("cpu", "disk"), ("cuda", "gpu"), ("cuda", "memory"), ("cuda", "disk")]
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+on_every_device = pytest.mark.parametrize(
+    ("device", "where"),
+    [
+        pytest.param(device, where, marks=[pytest.mark.gpu, needs_cuda] if device == "cuda" else [])
+        for device, where in KEPT
+    ],
+)
+in_every_precision = pytest.mark.parametrize("precision", ITEM_SIZE)
+
+
+def store(folder: Path, where: str, precision: str, device: str = "cpu") -> ImageStore:
+    return ImageStore(where, precision, device=device, folder=folder / "images")
+
+
+def eight_bit(*shape: int) -> Tensor:
+    return torch.randint(0, 256, shape, dtype=torch.uint8)
+
+
+@on_every_device
+@in_every_precision
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=arrays(np.float32, array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.floats(-3, 3, width=32)))
+def test_images_come_back_within_their_precision(
+    tmp_path: Path, device: str, where: str, precision: str, values: np.ndarray
+) -> None:
+    with store(tmp_path, where, precision, device) as kept:
+        kept.put("dir/view 1.jpg", torch.from_numpy(values))
+        got = kept.get("dir/view 1.jpg")
+        assert (got.dtype, got.device.type) == (torch.float32, device)
+        result = got.cpu().numpy()
+        if precision == "float32":
+            np.testing.assert_array_equal(result, values)
+        elif precision == "float16":  # half a unit in the last of 11 bits, or half a subnormal step
+            np.testing.assert_allclose(result, values, rtol=2**-11, atol=2**-25)
+        else:  # half of one of 255 steps over the image's own range, and float32 rounding of values up to 3
+            assert np.abs(result - values).max() <= np.ptp(values) / 510 + 1e-6
+
+
+@on_every_device
+def test_photographs_come_back_as_codebases_decode_them(tmp_path: Path, device: str, where: str) -> None:
+    every = torch.arange(256, dtype=torch.uint8).view(1, 16, 16)
+    for number, stored in enumerate(
+        [every, eight_bit(3, 7, 9), every[:, 3:4], torch.zeros(3, 1, 1, dtype=torch.uint8)]
+    ):
+        image = stored / 255  # on the CPU, where PIL images are decoded
+        with store(tmp_path, where, "uint8", device) as kept:
+            kept.put("cpu", image)
+            assert torch.equal(kept.get("cpu").cpu(), image), number
+            kept.put("moved", image.to(device))
+            assert torch.equal(kept.get("moved").cpu(), image), number
+            kept.put("decoded there", stored.to(device) / 255)  # a GPU multiplies, and misses by an ulp
+            assert torch.equal(kept.get("decoded there").cpu(), image), number
+
+
+def test_images_that_are_nearly_photographs_are_not_taken_for_some() -> None:
+    image = eight_bit(3, 8, 8) / 255
+    image[1, 2, 3] += 0.4 / 255
+    with ImageStore("memory", "uint8") as kept:
+        kept.put("a", image)
+        low, high = image.min(), image.max()
+        steps = (kept.get("a") - low) / (high - low) * 255
+        torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-4)  # its own 256 steps, worst seen 2e-5
+        assert float((kept.get("a") - image).abs().max()) <= float(high - low) / 510 + 1e-6
+
+
+@on_every_device
+@in_every_precision
+def test_a_constant_image_is_exact(tmp_path: Path, device: str, where: str, precision: str) -> None:
+    with store(tmp_path, where, precision, device) as kept:
+        kept.put("a", torch.full((3, 4, 5), -0.25))
+        assert torch.equal(kept.get("a").cpu(), torch.full((3, 4, 5), -0.25))
+
+
+@on_every_device
+@in_every_precision
+def test_the_type_of_the_result_is_chosen_by_the_caller(
+    tmp_path: Path, device: str, where: str, precision: str
+) -> None:
+    as_stored = torch.float16 if precision == "float16" else torch.float32
+    image = eight_bit(3, 4, 5) / 255
+    with store(tmp_path, where, precision, device) as kept:
+        kept.put("a", image)
+        for dtype, expected in ((None, as_stored), (torch.float16, torch.float16), (torch.float64, torch.float64)):
+            got = kept.get("a", dtype)
+            assert got.dtype == expected
+            torch.testing.assert_close(got.cpu().float(), image, rtol=2**-11, atol=0)
+
+
+@on_every_device
+@in_every_precision
+def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, where: str, precision: str) -> None:
+    with store(tmp_path, where, precision, device) as kept:
+        image = torch.ones(3, 2, 2, requires_grad=True, device=device)
+        kept.put("a", image)
+        image.data.zero_()
+        assert torch.equal(kept.get("a").cpu(), torch.ones(3, 2, 2))
+        kept.announce("a")
+        kept.put("a", torch.full((3, 3, 1), 2.0, dtype=torch.float64))
+        assert torch.equal(kept.get("a").cpu(), torch.full((3, 3, 1), 2.0))
+        assert (kept.names, len(kept)) == (("a",), 1)
+        transposed = eight_bit(5, 4, 3).permute(2, 0, 1) / 255
+        kept.put("b", transposed)
+        torch.testing.assert_close(kept.get("b").cpu(), transposed, rtol=2**-11, atol=0)
+
+
+@on_every_device
+def test_announcing_changes_nothing_but_when_it_is_brought(tmp_path: Path, device: str, where: str) -> None:
+    images = {f"{i}": torch.rand(3, 6 + i, 5) for i in range(4 * AHEAD)}
+    with store(tmp_path, where, "float32", device) as kept:
+        for name, image in images.items():
+            kept.put(name, image)
+        kept.announce("3")
+        kept.announce("3")
+        assert torch.equal(kept.get("3").cpu(), images["3"])
+        assert torch.equal(kept.get("3").cpu(), images["3"])
+        for name in images:  # more than may be under way
+            kept.announce(name)
+        for name, image in images.items():
+            assert torch.equal(kept.get(name).cpu(), image)
+        order = random.Random(0).choices(list(images), k=100)
+        for name, following in zip(order, [*order[1:], "0"], strict=True):
+            kept.announce(following)
+            assert torch.equal(kept.get(name).cpu(), images[name])
+        kept.announce("5")
+    for ask in (kept.get, kept.announce):
+        with pytest.raises(KeyError):
+            ask("5")
+
+
+@on_every_device
+@in_every_precision
+def test_bytes_are_counted_where_they_lie(tmp_path: Path, device: str, where: str, precision: str) -> None:
+    each = 3 * 4 * 5 * ITEM_SIZE[precision]
+    with store(tmp_path, where, precision, device) as kept:
+        assert "a" not in kept
+        for name in "abc":
+            kept.put(name, torch.rand(3, 4, 5))
+        assert "a" in kept
+        at_rest = {"gpu": 0, "memory": 0, "disk": 0, where: 3 * each}
+        assert (kept.bytes_on_device, kept.bytes_in_memory, kept.bytes_on_disk) == tuple(at_rest.values())
+        kept.announce("b")
+        if where == "disk" or (device, where) == ("cuda", "memory"):
+            at_rest["gpu" if device == "cuda" else "memory"] += each
+        assert (kept.bytes_on_device, kept.bytes_in_memory, kept.bytes_on_disk) == tuple(at_rest.values())
+        kept.get("b")
+        assert kept.bytes_on_device + kept.bytes_in_memory + kept.bytes_on_disk == 3 * each
+        if where == "disk":
+            assert sum(file.stat().st_size for file in (tmp_path / "images").iterdir()) == 3 * each
+    assert not (tmp_path / "images").exists()
+
+
+def test_the_disk_is_read_in_the_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a reader that never ends by itself holds one image, another one can be announced and fetched."""
+    reading, go_on = threading.Event(), threading.Event()
+    read = imagestore._read_file
+
+    def slow(path: Path, stored: Tensor) -> None:
+        if path.name == "000000.bin":
+            reading.set()
+            assert go_on.wait(10)
+        read(path, stored)
+
+    monkeypatch.setattr(imagestore, "_read_file", slow)
+    with store(tmp_path, "disk", "float32") as kept:
+        kept.put("slow", torch.ones(3, 2, 2))
+        kept.put("other", torch.zeros(3, 2, 2))
+        kept.announce("slow")
+        assert reading.wait(10)
+        assert torch.equal(kept.get("other"), torch.zeros(3, 2, 2))
+        threading.Timer(0.05, go_on.set).start()
+        kept.put("slow", torch.full((3, 2, 2), 5.0))  # waits for the reader, and never mixes with what it read
+        assert go_on.is_set()
+        assert torch.equal(kept.get("slow"), torch.full((3, 2, 2), 5.0))
+
+
+@on_every_device
+def test_files_that_are_gone_or_cut_short(tmp_path: Path, device: str, where: str) -> None:
+    if where != "disk":
+        return
+    with store(tmp_path, where, "float16", device) as kept:
+        for name in "abc":
+            kept.put(name, torch.rand(3, 4, 5))
+        kept.announce("c")
+        time.sleep(0.05)
+        (tmp_path / "images" / "000000.bin").write_bytes(b"x")
+        (tmp_path / "images" / "000001.bin").unlink()
+        for name, number in (("a", 0), ("b", 1)):
+            for _ in range(2):
+                with pytest.raises(RunFolderError, match=rf"00000{number}\.bin cannot be read: .*; expected"):
+                    kept.get(name)
+        kept.put("b", torch.ones(3, 4, 5))
+        assert torch.equal(kept.get("b").cpu(), torch.ones(3, 4, 5))
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, data: Any) -> int:
+        with path.open("wb") as stream:
+            stream.write(bytes(data)[:7])
+        raise OSError(28, "No space left on device")
+
+    with store(tmp_path, "disk", "float32") as kept:
+        kept.put("a", torch.ones(3, 2, 2))
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "write_bytes", full)
+            with pytest.raises(RunFolderError, match=r"000001\.bin cannot be written: No space left .*free some space"):
+                kept.put("b", torch.ones(3, 2, 2))
+        assert [file.name for file in (tmp_path / "images").iterdir()] == ["000000.bin"]
+        assert kept.names == ("a",)
+
+
+@pytest.mark.parametrize("precision", ITEM_SIZE)
+def test_images_that_diverged_are_refused(precision: str) -> None:
+    with ImageStore("memory", precision) as kept:
+        for bad in (torch.nan, torch.inf, -torch.inf):
+            with pytest.raises(TrainingDivergedError, match=r"view a\.jpg holds NaN"):
+                kept.put("a.jpg", torch.tensor([0.0, bad]).view(1, 1, 2))
+        if precision == "float16":
+            with pytest.raises(TrainingDivergedError, match="beyond 65504"):
+                kept.put("a.jpg", torch.full((1, 1, 2), 1e5))
+        assert len(kept) == 0
+
+
+def test_unknown_places_and_precisions_are_named(tmp_path: Path) -> None:
+    for where in ("tape", "gpu"):
+        with pytest.raises(UserInputError, match=f"--cache {where}: expected memory or disk$"):
+            ImageStore(where, "float32")
+    with pytest.raises(UserInputError, match=r"--cache tape: expected gpu or memory or disk$"):
+        ImageStore.check("tape", "float32", "cuda")
+    ImageStore.check("gpu", "float32", "cuda:1")
+    with pytest.raises(UserInputError, match="--cache-precision int4: expected float32, float16, uint8"):
+        ImageStore("memory", "int4")
+
+
+def test_a_cpu_keeps_images_in_memory() -> None:
+    assert place(1, "cpu") == place(1 << 50, torch.device("cpu")) == "memory"
+
+
+@pytest.mark.parametrize(("memory", "limit"), [(8 << 30, (8 << 30) // 10), (80 << 30, 2 << 30)])
+def test_a_gpu_keeps_what_is_small_beside_it(monkeypatch: pytest.MonkeyPatch, memory: int, limit: int) -> None:
+    class Properties:
+        total_memory = memory
+
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: Properties)
+    assert [place(limit + more, "cuda") for more in (-1, 0, 1)] == ["gpu", "gpu", "memory"]
+
+
+# On a GPU
+
+
+@pytest.mark.gpu
+@needs_cuda
+@pytest.mark.parametrize("where", ["memory", "disk", "gpu"])
+@in_every_precision
+def test_a_busy_gpu_gets_no_torn_and_no_stale_image(tmp_path: Path, where: str, precision: str) -> None:
+    """The processor runs far ahead of the GPU, so memory of fetched images is asked for again before it was used."""
+    size, names = (3, 600, 800), [f"{i}" for i in range(24)]
+    base = eight_bit(*size).cuda()
+    load = torch.rand(2048, 2048, device="cuda")
+
+    def image(name: str) -> Tensor:
+        return ((base.int() * (2 * int(name) + 1) + int(name)) % 256).to(torch.uint8).cpu() / 255
+
+    expected = {name: image(name).cuda() for name in names}
+    with store(tmp_path, where, precision, "cuda") as kept:
+        for name in names:
+            kept.put(name, image(name))
+        order = random.Random(0).choices(names, k=300)
+        wrong = torch.zeros((), dtype=torch.int64, device="cuda")
+        for i, name in enumerate(order):
+            for following in order[i + 1 : i + 4]:
+                kept.announce(following)
+            got = kept.get(name)
+            for _ in range(4):
+                load = (load @ load).clamp_(-1, 1)
+            tolerance = 0.0 if precision != "float16" else 2**-12
+            wrong += ((got - expected[name]).abs().amax() > tolerance).long()
+            del got
+        assert wrong.item() == 0
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_images_are_handed_to_the_current_stream(tmp_path: Path) -> None:
+    image = eight_bit(3, 600, 800) / 255
+    for where in ("gpu", "memory", "disk"):
+        with store(tmp_path, where, "uint8", "cuda") as kept:
+            kept.put("a", image)
+            other = torch.cuda.Stream()
+            with torch.cuda.stream(other):
+                got = kept.get("a")
+                doubled = got * 2
+            other.synchronize()
+            assert torch.equal(doubled.cpu(), image * 2)
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_memory_is_page_locked_and_let_go(tmp_path: Path) -> None:
+    with store(tmp_path, "memory", "uint8", "cuda") as kept:
+        kept.put("a", eight_bit(3, 1001, 701) / 255)
+        image = kept._images["a"]
+        assert image.stored is not None
+        assert image.page_locked is not None
+        assert image.stored.is_pinned()
+        address = image.stored.data_ptr()
+        del image
+    gc.collect()
+    assert int(torch.cuda.cudart().cudaHostUnregister(address)) != 0  # not registered any more
