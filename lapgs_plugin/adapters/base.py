@@ -192,7 +192,9 @@ class BackboneAdapter(ABC):
         """
         return []
 
-    def level_view(self, view: Any, original: Any, size: tuple[int, int], signed: bool) -> None:
+    def level_view(  # noqa: B027 - most backbones have nothing else in a view
+        self, view: Any, original: Any, size: tuple[int, int], signed: bool
+    ) -> None:
         """Bring everything of a view besides its image to a level's size.
 
         Args:
@@ -201,15 +203,12 @@ class BackboneAdapter(ABC):
             size: (width, height) of the level.
             signed: whether a residual is trained.
         """
-        return None
 
-    def first_points(self, count: int) -> None:
+    def first_points(self, count: int) -> None:  # noqa: B027 - few need it
         """Told how many points the scene comes with, before the first stage."""
-        return None
 
-    def stage_scene(self, scene: Any) -> None:
+    def stage_scene(self, scene: Any) -> None:  # noqa: B027 - few need it
         """Told of the scene that a stage trains on, before its first iteration."""
-        return None
 
     def new_model(self, call: TrainingCall) -> Any:
         """A GaussianModel without Gaussians, as the script makes it."""

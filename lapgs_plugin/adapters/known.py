@@ -70,7 +70,8 @@ def adapter_class(folder: Path, key: str | None = None) -> type[BackboneAdapter]
     if found is None or found.key is None:
         raise UserInputError(
             f"{folder} is not the root of a checkout that `lapgs run` knows (FastGS, Taming-3DGS, "
-            f"graphdeco 3DGS), which have {', '.join(GRAPHDECO_FILES)}; name it with --backbone, or use `lapgs train` without a checkout"
+            f"graphdeco 3DGS), which have {', '.join(GRAPHDECO_FILES)}; "
+            "name it with --backbone, or use `lapgs train` without a checkout"
         )
     module, name = found.adapter.split(":")
     adapter: Any = getattr(import_module(f"lapgs_plugin.adapters.{module}"), name)

@@ -88,8 +88,8 @@ class PhotoAlbum:
         except KeyError:
             raise UserInputError(
                 f"camera {getattr(camera, 'image_name', '?')} of the checkout was not made by "
-                "utils.camera_utils.Camera, expected of every camera of the scene; this checkout loads scenes in another "
-                "way: use `lapgs run --off`"
+                "utils.camera_utils.Camera, expected of every camera of the scene; this checkout loads scenes "
+                "in another way: use `lapgs run --off`"
             ) from None
 
     def photo(self, key: str) -> Photo:

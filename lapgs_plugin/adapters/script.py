@@ -74,9 +74,9 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         yield Script(path, module, main)
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
-        for name in set(sys.modules) - known:
-            if _is_under(sys.modules[name], path.parent):
-                del sys.modules[name]
+        # Found first, forgotten afterwards: a package without an __init__ asks for its parent when its path is looked at.
+        for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
+            del sys.modules[name]
 
 
 def _split(path: Path) -> tuple[CodeType, CodeType]:

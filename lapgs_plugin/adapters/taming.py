@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
 
+from lapgs_plugin.adapters.attachment import Replacement
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 
@@ -17,7 +19,7 @@ BASE_SHARE, FINEST_SHARE = 0.4, 0.6
 """Share of the budget that the base and the finest residual end with; stages between lie between.
 
 Both end below the whole budget, so that every iteration is cheaper than the backbone's own at the same progress, and
-each residual has room to grow from what it inherits: the checkout cannot densify by nothing.
+each residual has room to grow from what it inherits.
 """
 
 
@@ -41,6 +43,15 @@ class TamingAdapter(BackboneAdapter):
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
         return {}
 
+    def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        consumer = "densify_with_score(), which cannot sample nothing"
+        return [
+            Replacement(
+                self.train.GaussianModel, name, _unless_nothing, ("self", "grads", "budget", "filter"), consumer
+            )
+            for name in ("densify_and_clone_taming", "densify_and_split_taming")
+        ]
+
     def refuse(self, call: TrainingCall, levels: int) -> None:
         super().refuse(call, levels)
         if levels > 1 and call.values["args"].benchmark_dir:
@@ -53,13 +64,16 @@ class TamingAdapter(BackboneAdapter):
         changed = super().stage_call(call, window, model_path)
         args, opt = copy.copy(call.values["args"]), changed.opt
         args.ho_iteration = window.scaled(args.ho_iteration)
-        # Its table of counts has one entry an interval; a last, shorter interval would be looked up beyond the end.
+        # Its table of counts has one entry an interval, and is looked up beyond its end unless densification starts and
+        # stops at whole intervals.
+        opt.densify_from_iter = -(-opt.densify_from_iter // opt.densification_interval) * opt.densification_interval
         intervals = (opt.densify_until_iter - opt.densify_from_iter) // opt.densification_interval
         if intervals < 1:
             raise UserInputError(
                 f"level {window.stage.level} would stop densifying at iteration {opt.densify_until_iter} and start "
                 f"after {opt.densify_from_iter}, but a budget needs at least one interval of "
-                f"{opt.densification_interval} between; raise --iterations, or lower --densify_from_iter or --densification_interval"
+                f"{opt.densification_interval} between; raise --iterations, or lower --densify_from_iter "
+                "or --densification_interval"
             )
         opt.densify_until_iter = opt.densify_from_iter + intervals * opt.densification_interval
         args.mode, args.budget = "final_count", self._budget(call, window)
@@ -77,3 +91,13 @@ class TamingAdapter(BackboneAdapter):
 
     def first_points(self, count: int) -> None:
         self._points = count
+
+
+def _unless_nothing(original: Callable[..., None]) -> Callable[..., None]:
+    """Leave out what would add no Gaussian: a field that inherits can be at its budget, or have none that qualifies."""
+
+    def densify(gaussians: Any, grads: Tensor, budget: int, filter: Tensor, *others: Any) -> None:
+        if budget > 0:
+            original(gaussians, grads, budget, filter, *others)
+
+    return densify

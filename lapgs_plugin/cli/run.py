@@ -116,8 +116,9 @@ def run(
 
     import torch
 
+    from lapgs_plugin.adapters.active_stage import HierarchyOptions
     from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
-    from lapgs_plugin.adapters.driver import HierarchyDriver, HierarchyOptions
+    from lapgs_plugin.adapters.driver import HierarchyDriver
     from lapgs_plugin.adapters.known import adapter_class
     from lapgs_plugin.adapters.script import loaded_script, require_script
     from lapgs_plugin.inheritance import parse_inheritance
