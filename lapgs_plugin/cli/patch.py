@@ -25,7 +25,8 @@ SetName = Annotated[
     typer.Option(
         "--set",
         help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to "
-        "13), or all of them. Not among all, as it changes ordinary training: gradient-fixes, where there are any.",
+        "13), or all of them. Not among all, as they change ordinary training too: gradient-fixes and robustness, "
+        "where there are any; patches/README.md says what they mend.",
     ),
 ]
 AllowDirty = Annotated[

@@ -83,7 +83,7 @@ class Recipe:
         present, absent: what its folder must and must not contain to be recognised.
         reinstall: the command that builds and installs it again; `{folder}` stands for its folder.
         edits, checks: in the order of the file, inherited ones first.
-        opt_in: sets that change what ordinary calls compute; "all" leaves them out when it puts edits in.
+        opt_in: sets that change what ordinary calls do; "all" leaves them out when it puts edits in.
     """
 
     name: str
