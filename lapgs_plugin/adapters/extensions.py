@@ -27,13 +27,13 @@ from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 SEMANTICS = {
     "diff_gaussian_rasterization": Semantics(
         expanded_conic_gradient=True,
-        note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of needles are "
-        "rounded to a few hundredths",
+        note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of needles "
+        "are right to a few hundredths",
     ),
     "diff_gaussian_rasterization_fastgs": Semantics(
         three_sigma_cut=False,
         expanded_conic_gradient=True,
-        note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are rounded to a "
+        note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are right to a "
         "few hundredths",
     ),
 }

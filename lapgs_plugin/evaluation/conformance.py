@@ -68,14 +68,15 @@ EXPANDED_CONIC: dict[str, dict[str, dict[str, float]]] = {
 }
 """What replaces entries of `Bounds`, by case and gradient, where `Semantics.expanded_conic_gradient` holds.
 
-With C the inverse of the 2D covariance Sigma' and G the loss's gradient by C, the gradient by Sigma' is -C G C. CUDA code
-of the family multiplies that out, entry by entry, as polynomials of Sigma' over its squared determinant. With eigenvalues
-l1 > l2 of Sigma', terms of size l1/l2^2 then cancel, in each entry by itself, to what is at most 1/l2; the part along the
-longer axis, which is all that a needle's long scale sees, is 1/l1. So a relative (l1/l2)^2 epsilon is lost of it. Needles
-reach l1/l2 = 1250: 0.1, of which the random signs of the roundings leave a tenth or so. Taken through the determinant, as
-autograd does, the lost part has the shape of adj(Sigma'), whose own part along the longer axis is only l2, and the loss is
-l1/l2 epsilon: the same float32 gradients by C then give log_scales to 7e-5 instead of 1e-2. Neither the 1e-7 that the CUDA
-code adds to the squared determinant (2e-8 of the largest element) nor the rounding of G (3e-8) plays a part.
+With C the inverse of the 2D covariance Sigma' and G the loss's gradient by C, the gradient by Sigma' is -C G C. CUDA
+code of the family multiplies that out, entry by entry, as polynomials of Sigma' over its squared determinant. With
+eigenvalues l1 > l2 of Sigma', terms of size l1/l2^2 then cancel, in each entry by itself, to what is at most 1/l2; the
+part along the longer axis, which is all that a needle's long scale sees, is 1/l1. So a relative (l1/l2)^2 epsilon of
+it is lost. Needles reach l1/l2 = 1250: 0.1, of which the roundings' random signs leave a tenth or so. Taken through
+the determinant, as autograd does, what is lost has the shape of adj(Sigma'), whose own part along the longer axis is
+only l2, and the loss is l1/l2 epsilon: from the same float32 G, log_scales are then right to 7e-5 instead of 1e-2.
+Neither the 1e-7 that the CUDA code adds to the squared determinant (2e-8 of the largest element) nor the rounding of G
+(3e-8) plays a part.
 """
 MAX_BAND = 0.4
 """Largest share of pixels that may be in the band: only `near_plane` reaches a third."""

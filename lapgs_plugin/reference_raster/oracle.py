@@ -184,7 +184,7 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
     xy = covariances2d[:, 0, 1]  # (v,)
     yy = covariances2d[:, 1, 1] + PIXEL_VARIANCE  # (v,)
     determinants = xx * yy - xy * xy  # (v,)
-    conics = torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]  # (v, 3)
+    conics = inverse_covariances(xx, xy, yy, determinants)  # (v, 3)
 
     with torch.no_grad():
         radii = footprint_radii(xx, yy, determinants)  # (v,)
@@ -239,6 +239,11 @@ def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
         ],
         dim=-1,
     ).reshape(-1, 2, 3)  # fmt: skip
+
+
+def inverse_covariances(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor) -> Tensor:
+    """(n, 3) entries xx, xy, yy of the inverses of 2D covariances, from (n,) entries and determinants."""
+    return torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]
 
 
 def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:

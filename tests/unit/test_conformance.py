@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from lapgs_plugin.evaluation.cases import Case
 from lapgs_plugin.evaluation.conformance import Outcome, Subject, check, check_case
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.raster import RenderResult, Semantics
-from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.reference_raster import OracleRasterizer, oracle
 
 ORACLE = OracleRasterizer()
 
@@ -198,6 +199,46 @@ def test_a_rasterizer_without_the_three_sigma_cut_is_held_to_its_own_image() -> 
     honest = Subject("uncut", uncut, semantics=Semantics(three_sigma_cut=False))
     assert check_case(honest, case).problems == ()
     assert any("image is off" in problem for problem in check_case(Subject("uncut", uncut), case).problems)
+
+
+class _ExpandedConic(torch.autograd.Function):
+    """Entries of a 2D covariance -> its inverse's, with the backward pass -C G C multiplied out over det^2."""
+
+    @staticmethod
+    def forward(ctx: Any, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+        ctx.save_for_backward(xx, xy, yy)
+        return torch.stack([yy, -xy, xx], dim=-1) / (xx * yy - xy * xy)[:, None]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        a, b, c = ctx.saved_tensors
+        g_a, g_b, g_c = gradient.unbind(-1)
+        determinant = a * c - b * b
+        scale = 1 / (determinant.square() + 1e-7)
+        return (
+            scale * (b * c * g_b - c * c * g_a + (determinant - a * c) * g_c),
+            scale * (2 * b * c * g_a - (determinant + 2 * b * b) * g_b + 2 * a * b * g_c),
+            scale * (a * b * g_b - a * a * g_c + (determinant - a * c) * g_a),
+        )
+
+
+@pytest.mark.parametrize("name", ["needles", "pancakes", "giants", "degree_2_coloured"])
+def test_needles_alone_suffer_from_a_multiplied_out_conic_gradient(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is granted to such code is what its formula costs in float32, and granted nowhere else."""
+
+    def expanded(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor) -> Tensor:
+        if xx.dtype == torch.float32:
+            return _ExpandedConic.apply(xx, xy, yy)  # type: ignore[no-untyped-call, no-any-return]  # torch's
+        return torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]
+
+    monkeypatch.setattr(oracle, "inverse_covariances", expanded)
+    case = by_name()[name]
+    known = Semantics(expanded_conic_gradient=True)
+    for signed in (False, True):
+        case = replace(case, field=replace(case.field, signed=signed))
+        assert check_case(Subject("expanded", ORACLE, semantics=known), case).problems == ()
+        unknown = check_case(Subject("expanded", ORACLE), case).problems
+        assert any("gradient of log_scales is off" in problem for problem in unknown) == (name == "needles")
 
 
 def test_without_the_cut_what_is_blended_nowhere_may_have_no_radius() -> None:
