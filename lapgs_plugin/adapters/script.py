@@ -74,7 +74,7 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         yield Script(path, module, main)
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
-        # Found first, forgotten afterwards: a package without an __init__ asks for its parent when its path is looked at.
+        # Found first, forgotten afterwards: a package without an __init__ asks for its parent when looked at.
         for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
             del sys.modules[name]
 

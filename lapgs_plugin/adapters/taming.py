@@ -45,11 +45,15 @@ class TamingAdapter(BackboneAdapter):
 
     def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"
+        model = self.train.GaussianModel
         return [
             Replacement(
-                self.train.GaussianModel, name, _unless_nothing, ("self", "grads", "budget", "filter"), consumer
-            )
-            for name in ("densify_and_clone_taming", "densify_and_split_taming")
+                model, "densify_with_score", _unless_none_qualifies, ("self", "scores"), "training() when it densifies"
+            ),
+            *(
+                Replacement(model, name, _unless_nothing, ("self", "grads", "budget", "filter"), consumer)
+                for name in ("densify_and_clone_taming", "densify_and_split_taming")
+            ),
         ]
 
     def refuse(self, call: TrainingCall, levels: int) -> None:
@@ -101,3 +105,18 @@ def _unless_nothing(original: Callable[..., None]) -> Callable[..., None]:
             original(gaussians, grads, budget, filter, *others)
 
     return densify
+
+
+def _unless_none_qualifies(original: Callable[..., None]) -> Callable[..., None]:
+    """Leave out a densification for which no Gaussian qualifies: the checkout divides by how many do.
+
+    A residual's gradients begin near zero, because its colours do.
+    """
+
+    def densify_with_score(gaussians: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            original(gaussians, *args, **kwargs)
+        except ZeroDivisionError:  # raised before anything is changed
+            logger.info("no Gaussian qualifies for densification")
+
+    return densify_with_score
