@@ -1,0 +1,60 @@
+"""COLMAP and Blender scenes as posed image files, the images not yet read."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from utils.graphics_utils import BasicPointCloud, focal2fov
+
+from lapgs_plugin.scenes.blender import read_transforms
+from lapgs_plugin.scenes.colmap import find_model, read_colmap
+
+
+class PosedFile(NamedTuple):
+    """R is camera to world, T the translation from world to camera, as the family has it."""
+
+    path: Path
+    R: np.ndarray
+    T: np.ndarray
+    FovY: float
+    FovX: float
+    width: int
+    height: int
+
+
+class SceneFiles(NamedTuple):
+    point_cloud: BasicPointCloud
+    train: list
+    test: list
+
+
+def read_scene_files(path, images, eval):
+    model = find_model(Path(path))
+    if model is not None:
+        source = read_colmap(Path(path), model, images or "images", eval)
+    else:
+        source = read_transforms(Path(path), "images", eval)
+    train, test = ([posed_file(frame) for frame in frames] for frames in (source.train, source.test))
+    return SceneFiles(BasicPointCloud(source.points, source.colors, np.zeros_like(source.points)), train, test)
+
+
+def posed_file(frame):
+    camera = frame.camera
+    pose = camera.world_to_camera.numpy()
+    fov_x, fov_y = focal2fov(camera.fx, camera.width), focal2fov(camera.fy, camera.height)
+    return PosedFile(frame.path, pose[:3, :3].T, pose[:3, 3], fov_y, fov_x, camera.width, camera.height)
+
+
+def getNerfppNorm(cam_info):
+    centers = np.stack([-cam.R @ cam.T for cam in cam_info])
+    middle = centers.mean(axis=0)
+    return {"translate": -middle, "radius": 1.1 * np.linalg.norm(centers - middle, axis=1).max()}
+
+
+def size_for(width, height, resolution, resolution_scale):
+    """The size that `--resolution` asks for: a divisor of 1, 2, 4 or 8, or a width; -1 for at most 1600."""
+    if resolution in (1, 2, 4, 8):
+        return round(width / (resolution_scale * resolution)), round(height / (resolution_scale * resolution))
+    wanted = min(width, 1600) if resolution == -1 else resolution
+    divisor = float(width / wanted) * float(resolution_scale)
+    return int(width / divisor), int(height / divisor)
