@@ -78,6 +78,43 @@ def read_image(
     return image.contiguous()
 
 
+def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, float, float] | None) -> Tensor:
+    """Read an image as the loaders of 3DGS codebases do: with Pillow, resized by it in 8 bits.
+
+    Args:
+        path: the file, of a format that Pillow knows.
+        size: (width, height) to resize to, with Pillow's default filter (bicubic).
+        background: RGB to blend transparent pixels over, before resizing and rounded down, as these loaders do with
+            transforms scenes; None leaves alpha out, as they do with COLMAP scenes.
+
+    Returns:
+        (3, h, w) float32, k / 255.
+
+    Raises:
+        SceneError: the file is missing, no image, or cut short.
+    """
+    try:
+        with Image.open(path) as source:
+            picture: Image.Image = source if source.mode in ("RGB", "RGBA") else source.convert("RGBA")
+            if background is not None:
+                picture = _blend_8_bits(picture, background)
+            levels = np.asarray(picture.resize(size))[..., :3]  # (h, w, 3)
+    except FileNotFoundError as error:
+        raise SceneError(f"{path}: no such image; put it there or choose another folder with --images") from error
+    except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
+        raise SceneError(
+            f"{path}: Pillow, which 3DGS codebases read images with, cannot read it ({_one_line(str(error))}); "
+            "expected a whole 8-bit image, copy or convert it again"
+        ) from error
+    return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
+
+
+def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) -> Image.Image:
+    values = np.asarray(picture.convert("RGBA")) / 255.0  # (h, w, 4) float64
+    colour, alpha = values[..., :3], values[..., 3:]
+    return Image.fromarray(((colour * alpha + np.asarray(background) * (1 - alpha)) * 255.0).astype(np.uint8))
+
+
 def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize with an anti-aliasing bicubic filter (a = -0.5, widened by the factor of reduction).
 

@@ -1,6 +1,8 @@
 """Image sizes by name: the paper's 1k, 2k and 4k settings, a width in pixels, or a fraction of the full size.
 
-Only downscaling exists: a setting that asks for more pixels than an image has keeps the image's own size.
+Only downscaling exists: a setting that asks for more pixels than an image has keeps the image's own size. The exception
+is what 3DGS codebases do with their option -r, under a spelling of its own: runs trained by them are measured on their
+images, to the byte.
 """
 
 from __future__ import annotations
@@ -17,7 +19,16 @@ PAPER_WIDTH = 1600
 MIN_WIDTH = 16
 """Smaller widths are refused: `--resolution 4` is someone who means a quarter."""
 
-ACCEPTED = "1k, 2k, 4k, full, a width in pixels such as 800, or a fraction of the full size such as 1/4 or 0.25"
+BACKBONE_PREFIX = "3dgs:"
+"""Before the value of a 3DGS codebase's option -r."""
+
+BACKBONE_DIVISORS = (1, 2, 4, 8)
+"""Values of -r that divide both sides. Other positive ones are widths, -1 stands for `PAPER_WIDTH` at most."""
+
+ACCEPTED = (
+    "1k, 2k, 4k, full, a width in pixels such as 800, a fraction of the full size such as 1/4 or 0.25, "
+    "or 3dgs: and the -r of a 3DGS codebase, such as 3dgs:-1"
+)
 
 
 @dataclass(frozen=True)
@@ -31,22 +42,27 @@ class Resolution:
         width: width to shrink to, in pixels; None where `fraction` decides.
         midpoint: go only half of the way from the full width to `width`.
         fraction: share of the full width and height, in (0, 1], used where `width` is None.
+        backbone: value of a 3DGS codebase's -r, which then decides alone; None for our own settings.
     """
 
     text: str
     width: int | None = None
     midpoint: bool = False
     fraction: Fraction = Fraction(1)
+    backbone: int | None = None
 
     def size_for(self, width: int, height: int) -> tuple[int, int]:
         """Size (width, height) that an image of `width` x `height` pixels is trained at; never larger than it is.
 
         Rounds as 3DGS does: sides of a fraction to the nearest integer, heights that follow from a width downwards.
-        Unlike 3DGS it divides exactly, so that a width of 1600 never becomes 1599.
+        Unlike 3DGS it divides exactly, so that a width of 1600 never becomes 1599; only for a 3DGS codebase's own -r
+        it does as they do, enlarging included.
 
         >>> parse_resolution("1k").size_for(3118, 2078)
         (1600, 1066)
         """
+        if self.backbone is not None:
+            return _backbone_size(self.backbone, width, height)
         if self.width is None:
             return max(1, round(width * self.fraction)), max(1, round(height * self.fraction))
         if self.width >= width:
@@ -60,9 +76,10 @@ class Resolution:
 
 
 def parse_resolution(text: str) -> Resolution:
-    """The resolution a user wrote: "1k", "2k", "4k", "full", a width such as "800", or "1/4" or "0.25".
+    """The resolution a user wrote: "1k", "2k", "4k", "full", a width such as "800", "1/4" or "0.25", or "3dgs:-1".
 
-    1k is width 1600, 4k the full size and 2k the midpoint of the two widths, as the paper defines them.
+    1k is width 1600, 4k the full size and 2k the midpoint of the two widths, as the paper defines them. 3dgs:N is what
+    3DGS codebases make of -r N.
 
     Raises:
         UserInputError: the text is none of these.
@@ -74,6 +91,8 @@ def parse_resolution(text: str) -> Resolution:
         return Resolution(text, width=PAPER_WIDTH, midpoint=True)
     if setting in ("4k", "full"):
         return Resolution(text)
+    if setting.startswith(BACKBONE_PREFIX):
+        return _from_backbone(text, setting.removeprefix(BACKBONE_PREFIX))
     if re.fullmatch(r"[0-9]{1,9}", setting):
         return _from_width(text, int(setting))
     if re.fullmatch(r"[0-9]{1,9}/[0-9]{1,9}|[0-9]{0,9}\.[0-9]{1,9}", setting):
@@ -96,3 +115,22 @@ def _from_fraction(text: str, setting: str) -> Resolution:
     if not 0 < fraction <= 1:
         raise UserInputError(f"--resolution {text!r}: expected a fraction above 0 and at most 1, images only shrink")
     return Resolution(text, fraction=fraction)
+
+
+def _from_backbone(text: str, value: str) -> Resolution:
+    if not re.fullmatch(r"-1|0*[1-9][0-9]{0,8}", value):
+        raise UserInputError(f"--resolution {text!r}: expected -1, 1, 2, 4, 8 or a width in pixels after 3dgs:")
+    return Resolution(text, backbone=int(value))
+
+
+def _backbone_size(value: int, width: int, height: int) -> tuple[int, int]:
+    """What 3DGS codebases make of -r `value`, in their float arithmetic: 1600 may come out as 1599.
+
+    Where a side would be 0 pixels they stop; here it is 1.
+    """
+    if value in BACKBONE_DIVISORS:
+        return max(1, round(width / value)), max(1, round(height / value))
+    if value == -1:
+        value = min(width, PAPER_WIDTH)
+    factor = width / value
+    return max(1, int(width / factor)), max(1, int(height / factor))

@@ -7,7 +7,8 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePath
 
 import torch
@@ -18,7 +19,7 @@ from lapgs_plugin.errors import SceneError
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
-from lapgs_plugin.scenes.images import image_size, read_image
+from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import Frame, SceneSource
 
@@ -95,7 +96,9 @@ def load_scene(
     Args:
         path: the scene folder.
         resolution: "full", "1k", "2k", "4k", a width or a fraction; see `parse_resolution`. It counts from the size of
-            the image files, which may be the model's or a multiple of it.
+            the image files, which may be the model's or a multiple of it. "3dgs:" and the -r of a 3DGS codebase gives
+            the views as such a codebase sees them: its sizes, its pixels to the byte, and the principal point in the
+            middle of the image, wherever the model has it.
         images: name of the image folder, such as "images_4" for smaller copies.
         eval: hold out every eighth view in name order, or what `transforms_test.json` lists.
         background: RGB that shows through transparent pixels.
@@ -118,7 +121,8 @@ def load_scene(
             "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
             *(resolution, len(short), len(frames), max(short)),
         )
-    views = _load_views(frames, cameras, background, progress)
+    as_3dgs = rule.backbone is not None
+    views = _load_views(frames, cameras, partial(_read, source.kind, background, as_3dgs), progress)
     return Scene(
         path=path,
         kind=source.kind,
@@ -186,21 +190,29 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
             "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
         )
-    resized = camera.resized(*rule.size_for(width, height))
-    return resized.to(dtype=torch.float32)
+    resized = camera.resized(*rule.size_for(width, height)).to(dtype=torch.float32)
+    return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if rule.backbone is not None else resized
+
+
+def _read(
+    kind: str, background: tuple[float, float, float], as_3dgs: bool, path: Path, size: tuple[int, int]
+) -> Tensor:
+    """An image of a scene of that kind, (3, h, w)."""
+    if as_3dgs:
+        return read_as_3dgs(path, size, background if kind == "transforms" else None)
+    return read_image(path, size=size, background=background)
 
 
 def _load_views(
     frames: Sequence[Frame],
     cameras: Sequence[Camera],
-    background: tuple[float, float, float],
+    read: Callable[[Path, tuple[int, int]], Tensor],
     progress: bool | ProgressCallback,
 ) -> list[View]:
     """Read all images in parallel, in the order of `frames`; the first one that fails in that order is the error."""
 
     def load(frame: Frame, camera: Camera) -> View:
-        size = (camera.width, camera.height)
-        return View(frame.name, camera, read_image(frame.path, size=size, background=background))
+        return View(frame.name, camera, read(frame.path, (camera.width, camera.height)))
 
     bar = item_progress("images") if progress is True else None
     task = bar.add_task("Reading images", total=len(frames)) if bar else None
