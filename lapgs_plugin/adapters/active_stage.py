@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
 from lapgs_plugin.adapters.hooking import HookCaller
-from lapgs_plugin.adapters.level_views import PhotoAlbum, make_level_view
+from lapgs_plugin.adapters.level_views import AnnouncingViews, PhotoAlbum, make_level_view
 from lapgs_plugin.adapters.shim import RasterizerShim, StageRendering
 from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.errors import UserInputError
@@ -191,7 +191,7 @@ class ActiveStage:
             loaded.scene,
             gaussians=gaussians,
             model_path=self._call.dataset.model_path,
-            train_cameras={1.0: [self._view(camera) for camera in loaded.train]},
+            train_cameras={1.0: self._announcing([self._view(camera) for camera in loaded.train])},
             test_cameras={1.0: [self._view(camera) for camera in loaded.test]},
         )
         with self.timed("inheritance"):
@@ -295,9 +295,8 @@ class ActiveStage:
 
     def close(self) -> None:
         """Let go of the stage's images, those that the next stage needs excepted."""
-        self._targets.close()
-        if self._before is not None and self._before.predictions is not None:
-            self._before.predictions.close()
+        for store in self._stores:
+            store.close()
         self._views.clear()
         self._gaussians = None
         if self._device.type == "cuda":
@@ -446,6 +445,16 @@ class ActiveStage:
             self._views[key] = view
         return self._views[key]
 
+    def _announcing(self, views: list[Any]) -> list[Any]:
+        """Views that bring their images to the GPU before they are drawn, unless those lie there."""
+        away = sum(store.bytes_on_disk for store in self._stores)
+        if self._device.type == "cuda":
+            away += sum(store.bytes_in_memory for store in self._stores)
+        if not away:
+            return views
+        keys = {id(view): key for key, view in self._views.items()}
+        return AnnouncingViews(views, lambda view: self._rendering.announce(keys[id(view)]))
+
     def _target(self, key: str) -> Tensor:
         """(3, h, w) what a render of the view is compared with."""
         target = self._targets.get(key)
@@ -456,12 +465,15 @@ class ActiveStage:
             return target - self._before.predictions.get(key)
         return target
 
+    @property
+    def _stores(self) -> tuple[ImageStore, ...]:
+        """The images that this stage reads."""
+        predictions = None if self._before is None else self._before.predictions
+        return (self._targets,) if predictions is None else (self._targets, predictions)
+
     def _image_bytes(self) -> int:
         """Bytes of images that this stage holds on the GPU."""
-        held = self._targets.bytes_on_device
-        if self._before is not None and self._before.predictions is not None:
-            held += self._before.predictions.bytes_on_device
-        return held
+        return sum(store.bytes_on_device for store in self._stores)
 
     def _memory(self) -> dict[str, int]:
         """Peak bytes on the GPU during the stage, and how many of them were images."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
 import tempfile
 import uuid
@@ -37,7 +38,7 @@ from lapgs_plugin.adapters.extensions import CudaExtension
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.shim import RasterizerShim
-from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.archive import CACHE, Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import StagePlan
@@ -195,6 +196,7 @@ class HierarchyDriver:
             )
             with self._open_archive(folder, call, scene, plan) as archive:
                 self._run_stages(call, scene, plan, archive, path, Path(scratch))
+                shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         logger.info("run folder: %s", folder)
 
     def _run_stages(

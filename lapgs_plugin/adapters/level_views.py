@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import random
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.imagestore import ImageStore
 
 BYTE_TOLERANCE = 1e-3
 """How far 255 times a value may be from a whole number to count as a pixel of an 8-bit image: float32 gives 2e-5."""
@@ -115,6 +114,35 @@ def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tens
     return view
 
 
+class AnnouncingViews(list[Any]):
+    """Views from which a training loop draws: `stack = views.copy()`, then `stack.pop(randint(0, len(stack) - 1))`.
+
+    With every draw the next one is announced. It is known: the loop will ask Python's generator, whose state can be
+    looked at without changing it. Where somebody else draws in between, an announcement is in vain, nothing more.
+
+    Args:
+        views: in the scene's order.
+        announce: told of the view that will be drawn next.
+    """
+
+    def __init__(self, views: Iterable[Any], announce: Callable[[Any], None]) -> None:
+        super().__init__(views)
+        self._announce = announce
+
+    def copy(self) -> AnnouncingViews:
+        return AnnouncingViews(self, self._announce)
+
+    def pop(self, index: SupportsIndex = -1, /) -> Any:
+        drawn = super().pop(index)
+        if self:
+            _PEEK.setstate(random.getstate())
+            self._announce(self[_PEEK.randint(0, len(self) - 1)])
+        return drawn
+
+
+_PEEK = random.Random()
+"""Generator that takes the state of Python's own to see what that one will say."""
+
 _LEVEL_CLASSES: dict[type, type] = {}
 
 
@@ -123,14 +151,3 @@ def _level_class(kind: type) -> type:
         read = property(lambda view: view.lapgs_image(), doc="(3, h, w) the level's ground truth, float32.")
         _LEVEL_CLASSES[kind] = type(f"Level{kind.__name__}", (kind,), {"original_image": read})
     return _LEVEL_CLASSES[kind]
-
-
-@contextmanager
-def closing(*stores: ImageStore | None) -> Iterator[None]:
-    """Close stores on leaving."""
-    try:
-        yield
-    finally:
-        for store in stores:
-            if store is not None:
-                store.close()
