@@ -1,0 +1,139 @@
+"""What the checkouts' `train.py` needs of packages that they import and that are not installed here.
+
+Their import lines run through, and so do the few functions that training calls. Anything else of these packages raises
+`MissingExtraError`, which names the package, when it is first used. An installed package is always preferred.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sized
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from lapgs_plugin.errors import MissingExtraError
+
+__all__ = ["absent_modules"]
+
+Item = TypeVar("Item")
+
+
+def absent_modules() -> dict[str, ModuleType]:
+    """Stand-ins, by their full names, for those of the known packages that cannot be imported here."""
+    found: dict[str, ModuleType] = {}
+    for package, (distribution, modules) in _PACKAGES.items():
+        if package in sys.modules or find_spec(package) is not None:
+            continue
+        for name, contents in modules.items():
+            found[name] = _AbsentModule(name, distribution, contents)
+            parent, _, child = name.rpartition(".")
+            if parent:
+                setattr(found[parent], child, found[name])
+    return found
+
+
+class _AbsentModule(ModuleType):
+    """A module with some contents, whose other names ask for the package."""
+
+    def __init__(self, name: str, distribution: str, contents: Mapping[str, object]) -> None:
+        super().__init__(name, f"Stands in for {name}, which is not installed.")
+        self.__spec__ = ModuleSpec(name, None, is_package=True)
+        self.__path__: list[str] = []
+        self._distribution = distribution
+        vars(self).update(contents)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # Python itself looks for these in every module
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        raise MissingExtraError(
+            f"{self.__name__}.{name} is used by the checkout, and {self.__name__.partition('.')[0]} is not installed: "
+            f"pip install {self._distribution}, or leave out the option that needs it"
+        )
+
+
+class _ToTensor:
+    """An 8-bit picture, grey or RGB, as a float tensor (c, h, w) in [0, 1]."""
+
+    def __call__(self, picture: Image.Image) -> Tensor:
+        pixels = np.asarray(picture)
+        if pixels.dtype != np.uint8:
+            raise MissingExtraError(
+                f"ToTensor got a picture of mode {picture.mode}, and without torchvision it takes 8-bit ones only: "
+                "pip install torchvision"
+            )
+        return torch.from_numpy(np.atleast_3d(pixels).transpose(2, 0, 1).copy()).float() / 255
+
+
+class _ToPILImage:
+    """A float tensor (1, h, w) or (3, h, w) in [0, 1] as an 8-bit picture; what is between two steps is cut off."""
+
+    def __call__(self, tensor: Tensor) -> Image.Image:
+        if not (
+            isinstance(tensor, Tensor) and tensor.is_floating_point() and tensor.ndim == 3 and len(tensor) in (1, 3)
+        ):
+            raise MissingExtraError(
+                f"ToPILImage got {_described(tensor)}, and without torchvision it takes float tensors (1 or 3, h, w) "
+                "only: pip install torchvision"
+            )
+        pixels = tensor.detach().cpu().mul(255).byte().permute(1, 2, 0).numpy()  # (h, w, c)
+        return Image.fromarray(pixels[:, :, 0] if len(tensor) == 1 else np.ascontiguousarray(pixels))
+
+
+def _described(value: object) -> str:
+    return (
+        f"a tensor {tuple(value.shape)} of {value.dtype}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+    )
+
+
+class _Progress(Generic[Item]):
+    """A progress bar in one line of the terminal: `tqdm.tqdm` for training loops."""
+
+    def __init__(self, iterable: Iterable[Item] = (), desc: str = "", **_: object) -> None:
+        self._items = iterable
+        self._total = len(iterable) if isinstance(iterable, Sized) else None
+        self._label, self._done, self._postfix, self._closed = desc or "Progress", 0, "", False
+
+    def __iter__(self) -> Iterator[Item]:
+        for item in self._items:
+            yield item
+            self.update()
+        self.close()
+
+    def set_postfix(self, values: Mapping[str, object]) -> None:
+        self._postfix = ", ".join(f"{key}={value}" for key, value in values.items())
+
+    def update(self, steps: int = 1) -> None:
+        self._done += steps
+        of = "" if self._total is None else f"/{self._total}"
+        print(f"\r{self._label}: {self._done}{of} {self._postfix}", end="", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if not self._closed:
+            print(file=sys.stderr)
+        self._closed = True
+
+
+_PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
+    # Taming-3DGS finds edges with the two transforms; the networks are those of LPIPS, which no training step asks for.
+    "torchvision": (
+        "torchvision",
+        {
+            "torchvision": {},
+            "torchvision.transforms": {"ToTensor": _ToTensor, "ToPILImage": _ToPILImage},
+            "torchvision.models": {},
+        },
+    ),
+    # graphdeco reads depth maps with it; scenes without depths call nothing.
+    "cv2": ("opencv-python-headless", {"cv2": {}}),
+    # The viewers of FastGS and Taming-3DGS, which are off unless asked for.
+    "websockets": ("websockets", {"websockets": {}}),
+    "tqdm": ("tqdm", {"tqdm": {"tqdm": _Progress}}),
+}
+"""For each package: what to install, and its modules with what they have here."""
