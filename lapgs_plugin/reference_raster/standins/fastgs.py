@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from lapgs_plugin.reference_raster.standins.binding import RasterizerBase, SparseGaussianAdam, gather
 from lapgs_plugin.reference_raster.standins.engine import Options, rasterize
+from lapgs_plugin.reference_raster.standins.settings import settings_class
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
-
-class GaussianRasterizationSettings(NamedTuple):
-    """A view, in the CUDA binding's names; matrices are transposed. `metric_map`, h * w integers, marks
-    pixels with 1."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    mult: float
-    prefiltered: bool
-    debug: bool
-    get_flag: bool | None
-    metric_map: Tensor
+GaussianRasterizationSettings = settings_class("fastgs")
 
 
 class GaussianRasterizer(RasterizerBase):
@@ -53,7 +33,7 @@ class GaussianRasterizer(RasterizerBase):
         is blended (n,) int32, or an empty tensor. `means2D` is (n, 4): its gradient's last two columns are sums over
         pixels of the first two's absolute values.
         """
-        settings: GaussianRasterizationSettings = self.raster_settings
+        settings = self.raster_settings
         inputs = gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
         weights = (settings.metric_map == 1).float() if settings.get_flag else None
         output = rasterize(settings, inputs, Options(mult=settings.mult, pixel_weights=weights))

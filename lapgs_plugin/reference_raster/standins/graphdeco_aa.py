@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from torch import Tensor
 
 from lapgs_plugin.reference_raster.standins.binding import RasterizerBase, gather
 from lapgs_plugin.reference_raster.standins.engine import Options, rasterize
+from lapgs_plugin.reference_raster.standins.settings import settings_class
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
-
-class GaussianRasterizationSettings(NamedTuple):
-    """A view, in the CUDA binding's names; matrices are transposed."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
-    antialiasing: bool
+GaussianRasterizationSettings = settings_class("graphdeco-aa")
 
 
 class GaussianRasterizer(RasterizerBase):
@@ -45,7 +28,7 @@ class GaussianRasterizer(RasterizerBase):
         cov3D_precomp: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the image (3, h, w), the radii (n,) int32 and 1 / depth blended over black (1, h, w)."""
-        settings: GaussianRasterizationSettings = self.raster_settings
+        settings = self.raster_settings
         inputs = gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)
         output = rasterize(settings, inputs, Options(antialiasing=settings.antialiasing, inverse_depth=True))
         assert output.inverse_depths is not None

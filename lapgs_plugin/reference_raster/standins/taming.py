@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from lapgs_plugin.reference_raster.standins.binding import RasterizerBase, SparseGaussianAdam, gather
 from lapgs_plugin.reference_raster.standins.engine import Options, rasterize
+from lapgs_plugin.reference_raster.standins.settings import settings_class
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
-
-class GaussianRasterizationSettings(NamedTuple):
-    """A view, in the CUDA binding's names; matrices are transposed. `pixel_weights` (h, w) or None."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
-    pixel_weights: Tensor | None
+GaussianRasterizationSettings = settings_class("taming")
 
 
 class GaussianRasterizer(RasterizerBase):
@@ -51,7 +34,7 @@ class GaussianRasterizer(RasterizerBase):
         the pixels a Gaussian is blended in: of their weights, of 1, of its share in the pixel, of the distance from its
         centre in pixels; otherwise four empty tensors.
         """
-        settings: GaussianRasterizationSettings = self.raster_settings
+        settings = self.raster_settings
         inputs = gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
         weights = settings.pixel_weights
         size = 0 if weights is None else len(weights)  # the CUDA code asks for rows, not for pixels
