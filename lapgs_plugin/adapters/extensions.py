@@ -39,6 +39,9 @@ SEMANTICS = {
 }
 """The modules, and where each departs from the oracle by design."""
 
+STAND_INS = {"diff_gaussian_rasterization": "graphdeco-aa", "diff_gaussian_rasterization_fastgs": "fastgs"}
+"""The stand-in that knows every setting of a module's builds which changes the image."""
+
 CONSTANTS: dict[str, Any] = {
     "scale_modifier": 1.0,
     "prefiltered": False,
@@ -98,7 +101,7 @@ class CudaExtension:
         settings: Mapping[str, Any] | None = None,
         module: ModuleType | None = None,
     ) -> None:
-        module = _imported(name) if module is None else module
+        module = import_extension(name) if module is None else module
         self._name = name
         self._device = torch.device(device)
         self._settings = _known_settings(module)
@@ -243,7 +246,12 @@ def options_of(module: ModuleType) -> frozenset[str]:
     return frozenset(CONSTANTS) & frozenset(module.GaussianRasterizationSettings._fields)
 
 
-def _imported(name: str) -> ModuleType:
+def import_extension(name: str) -> ModuleType:
+    """The module of that name.
+
+    Raises:
+        MissingExtraError: it is not installed, or was built for another PyTorch.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -7,15 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
+from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+
 SHOWN_VIEWS = 12
 """How many views the terminal shows; metrics.json and the report hold all."""
 
 
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="Complete run folder that `lapgs train` wrote.")],
+    run: Annotated[
+        Path, typer.Argument(help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+    ],
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
     ] = None,
+    device: DeviceOption = "auto",
+    rasterizer: RasterizerOption = "auto",
 ) -> None:
     """Measure RUN on its held-out views, print the figures and write them to RUN/metrics.json.
 
@@ -27,7 +33,8 @@ def evaluate(
     from lapgs_plugin.evaluation.figures import evaluate_run
 
     archive = RunArchive.open(run)
-    metrics = evaluate_run(archive, scene)
+    show_log()
+    metrics = evaluate_run(archive, scene, device=device, rasterizer=rasterizer)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ FORMATS = ("png", "exr")
 
 
 def render(
-    run: Annotated[Path, typer.Argument(help="Run folder that `lapgs train` wrote.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")],
     views: Annotated[
         str | None,
         typer.Option(help="test (held out), train or all. Default: test, or train when nothing was held out."),
@@ -38,6 +39,8 @@ def render(
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
     ] = None,
+    device: DeviceOption = "auto",
+    rasterizer: RasterizerOption = "auto",
 ) -> None:
     """Write the images of RUN: base, each residual, and their composition, for every view.
 
@@ -58,7 +61,8 @@ def render(
     _require_one_of("--views", views, (None, *SPLITS))
     _require_one_of("--format", image_format, FORMATS)
     archive = RunArchive.open(run)
-    renderer = run_renderer(archive)
+    show_log()
+    renderer = run_renderer(archive, device, rasterizer)
     level = renderer.finest if level is None else level
     renderer.require_level(level)
     folder = archive.path(RENDERS) if out is None else out
@@ -104,7 +108,7 @@ def _write_views(
         task = progress.add_task(f"Rendering {folder.name} views", total=len(views))
         for view in views:
             composition = renderer.render(view.camera, level)
-            photo = renderer.pyramid.gaussian(view.image, level + 1)[level] if compare else None
+            photo = renderer.pyramid.gaussian(view.image.to(renderer.device), level + 1)[level] if compare else None
             images = view_images(composition, photo, raw=image_format == "exr")
             paths = [folder / f"{stems[view.name]}_{suffix}.{image_format}" for suffix in images]
             for _ in pool.map(write_image, paths, images.values()):

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -14,13 +16,17 @@ if TYPE_CHECKING:
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Complete run folder that `lapgs train` wrote.")],
+    run: Annotated[
+        Path, typer.Argument(help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+    ],
     baseline: Annotated[
         Path | None, typer.Option(help="Another run to compare it with, such as one trained with --levels 1.")
     ] = None,
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the runs were trained.")
     ] = None,
+    device: DeviceOption = "auto",
+    rasterizer: RasterizerOption = "auto",
 ) -> None:
     """Print the figures of RUN as a table and write RUN/report.html, with curves and images.
 
@@ -32,8 +38,11 @@ def report(
     from lapgs_plugin.evaluation.report import MeasuredRun, write_report
 
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
-    runs = [MeasuredRun(archive, run_metrics(archive, scene)) for archive in archives]
-    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, scene)
+    show_log()
+    runs = [
+        MeasuredRun(archive, run_metrics(archive, scene, device=device, rasterizer=rasterizer)) for archive in archives
+    ]
+    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, scene, device=device, rasterizer=rasterizer)
     _print(runs)
     print(f"{page} shows this with curves and images")
 

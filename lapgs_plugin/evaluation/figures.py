@@ -46,17 +46,20 @@ class ViewMetrics:
 
 
 def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer) -> ViewMetrics:
-    """Compare a rendered view with its photo, level by level."""
-    targets = renderer.pyramid.gaussian(view.image, renderer.levels)
+    """Compare a rendered view with its photo, level by level, where it was rendered."""
+    photo = view.image.to(renderer.device)
+    targets = renderer.pyramid.gaussian(photo, renderer.levels)
     level_psnr = {level: psnr(image, targets[level]) for level, image in composition.composed.items()}
     upsampled = {
-        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), view.image)
+        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), photo)
         for level, image in composition.composed.items()
     }
-    return ViewMetrics(view.name, level_psnr[0], ssim(composition.composed[0], view.image), level_psnr, upsampled)
+    return ViewMetrics(view.name, level_psnr[0], ssim(composition.composed[0], photo), level_psnr, upsampled)
 
 
-def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str, Any]:
+def evaluate_run(
+    archive: RunArchive, moved_to: Path | None = None, *, device: str = "auto", rasterizer: str = "auto"
+) -> dict[str, Any]:
     """Render the held-out views of a complete run, or the training views when none were held out, and measure it.
 
     Shows a progress bar and writes the result to the run's metrics.json.
@@ -64,6 +67,7 @@ def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str,
     Args:
         archive: the run.
         moved_to: where its scene is now; None when it did not move.
+        device, rasterizer: what renders it, see `rendering.run.run_renderer`.
 
     Returns:
         What is written, described in `run_figures`.
@@ -72,7 +76,7 @@ def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str,
         RunFolderError: the run is not complete, or its scene is not where it was.
     """
     require_complete(archive)
-    renderer = run_renderer(archive)
+    renderer = run_renderer(archive, device, rasterizer)
     with one_pool():
         scene = run_scene(archive, moved_to)
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
@@ -81,13 +85,15 @@ def evaluate_run(archive: RunArchive, moved_to: Path | None = None) -> dict[str,
                 measure_view(view, renderer.render(view.camera), renderer)
                 for view in progress.track(views, description=f"Measuring {split} views")
             ]
-    metrics = run_figures(archive.manifest, split, measured)
+    metrics = run_figures(archive.manifest, split, measured, renderer.rasterizer.name)
     archive.write_metrics(metrics)
     return metrics
 
 
-def run_metrics(archive: RunArchive, moved_to: Path | None = None) -> dict[str, Any]:
-    """The run's metrics.json, measured now if it never was.
+def run_metrics(
+    archive: RunArchive, moved_to: Path | None = None, *, device: str = "auto", rasterizer: str = "auto"
+) -> dict[str, Any]:
+    """The run's metrics.json, measured now, as `evaluate_run` does, if it never was.
 
     Raises:
         RunFolderError: as `evaluate_run`, or the file was written by something else.
@@ -95,7 +101,7 @@ def run_metrics(archive: RunArchive, moved_to: Path | None = None) -> dict[str, 
     require_complete(archive)
     metrics = archive.metrics()
     if metrics is None:
-        return evaluate_run(archive, moved_to)
+        return evaluate_run(archive, moved_to, device=device, rasterizer=rasterizer)
     if missing := METRIC_KEYS - metrics.keys():
         raise RunFolderError(
             f"{archive.path(METRICS)} lacks {', '.join(sorted(missing))}; write it again with `lapgs eval`"
@@ -117,7 +123,7 @@ def require_complete(archive: RunArchive) -> None:
         )
 
 
-def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics]) -> dict[str, Any]:
+def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], rasterizer: str) -> dict[str, Any]:
     """Figures of a complete run as JSON.
 
     Keys, with levels as text because JSON has no other keys:
@@ -145,7 +151,7 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics]) ->
         "peak_gaussians": max(record.peak_gaussians for record in manifest.records),
         "levels": {str(record.level): _level_figures(record, views) for record in manifest.records},
         "views": [{"name": view.name, "psnr": view.psnr, "ssim": view.ssim} for view in views],
-        "rasterizer": manifest.rasterizer,
+        "rasterizer": rasterizer,
         "versions": versions(),
     }
 

@@ -78,13 +78,21 @@ class Strip:
         return count if count <= MOST_COLUMNS else (count + 1) // 2
 
 
-def write_report(run: MeasuredRun, baseline: MeasuredRun | None = None, moved_to: Path | None = None) -> Path:
+def write_report(
+    run: MeasuredRun,
+    baseline: MeasuredRun | None = None,
+    moved_to: Path | None = None,
+    *,
+    device: str = "auto",
+    rasterizer: str = "auto",
+) -> Path:
     """Write RUN/report.html.
 
     Args:
         run: what the page is about.
         baseline: what it is compared with.
         moved_to: where the run's scene is now; None when it did not move.
+        device, rasterizer: what renders the pictures, see `rendering.run.run_renderer`.
 
     Returns:
         The file.
@@ -93,6 +101,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None = None, moved_to
         RunFolderError: the scene is not where it was, or the file cannot be written.
     """
     runs = [run] if baseline is None else [run, baseline]
+    renderers = [run_renderer(each.archive, device, rasterizer) for each in runs]
     page = _render(
         name=run.archive.path().name,
         scene=Path(run.archive.manifest.scene.path).name,
@@ -102,7 +111,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None = None, moved_to
         unlike=unlike(run.archive.manifest, baseline.archive.manifest) if baseline else [],
         rows=comparison_rows([each.metrics for each in runs]),
         charts=_charts(runs),
-        strips=_strips(runs, moved_to),
+        strips=_strips(runs, renderers, moved_to),
         settings=_settings(run),
     )
     path = run.archive.path(REPORT)
@@ -190,9 +199,10 @@ def _count(value: float) -> str:
     return f"{value:g}"
 
 
-def _strips(runs: Sequence[MeasuredRun], moved_to: Path | None) -> list[Strip]:
+def _strips(
+    runs: Sequence[MeasuredRun], renderers: Sequence[HierarchyRenderer], moved_to: Path | None
+) -> list[Strip]:
     """The worst, the median and the best view of the run, in pictures."""
-    renderers = [run_renderer(run.archive) for run in runs]
     shown = _shown_views(runs[0].metrics)
     with one_pool():
         scene = run_scene(runs[0].archive, moved_to)
@@ -267,6 +277,7 @@ def _settings(run: MeasuredRun) -> dict[str, str]:
         "SH degree": manifest.sh_degree,
         "seed": manifest.seed,
         "rasterizer": manifest.rasterizer,
+        "measured with rasterizer": run.metrics["rasterizer"],
         **_flat(manifest.settings),
         "trained": f"{manifest.created} by {manifest.created_by}",
         **{f"measured with {name}": version for name, version in run.metrics["versions"].items()},

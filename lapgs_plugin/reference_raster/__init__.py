@@ -7,7 +7,10 @@ from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 
-__all__ = ["CpuRasterizer", "OracleRasterizer", "make_rasterizer"]
+__all__ = ["CPU_RASTERIZERS", "CpuRasterizer", "OracleRasterizer", "make_rasterizer"]
+
+CPU_RASTERIZERS: dict[str, type[Rasterizer]] = {"cpu": CpuRasterizer, "oracle": OracleRasterizer}
+"""By the name that manifests and the command line use."""
 
 
 def make_rasterizer(name: str) -> Rasterizer:
@@ -16,7 +19,6 @@ def make_rasterizer(name: str) -> Rasterizer:
     Raises:
         UserInputError: there is none of that name.
     """
-    known: dict[str, type[Rasterizer]] = {"cpu": CpuRasterizer, "oracle": OracleRasterizer}
-    if name not in known:
-        raise UserInputError(f"--rasterizer {name}: expected {' or '.join(known)}")
-    return known[name]()
+    if name not in CPU_RASTERIZERS:
+        raise UserInputError(f"--rasterizer {name}: expected {' or '.join(CPU_RASTERIZERS)}")
+    return CPU_RASTERIZERS[name]()

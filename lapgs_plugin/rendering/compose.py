@@ -89,8 +89,15 @@ class HierarchyRenderer:
                 )
 
     @classmethod
-    def from_archive(cls, archive: RunArchive, rasterizer: Rasterizer) -> HierarchyRenderer:
+    def from_archive(
+        cls, archive: RunArchive, rasterizer: Rasterizer, device: torch.device | str = "cpu"
+    ) -> HierarchyRenderer:
         """A renderer of a run's finished levels.
+
+        Args:
+            archive: the run.
+            rasterizer: renders every field.
+            device: where it wants them; they are moved there once, and images stay there.
 
         Raises:
             RunFolderError: a field is damaged, or no level is finished.
@@ -98,12 +105,17 @@ class HierarchyRenderer:
         manifest = archive.manifest
         manifest.record(manifest.levels - 1)
         return cls(
-            fields={level: archive.field(level) for level in archive.available_levels},
+            fields={level: archive.field(level).to(device) for level in archive.available_levels},
             levels=manifest.levels,
             pyramid=Pyramid(manifest.grid),
             rasterizer=rasterizer,
             background=manifest.scene.background,
         )
+
+    @property
+    def device(self) -> torch.device:
+        """Where the fields are, and the images come out."""
+        return self.fields[self.levels - 1].means.device
 
     @property
     def finest(self) -> int:

@@ -7,18 +7,25 @@ from pathlib import Path
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.plan import level_size
-from lapgs_plugin.reference_raster import make_rasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.rasterizers import rasterizer_for
 from lapgs_plugin.scenes.scene import Scene, load_scene
 
 
-def run_renderer(archive: RunArchive) -> HierarchyRenderer:
-    """A renderer of a run's finished levels, with the rasterizer it was trained with.
+def run_renderer(archive: RunArchive, device: str = "auto", rasterizer: str = "auto") -> HierarchyRenderer:
+    """A renderer of a run's finished levels.
+
+    Args:
+        archive: the run.
+        device, rasterizer: as `rasterizer_for` takes them; what is left to it is the rasterizer of the training, or the
+            nearest that runs here.
 
     Raises:
         RunFolderError: no level is finished, or a field is damaged.
+        UserInputError, MissingExtraError: as `rasterizer_for`.
     """
-    return HierarchyRenderer.from_archive(archive, make_rasterizer(archive.manifest.rasterizer))
+    placed = rasterizer_for(archive.manifest, device, rasterizer)
+    return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device)
 
 
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:

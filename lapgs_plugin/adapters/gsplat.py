@@ -1,0 +1,142 @@
+"""gsplat's CUDA rasterizer behind the one interface `lapgs_plugin.raster.Rasterizer`.
+
+gsplat passes colours through as they are, so signed colour needs nothing from it: SH are evaluated by its own kernel,
+and the colour map is ours.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import RenderResult, Semantics
+from lapgs_plugin.reference_raster.oracle import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
+
+NAME = "gsplat"
+
+SEMANTICS = Semantics(
+    three_sigma_cut=False,
+    note="alpha is capped at 0.999 instead of 0.99, and where it is, there is no gradient by opacity and position; the "
+    "Jacobian's limit counts from the border of the image instead of 1.3 half sides from its centre, which differs for "
+    "principal points off the centre; footprints end where alpha = 1/255 instead of at three sigma; a depth of exactly "
+    "0.2 is not culled",
+)
+
+
+def missing() -> str:
+    """Why gsplat cannot render on this machine, as a clause; empty where it can. Imports and compiles nothing."""
+    if not torch.cuda.is_available():
+        return "PyTorch sees no CUDA device"
+    spec = importlib.util.find_spec("gsplat")
+    if spec is None or not spec.submodule_search_locations:
+        return "gsplat is not installed"
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    built = any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
+    return "" if built or CUDA_HOME else "gsplat's CUDA part is not built, and there is no nvcc to build it"
+
+
+class GsplatRasterizer:
+    """`gsplat.rasterization` with the conventions of the 3DGS family; float32 fields on a CUDA device.
+
+    Where it is not built yet, gsplat compiles its CUDA part with the first call, for some minutes.
+
+    Args:
+        antialiasing: dim Gaussians that are smaller than a pixel, as graphdeco's option of that name does.
+
+    Raises:
+        MissingExtraError: gsplat cannot render on this machine.
+    """
+
+    def __init__(self, *, antialiasing: bool = False) -> None:
+        if reason := missing():
+            raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
+        self._mode = "antialiased" if antialiasing else "classic"
+
+    @property
+    def name(self) -> str:
+        return NAME
+
+    @property
+    def semantics(self) -> Semantics:
+        """Where it departs from the oracle."""
+        return SEMANTICS
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
+
+        Raises:
+            UserInputError: the field is not float32 on a CUDA device.
+        """
+        means = field.means
+        if means.device.type != "cuda" or means.dtype != torch.float32:
+            raise UserInputError(f"means is {means.dtype} on {means.device}, expected float32 on cuda; use .to()")
+        from gsplat import rasterization, spherical_harmonics
+
+        n, width, height = len(field), camera.width, camera.height
+        differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
+        means2d = means.new_zeros(n, 2).requires_grad_(differentiated)  # (n, 2)
+        absgrad2d = means.new_zeros(n, 2) if differentiated else None
+        if n == 0:
+            image = background.to(means)[:, None, None].expand(3, height, width)
+            return RenderResult(
+                image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
+            )
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        colors = spherical_harmonics(degree, means - camera.position.to(means), field.sh)  # (n, 3)
+        intrinsics = means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])  # (3, 3)
+        images, alphas, found = rasterization(
+            means,
+            field.quaternions,
+            torch.exp(field.log_scales),
+            torch.sigmoid(field.opacity_logits),
+            colors if field.signed else torch.clamp_min(colors + 0.5, 0.0),
+            camera.world_to_camera.to(means)[None],  # (1, 4, 4)
+            intrinsics[None],
+            width,
+            height,
+            near_plane=NEAR_DEPTH,
+            eps2d=PIXEL_VARIANCE,
+            radius_clip=0.0,
+            packed=False,
+            backgrounds=background.to(means)[None],  # (1, 3)
+            rasterize_mode=self._mode,
+            absgrad=differentiated,
+        )  # (1, h, w, 3), (1, h, w, 1)
+        if absgrad2d is not None:
+            _hand_over_gradients(found["means2d"], means2d, absgrad2d)
+        with torch.no_grad():
+            shown = (found["radii"][0] > 0).all(-1)  # (n,)
+            # What gsplat leaves for culled Gaussians is memory as it was; its pixels have their centre at 0.5.
+            means2d.copy_(torch.where(shown[:, None], found["means2d"][0] - 0.5, 0.0))
+            radii = torch.where(shown, _three_sigma_radii(found["conics"][0]), 0.0).to(torch.int32)  # (n,)
+        return RenderResult(images[0].permute(2, 0, 1), 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
+
+
+def _hand_over_gradients(theirs: Tensor, means2d: Tensor, absgrad2d: Tensor) -> None:
+    """Let the backward pass leave what it finds for gsplat's centres (1, n, 2) in our (n, 2) of them."""
+    raw: Any = theirs
+
+    def hand_over(gradient: Tensor) -> None:
+        means2d.grad = gradient[0].clone()
+        absgrad2d.copy_(raw.absgrad[0])
+
+    theirs.register_hook(hand_over)  # type: ignore[no-untyped-call]  # torch leaves it without types
+
+
+def _three_sigma_radii(conics: Tensor) -> Tensor:
+    """(n,) radii in whole pixels from the entries xx, xy, yy of the inverse 2D covariances, (n, 3)."""
+    xx, xy, yy = conics.unbind(-1)  # (n,) each
+    determinants = 1 / (xx * yy - xy * xy)  # of the covariances
+    middles = 0.5 * (xx + yy) * determinants
+    roots = torch.sqrt(torch.clamp_min(middles * middles - determinants, MIN_ROOT))
+    return torch.ceil(RADIUS_SIGMAS * torch.sqrt(middles + roots))

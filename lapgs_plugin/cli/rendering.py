@@ -1,0 +1,25 @@
+"""What the commands that render a run have in common: where, with what, and the line that says so."""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated
+
+import typer
+
+DeviceOption = Annotated[
+    str, typer.Option(help="Where to render: cuda, cpu, or auto, which takes CUDA where there is any.")
+]
+RasterizerOption = Annotated[
+    str,
+    typer.Option(
+        help="What renders: cpu, oracle, gsplat, or the module of an installed rasterizer such as "
+        "diff_gaussian_rasterization. auto takes the one that the run was trained with, or else gsplat, or else cpu."
+    ),
+]
+
+
+def show_log() -> None:
+    """Let what renders a run, and why, appear on stderr."""
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
