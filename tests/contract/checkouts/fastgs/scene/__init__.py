@@ -5,6 +5,7 @@ from pathlib import Path
 
 from arguments import ModelParams
 from utils.camera_utils import cameraList_from_camInfos
+from utils.scene_files import write_scene_files
 
 from scene.dataset_readers import sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
@@ -24,6 +25,7 @@ class Scene:
             scene_info = sceneLoadTypeCallbacks["Blender"](args.source_path, args.white_background, args.eval)
         else:
             raise AssertionError("Could not recognize scene type!")
+        write_scene_files(self.model_path, scene_info)
         if shuffle:
             random.shuffle(scene_info.train_cameras)
             random.shuffle(scene_info.test_cameras)

@@ -1,10 +1,12 @@
-"""COLMAP and Blender scenes as posed image files, the images not yet read."""
+"""Scenes as posed image files, the images not yet read; and what is written of a scene beside a model."""
 
+import json
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from utils.graphics_utils import BasicPointCloud, focal2fov
+from plyfile import PlyData, PlyElement
+from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
 
 from lapgs_plugin.scenes.blender import read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
@@ -58,3 +60,31 @@ def size_for(width, height, resolution, resolution_scale):
     wanted = min(width, 1600) if resolution == -1 else resolution
     divisor = float(width / wanted) * float(resolution_scale)
     return int(width / divisor), int(height / divisor)
+
+
+def storePly(path, xyz, rgb):
+    names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    vertices = np.zeros(len(xyz), dtype=[(name, "u1" if len(name) > 2 else "f4") for name in names])
+    for name, column in zip((*names[:3], *names[6:]), np.hstack([xyz, rgb]).T, strict=True):
+        vertices[name] = column
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+
+
+def camera_to_JSON(id, camera):
+    return {
+        "id": id,
+        "img_name": camera.image_name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": (-camera.R @ camera.T).tolist(),
+        "rotation": camera.R.tolist(),
+        "fy": fov2focal(camera.FovY, camera.height),
+        "fx": fov2focal(camera.FovX, camera.width),
+    }
+
+
+def write_scene_files(model_path, scene_info):
+    storePly(Path(model_path, "input.ply"), scene_info.point_cloud.points, scene_info.point_cloud.colors * 255)
+    infos = [*scene_info.test_cameras, *scene_info.train_cameras]
+    entries = [camera_to_JSON(index, info) for index, info in enumerate(infos)]
+    Path(model_path, "cameras.json").write_text(json.dumps(entries), encoding="utf-8")
