@@ -127,6 +127,11 @@ def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_
         assert plys(archive) == plys(whole)
 
 
+def test_predictions_read_ahead_from_the_disk_change_no_bit(scene: Scene, tmp_path: Path) -> None:
+    runs = [train(tmp_path / cache, scene, replace(SETTINGS, cache=cache)) for cache in ("memory", "disk")]
+    assert plys(runs[0]) == plys(runs[1])
+
+
 @pytest.mark.parametrize(
     "changes",
     [
