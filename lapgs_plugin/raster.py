@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -43,13 +44,15 @@ class Semantics:
         three_sigma_cut: False where a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one
             that is blended in no pixel may then have radius 0.
         expanded_conic_gradient: True where the backward pass takes the gradient of the inverse 2D covariance to that of
-            the covariance with the matrix products multiplied out. In float32 that loses the gradients of Gaussians
-            that are very long on screen; see `evaluation.conformance.EXPANDED_CONIC`.
+            the covariance by matrix products, as such or multiplied out. In float32 that loses the gradients of
+            Gaussians that are very long on screen; see `evaluation.conformance.EXPANDED_CONIC`.
+        departures: reasons by the name of the conformance case for which another image or gradient is right.
         note: the departures in words, for reports.
     """
 
     three_sigma_cut: bool = True
     expanded_conic_gradient: bool = False
+    departures: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
 
 

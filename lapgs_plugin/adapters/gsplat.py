@@ -21,12 +21,19 @@ from lapgs_plugin.reference_raster.oracle import MIN_ROOT, NEAR_DEPTH, PIXEL_VAR
 
 NAME = "gsplat"
 
+LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
 SEMANTICS = Semantics(
     three_sigma_cut=False,
+    expanded_conic_gradient=True,
+    departures={
+        "saturated": "alpha is capped at 0.999, without a gradient there",
+        **dict.fromkeys(("off_centre", "outside_frustum", "same_plane"), LIMIT),
+    },
     note="alpha is capped at 0.999 instead of 0.99, and where it is, there is no gradient by opacity and position; the "
     "Jacobian's limit counts from the border of the image instead of 1.3 half sides from its centre, which differs for "
-    "principal points off the centre; footprints end where alpha = 1/255 instead of at three sigma; a depth of exactly "
-    "0.2 is not culled",
+    "principal points off the centre, and beyond it depth has another gradient; footprints end where alpha = 1/255 "
+    "instead of at three sigma; a depth of exactly 0.2 is not culled; gradients of needles are right to a few "
+    "thousandths",
 )
 
 
@@ -87,7 +94,9 @@ class GsplatRasterizer:
         means2d = means.new_zeros(n, 2).requires_grad_(differentiated)  # (n, 2)
         absgrad2d = means.new_zeros(n, 2) if differentiated else None
         if n == 0:
-            image = background.to(means)[:, None, None].expand(3, height, width)
+            # Zero, and in the graph: a loss of the image can be differentiated by everything that is not there.
+            nothing = torch.cat([value.flatten() for value in (means2d, *field.parameters.values())]).sum()
+            image = (background.to(means) + nothing)[:, None, None].expand(3, height, width)
             return RenderResult(
                 image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
             )

@@ -3,7 +3,7 @@
 Image, transmittance, radii, screen-space gradients and the gradients of all parameters have to agree wherever the image
 does not hang on a comparison that rounding can turn. Pixels and Gaussians where it does (`reference_raster.thresholds`)
 form a band: they are counted, and still have to stay within what the decisions can make of them. The gradients are
-those of a loss that leaves the band's pixels out.
+those of a loss that leaves the band's pixels out. A case for which a rasterizer departs by design is all band.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ it is lost. Needles reach l1/l2 = 1250: 0.1, of which the roundings' random sign
 the determinant, as autograd does, what is lost has the shape of adj(Sigma'), whose own part along the longer axis is
 only l2, and the loss is l1/l2 epsilon: from the same float32 G, log_scales are then right to 7e-5 instead of 1e-2.
 Neither the 1e-7 that the CUDA code adds to the squared determinant (2e-8 of the largest element) nor the rounding of G
-(3e-8) plays a part.
+(3e-8) plays a part. Done as two float32 matrix products, as in gsplat, it loses less of the same kind: 2e-3.
 """
 MAX_BAND = 0.4
 """Largest share of pixels that may be in the band: only `near_plane` reaches a third."""
@@ -176,6 +176,8 @@ def check_case(subject: Subject, case: Case) -> Outcome:
         tolerance=bounds.roundings * torch.finfo(subject.dtype).eps,
         three_sigma_cut=cut,
     )
+    if case.name in subject.semantics.departures:
+        mask = ThresholdMask(*(torch.ones_like(part) for part in (mask.pixels, mask.radii, mask.kinks)))
     weights = pixel_weights(exact) * ~mask.pixels  # (3, h, w)
     expected = _render(OracleRasterizer(three_sigma_cut=cut), exact, weights, "cpu")
     outcome = Outcome(
@@ -245,7 +247,7 @@ def _compared(
 ) -> Outcome:
     bounds, problems = BOUNDS[subject.dtype], []
     errors: dict[str, float] = {}
-    if outcome.band_share > MAX_BAND:
+    if outcome.band_share > MAX_BAND and case.name not in subject.semantics.departures:
         problems.append(f"the band has {outcome.band_share:.0%} of the pixels, expected at most {MAX_BAND:.0%}")
     scale = max(1.0, _largest(expected.image))
     for name in ("image", "transmittance"):

@@ -249,6 +249,24 @@ def test_without_the_cut_what_is_blended_nowhere_may_have_no_radius() -> None:
     assert check_case(replace(subject, rasterizer=culled), ordinary()).problems != ()
 
 
+def test_a_case_that_a_rasterizer_departs_for_by_design_is_not_compared_but_stays_plausible() -> None:
+    case = by_name()["saturated"]
+    departing = Semantics(departures={"saturated": "the cap is another"})
+    dimmer = Mutant(before=lambda f: changed(f, "opacity_logits", lambda logits: logits - 3))
+    assert check_case(Subject("dimmer", dimmer), case).problems != ()
+    outcome = check_case(Subject("dimmer", dimmer, semantics=departing), case)
+    assert outcome.problems == ()
+    assert outcome.band_share == 1
+    assert check_case(Subject("dimmer", dimmer, semantics=departing), ordinary()).problems != ()
+    for spoiled, said in (
+        (Mutant(after=image_of(lambda image: image + 10)), "beyond all colours"),
+        (Mutant(after=image_of(lambda image: image / 0)), "not finite"),
+        (Mutant(before=lambda f: changed(f, "means", Tensor.detach)), "gradient of means is missing"),
+    ):
+        problems = check_case(Subject("spoiled", spoiled, semantics=departing), case).problems
+        assert any(said in problem for problem in problems), problems
+
+
 # ------------------------------------------------------------------------------------------------ the command
 
 
