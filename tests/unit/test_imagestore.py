@@ -202,11 +202,9 @@ def test_the_disk_is_read_in_the_background(tmp_path: Path, monkeypatch: pytest.
         assert torch.equal(kept.get("slow"), torch.full((3, 2, 2), 5.0))
 
 
-@on_every_device
-def test_files_that_are_gone_or_cut_short(tmp_path: Path, device: str, where: str) -> None:
-    if where != "disk":
-        return
-    with store(tmp_path, where, "float16", device) as kept:
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, needs_cuda])])
+def test_files_that_are_gone_or_cut_short(tmp_path: Path, device: str) -> None:
+    with store(tmp_path, "disk", "float16", device) as kept:
         for name in "abc":
             kept.put(name, torch.rand(3, 4, 5))
         kept.announce("c")
