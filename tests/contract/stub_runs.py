@@ -1,0 +1,161 @@
+"""The stub checkouts, run on the CPU in this process: bare, and driven as a hierarchy."""
+
+from __future__ import annotations
+
+import io
+import re
+import runpy
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters.active_stage import HierarchyOptions
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+from lapgs_plugin.adapters.driver import HierarchyDriver
+from lapgs_plugin.adapters.known import adapter_class
+from lapgs_plugin.adapters.script import loaded_script
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.hooks import StageHook
+
+CHECKOUTS = Path(__file__).parent / "checkouts"
+
+ITERATIONS = 90
+"""Of a whole run: 30 and 60 iterations in two stages."""
+
+SCHEDULE = ("--eval", "--iterations", ITERATIONS, "--densify_from_iter", 5, "--densification_interval", 5)
+SCHEDULE += ("--densify_until_iter", 60, "--percent_dense", 0.05)
+
+
+@dataclass(frozen=True)
+class Stub:
+    """A stub checkout.
+
+    Attributes:
+        name: its folder.
+        stand_in: variant of the rasterizer that it runs with.
+        options: that its tests always give.
+    """
+
+    name: str
+    stand_in: str
+    options: tuple[Any, ...] = ()
+
+    @property
+    def script(self) -> Path:
+        return CHECKOUTS / self.name / "train.py"
+
+
+STUBS = {
+    stub.name: stub
+    for stub in (
+        Stub("fastgs", "fastgs", ("--dense", 0.05)),
+        Stub("taming", "taming", ("--budget", 4, "--cams", 5, "--sh_lower")),
+        Stub("graphdeco", "graphdeco-accel", ("--disable_viewer",)),
+    )
+}
+NAMES = tuple(STUBS)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run printed, and where it went."""
+
+    folder: Path
+    output: str
+    progress: str
+
+    @property
+    def losses(self) -> list[float]:
+        """The running mean of the loss that the progress bar shows every ten iterations."""
+        shown = re.findall(r"(?<!Depth )Loss=([0-9.]+)", self.progress)
+        return [float(value) for i, value in enumerate(shown) if i == 0 or value != shown[i - 1]]
+
+    @property
+    def lines(self) -> list[str]:
+        """What was printed, without times of day and durations."""
+        untimed = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]", "", self.output)
+        return re.sub(r"(time: |Time taken by None: )[0-9.]+", r"\1", untimed).splitlines()
+
+
+def arguments(stub: Stub, scene: Path, folder: Path, more: Sequence[Any] = ()) -> list[str]:
+    return [str(a) for a in ("-s", scene, "-m", folder, *SCHEDULE, *stub.options, *more)]
+
+
+@contextmanager
+def _without_leftovers() -> Iterator[None]:
+    """Forget modules that the stubs share: other checkouts have modules of the same names."""
+    try:
+        yield
+    finally:
+        for name, module in list(sys.modules.items()):
+            if str(getattr(module, "__file__", None) or "").startswith(str(CHECKOUTS)):
+                del sys.modules[name]
+
+
+@contextmanager
+def captured(folder: Path, results: list[Result]) -> Iterator[None]:
+    """Append to `results` what is printed inside."""
+    output, progress = io.StringIO(), io.StringIO()
+    with redirect_stdout(output), redirect_stderr(progress):
+        yield
+    results.append(Result(folder, output.getvalue(), progress.getvalue()))
+
+
+def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
+    """The script as Python runs it, without anything of `lapgs run`."""
+    results: list[Result] = []
+    before = sys.argv, sys.path[:], set(sys.modules)
+    sys.argv = [str(stub.script), *arguments(stub, scene, folder, more)]
+    sys.path.insert(0, str(stub.script.parent))
+    try:
+        with _without_leftovers(), captured(folder, results), cuda_on_cpu(stub.stand_in):
+            runpy.run_path(str(stub.script), run_name="__main__")
+    finally:
+        sys.argv, sys.path[:] = before[:2]
+        for name in ("utils", *(n for n in sys.modules if n.startswith("utils."))):
+            if name not in before[2]:
+                sys.modules.pop(name, None)
+    return results[0]
+
+
+@contextmanager
+def loaded(
+    stub: Stub, scene: Path, folder: Path, *more: Any, script: Path | None = None, stand_in: str | None = None
+) -> Iterator[BackboneAdapter]:
+    """The adapter over a stub whose definitions have been executed.
+
+    Args:
+        script: of a changed copy of the stub.
+        stand_in: another rasterizer than the checkout wants.
+    """
+    script = stub.script if script is None else script
+    with (
+        _without_leftovers(),
+        cuda_on_cpu(stub.stand_in if stand_in is None else stand_in),
+        loaded_script(script, arguments(stub, scene, folder, more)) as definitions,
+    ):
+        yield adapter_class(script.parent)(definitions)
+
+
+def drive(adapter: BackboneAdapter, *, hooks: Sequence[StageHook] = (), resume: bool = False, **options: Any) -> None:
+    HierarchyDriver(adapter, HierarchyOptions(**options), device="cpu", resume=resume, hooks=hooks).run()
+
+
+def run_hierarchy(
+    stub: Stub,
+    scene: Path,
+    folder: Path,
+    *more: Any,
+    hooks: Sequence[StageHook] = (),
+    resume: bool = False,
+    **options: Any,
+) -> tuple[RunArchive, Result]:
+    """Train a stub as a hierarchy with `HierarchyOptions(**options)`."""
+    results: list[Result] = []
+    with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
+        drive(adapter, hooks=hooks, resume=resume, **options)
+    return RunArchive.open(folder), results[0]
