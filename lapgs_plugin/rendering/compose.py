@@ -16,10 +16,13 @@ from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
 
+CLAMPED = "clamped"
+"""Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
+
 
 @dataclass(frozen=True)
 class Composition:
-    """One view, level by level; nothing is clamped.
+    """One view, level by level; the sums are never clamped.
 
     Attributes:
         base: (3, h, w) the coarsest level's render, background blended in.
@@ -61,6 +64,8 @@ class HierarchyRenderer:
         pyramid: Up between two levels; on the grid the hierarchy was trained with.
         rasterizer: renders every field.
         background: RGB behind the base. Residuals are always rendered over zero.
+        clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
+            paper authors' release does in training and rendering.
 
     Raises:
         UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
@@ -72,6 +77,7 @@ class HierarchyRenderer:
     pyramid: Pyramid
     rasterizer: Rasterizer
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clamped: bool = False
 
     def __post_init__(self) -> None:
         given = sorted(self.fields, reverse=True)
@@ -110,6 +116,7 @@ class HierarchyRenderer:
             pyramid=Pyramid(manifest.grid),
             rasterizer=rasterizer,
             background=manifest.scene.background,
+            clamped=bool(manifest.settings.get(CLAMPED, False)),
         )
 
     @property
@@ -169,6 +176,8 @@ class HierarchyRenderer:
         # A residual adds to the image; a background behind it would be added twice.
         color = torch.zeros(3) if field.signed else torch.tensor(self.background)
         image = self.rasterizer(field, at_level, background=color.to(field.means)).image
+        if self.clamped:
+            image = image.clamp(-1.0 if field.signed else 0.0, 1.0)
         if coarser is None:
             return image, image
         return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image

@@ -2,6 +2,15 @@
 
 from lapgs_plugin.scenes.images import read_image, write_image
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
-from lapgs_plugin.scenes.scene import Scene, View, load_scene
+from lapgs_plugin.scenes.scene import Scene, View, load_scene, smallest_size
 
-__all__ = ["Resolution", "Scene", "View", "load_scene", "parse_resolution", "read_image", "write_image"]
+__all__ = [
+    "Resolution",
+    "Scene",
+    "View",
+    "load_scene",
+    "parse_resolution",
+    "read_image",
+    "smallest_size",
+    "write_image",
+]

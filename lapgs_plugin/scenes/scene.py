@@ -111,8 +111,7 @@ def load_scene(
     """
     rule = parse_resolution(resolution)
     path = Path(path)
-    source = _read_source(path, images, eval)
-    _check_source(path, source)
+    source = _checked_source(path, images, eval)
     frames = [*source.train, *source.test]
     cameras = [_sized_camera(frame, rule) for frame in frames]
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
@@ -133,6 +132,27 @@ def load_scene(
         extent=_extent(path, source.train),
         background=background,
     )
+
+
+def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "images") -> tuple[int, int]:
+    """`Scene.smallest_size` of a scene, from its model and the headers of its images alone.
+
+    Args:
+        path, resolution, images: as `load_scene` takes them.
+
+    Raises:
+        SceneError, UserInputError: as `load_scene`.
+    """
+    rule = parse_resolution(resolution)
+    source = _checked_source(Path(path), images, evaluate=False)
+    cameras = [_sized_camera(frame, rule) for frame in (*source.train, *source.test)]
+    return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+
+
+def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
+    source = _read_source(path, images, evaluate)
+    _check_source(path, source)
+    return source
 
 
 def _read_source(path: Path, images: str, evaluate: bool) -> SceneSource:

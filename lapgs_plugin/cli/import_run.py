@@ -1,0 +1,77 @@
+"""`lapgs import-run`: a run folder from what other programs trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lapgs_plugin.errors import UserInputError
+
+
+def import_run(
+    folder: Annotated[
+        Path, typer.Argument(help="What a 3DGS codebase or the paper authors' release wrote: its -m folder.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder to write. Default: FOLDER/lapgs.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", "-s", help="Where the scene is now, if it moved since training.")
+    ] = None,
+    backbone: Annotated[
+        str | None,
+        typer.Option(help="fastgs, taming or graphdeco: what it was trained with, where the folder does not tell."),
+    ] = None,
+    iteration: Annotated[
+        int | None, typer.Option(help="Take the fields saved at this iteration. Default: the last ones.")
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="An option of its rasterizer that was not the default and is recorded nowhere: mult=0.7 or "
+            "antialiasing=true. May be given several times.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already in OUT.")] = False,
+) -> None:
+    """Turn FOLDER, trained without this program, into a run folder for `lapgs render`, `lapgs eval` and `lapgs report`.
+
+    FOLDER is that of a 3DGS codebase (point_cloud/), which becomes a run of one level, or of the paper authors' release
+    (L1/, L0/), rendered as its own script renders it, on the assumption that it was trained with --blur_up as in its
+    scripts. The fields are copied; FOLDER stays as it is.
+
+    Examples:
+
+        lapgs import-run output/garden --backbone fastgs
+
+        lapgs import-run output/garden -o runs/garden -s /data/garden --backbone taming
+    """
+    from lapgs_plugin.adapters.imported import import_run as make_run
+    from lapgs_plugin.adapters.imported import read_foreign_run
+
+    run = read_foreign_run(folder, iteration)
+    target = folder / "lapgs" if out is None else out
+    archive = make_run(
+        run, target, codebase=backbone, scene=scene, settings=_parsed(setting or []), overwrite=overwrite
+    )
+    for record in archive.manifest.records:
+        width, height = record.image_size
+        print(
+            f"level {record.level}: {record.num_gaussians:,} Gaussians, {record.iterations:,} steps, {width}x{height}"
+        )
+    if not run.times_are_known:
+        print("training time is not recorded there: figures will show it as 0")
+    print(f"{archive.path()} holds the run")
+
+
+def _parsed(texts: list[str]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        known = {"true": True, "false": False}
+        try:
+            values[name] = known[value.lower()] if value.lower() in known else float(value)
+        except ValueError as error:
+            raise UserInputError(f"--set {text}: expected mult=NUMBER or antialiasing=true|false") from error
+    return values
