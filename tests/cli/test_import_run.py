@@ -1,0 +1,249 @@
+"""`lapgs import-run`: folders laid out as other programs write them, rendered as those programs render."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import typer
+from torch import Tensor
+from typer.testing import CliRunner
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.import_run import import_run
+from lapgs_plugin.cli.render import render
+from lapgs_plugin.cli.report import report
+from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.run import run_scene
+from lapgs_plugin.scenes import read_image
+from tests.cli.run_folder import files_in, write_scene
+from tests.training_scene import blob_field
+
+app = typer.Typer()
+for command, function in (("import-run", import_run), ("render", render), ("eval", evaluate), ("report", report)):
+    app.command(command)(function)
+
+FASTGS = "diff_gaussian_rasterization_fastgs"
+
+
+def lapgs(*arguments: object) -> str:
+    """Standard output of a command that succeeds; a LapgsError comes through as it is."""
+    result = CliRunner(env={"COLUMNS": "100"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), size=(57, 41))
+
+
+@dataclass
+class Foreign:
+    """A folder as a 3DGS codebase or the release leaves it; options go into cfg_args."""
+
+    folder: Path
+    scene: Path
+
+    def options(self, **changes: Any) -> None:
+        values = {
+            **{"sh_degree": 0, "source_path": str(self.scene), "model_path": "output/x", "images": "images"},
+            **{"resolution": -1, "white_background": False, "data_device": "cuda", "eval": True},
+            **changes,
+        }
+        self.folder.mkdir(exist_ok=True, parents=True)
+        text = ", ".join(f"{name}={value!r}" for name, value in values.items())
+        (self.folder / "cfg_args").write_text(f"Namespace({text})")
+
+    def field(self, place: str, iteration: int, field: GaussianField) -> GaussianField:
+        path = self.folder / place / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+        path.parent.mkdir(parents=True)
+        replace(field, signed=False).save_ply(path)  # theirs have no mark of ours
+        return field
+
+    def info(self, level: int, seconds: float, peak: int) -> None:
+        (self.folder / f"L{level}" / "TRAIN_INFO").write_text(
+            f"Training Time: {seconds:.2f} seconds, {seconds / 60:.2f} minutes\nGS Number: 1\nPeak GS number: {peak}\n"
+            "Peak GPU allocated: 12.00 MB\n"
+        )
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, scene: Path) -> Foreign:
+    made = Foreign(tmp_path / "output", scene)
+    made.options()
+    return made
+
+
+def release_up(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """The release's way from a level to the next finer one: bilinear with half-pixel centres, then the blur."""
+    taps = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    kernel = torch.outer(taps, taps).expand(3, 1, 5, 5)
+    larger = F.interpolate(image[None], size=size, mode="bilinear", align_corners=False)
+    return F.conv2d(F.pad(larger, (2, 2, 2, 2), mode="reflect"), kernel, groups=3)[0]
+
+
+def test_a_hierarchy_of_the_release_is_rendered_as_its_script_does(foreign: Foreign, tmp_path: Path) -> None:
+    # Colours beyond 1 in the base and below -1 in the residual, so that its clamps show.
+    base = foreign.field("L1", 100, replace(blob_field(seed=1), sh=4 * blob_field(seed=1).sh))
+    residual = replace(foreign.field("L0", 200, replace(blob_field(seed=2), sh=4 * blob_field(seed=2).sh)), signed=True)
+    run = tmp_path / "run"
+    lapgs("import-run", foreign.folder, "-o", run, "--backbone", "fastgs", "--set", "mult=1.0")
+    lapgs("render", run, "--format", "exr")
+
+    view = run_scene(RunArchive.open(run)).test[0]
+    assert (view.camera.width, view.camera.height) == (57, 41)
+    cpu, black = CpuRasterizer(), torch.zeros(3)
+    coarse = cpu(base, view.camera.resized(29, 21), background=black).image
+    fine = cpu(residual, view.camera, background=black).image
+    assert coarse.max() > 1.1
+    assert fine.min() < -1.1
+    expected = release_up(coarse.clamp(0, 1), (41, 57)) + fine.clamp(-1, 1)
+    written = read_image(run / "renders" / "test" / "photos" / "00_composed.exr")
+    np.testing.assert_allclose(written, expected, atol=2e-5)  # worst seen 2e-6
+
+
+def test_figures_of_the_release_count_from_its_first_stage(foreign: Foreign, tmp_path: Path) -> None:
+    foreign.field("L1", 100, blob_field(200, seed=1))
+    foreign.field("L0", 200, blob_field(150, seed=2))
+    foreign.info(1, 10.5, 260)
+    foreign.info(0, 35.75, 260)  # the peak was the first stage's
+    output = lapgs("import-run", foreign.folder, "--backbone", "taming")
+    archive = RunArchive.open(foreign.folder / "lapgs")
+    assert [record.level for record in archive.manifest.records] == [1, 0]
+    assert [record.signed for record in archive.manifest.records] == [False, True]
+    assert [record.train_seconds for record in archive.manifest.records] == [10.5, 25.25]
+    assert [record.peak_gaussians for record in archive.manifest.records] == [260, 150]
+    assert [record.image_size for record in archive.manifest.records] == [(29, 21), (57, 41)]
+    assert "not recorded" not in output
+    lapgs("eval", foreign.folder / "lapgs")
+    lapgs("report", foreign.folder / "lapgs")
+    metrics = json.loads((foreign.folder / "lapgs" / "metrics.json").read_text())
+    assert metrics["train_seconds"] == 35.75
+    assert metrics["rasterizer"] == "cpu" or torch.cuda.is_available()
+
+
+def test_a_plain_run_is_one_level_and_its_last_field_is_taken(foreign: Foreign) -> None:
+    foreign.field("", 700, blob_field(90, seed=1))
+    last = foreign.field("", 3000, blob_field(120, seed=2))
+    output = lapgs("import-run", foreign.folder, "--backbone", "fastgs")
+    assert "training time is not recorded" in output
+    archive = RunArchive.open(foreign.folder / "lapgs")
+    assert archive.manifest.levels == 1
+    assert archive.manifest.records[0].iterations == 3000
+    assert archive.manifest.rasterizer == FASTGS
+    assert archive.manifest.settings["raster"] == {"mult": 0.5}
+    for name, value in archive.field(0).parameters.items():
+        assert torch.equal(value, last.parameters[name])
+    assert files_in(foreign.folder / "point_cloud") == {f"iteration_{i}/point_cloud.ply" for i in (700, 3000)}
+    lapgs("render", foreign.folder / "lapgs")
+    lapgs("report", foreign.folder / "lapgs")  # without any history
+
+    lapgs("import-run", foreign.folder, "--backbone", "fastgs", "--iteration", 700, "--overwrite")
+    assert RunArchive.open(foreign.folder / "lapgs").manifest.records[0].num_gaussians == 90
+
+
+def test_opacities_that_taming_keeps_without_a_sigmoid(foreign: Foreign) -> None:
+    logits = torch.linspace(-5, 5, 50)
+    field = blob_field(50)
+    linear = torch.sigmoid(logits) * torch.tensor([1.0, -1.0]).repeat(25).where(logits < -3, 1.0)
+    foreign.field("", 30000, replace(field, opacity_logits=linear))
+    lapgs("import-run", foreign.folder, "--backbone", "taming")
+    read = RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits
+    torch.testing.assert_close(read, logits, rtol=0, atol=1e-4)  # worst seen 2e-5: one epsilon of 1 - 0.993
+    lapgs("import-run", foreign.folder, "--backbone", "fastgs", "--overwrite")  # which has no such thing
+    assert torch.equal(RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits, linear)
+
+
+def test_an_interrupted_hierarchy_is_what_it_is(foreign: Foreign) -> None:
+    foreign.field("L1", 100, blob_field())
+    (foreign.folder / "L0").mkdir()
+    lapgs("import-run", foreign.folder, "--backbone", "fastgs")
+    manifest = RunArchive.open(foreign.folder / "lapgs").manifest
+    assert (manifest.levels, len(manifest.records), manifest.complete) == (2, 1, False)
+
+
+def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
+    foreign.field("", 30, blob_field())
+    with pytest.raises(UserInputError, match=r"does not say what it was trained with, expected fastgs, taming"):
+        lapgs("import-run", foreign.folder)
+    (foreign.folder / "runtime_breakdown.json").write_text('{"backbone": "taming", "config": {"blur_up": true}}')
+    lapgs("import-run", foreign.folder)
+    assert RunArchive.open(foreign.folder / "lapgs").manifest.settings["backbone"]["name"] == "taming"
+    foreign.options(depths="", train_test_exp=False)
+    lapgs("import-run", foreign.folder, "--overwrite", "--set", "antialiasing=true")
+    manifest = RunArchive.open(foreign.folder / "lapgs").manifest
+    assert manifest.settings["backbone"]["name"] == "graphdeco"
+    assert manifest.settings["raster"] == {"antialiasing": True}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("Namespace(a=__import__('os').system('touch HERE'))", "is not readable"),
+        ("dict(sh_degree=3)", "is not readable"),
+        ("Namespace(**{'sh_degree': 3})", "is not readable"),
+        ("Namespace(sh_degree=3", "is not readable"),
+        ("Namespace(sh_degree=3)", "lacks source_path, resolution, eval"),
+        ("[" * 5000, "is not readable"),
+    ],
+)
+def test_options_are_read_and_never_executed(foreign: Foreign, text: str, message: str) -> None:
+    (foreign.folder / "cfg_args").write_text(text.replace("HERE", str(foreign.folder / "executed")))
+    with pytest.raises(RunFolderError, match=message) as caught:
+        lapgs("import-run", foreign.folder)
+    assert "\n" not in str(caught.value)
+    assert not (foreign.folder / "executed").exists()
+
+
+def test_what_cannot_be_rendered_as_it_was_is_refused(foreign: Foreign, tmp_path: Path) -> None:
+    def refused(message: str, *arguments: object) -> None:
+        with pytest.raises((UserInputError, RunFolderError), match=message) as caught:
+            lapgs("import-run", foreign.folder, "--backbone", "fastgs", *arguments)
+        assert "\n" not in str(caught.value)
+        assert not (foreign.folder / "lapgs").exists()
+
+    refused("holds no point_cloud folder")
+    foreign.field("L0", 10, blob_field())
+    (foreign.folder / "L1").mkdir()
+    refused(r"holds L0, expected point_cloud/, or L<n>/point_cloud/ of the coarsest")
+    foreign.field("L1", 10, blob_field())
+    refused("holds fields of iterations 10, expected 7;", "--iteration", 7)
+    refused(r"--set mult=big: expected mult=NUMBER", "--set", "mult=big")
+    refused(r"--set debug=True: expected mult=NUMBER", "--set", "debug=true")
+    refused(r"--set antialiasing=1.0", "--set", "antialiasing=1")
+    refused("is not there; give the scene's folder with -s", "-s", tmp_path / "nowhere")
+    foreign.options(white_background=True)
+    refused("--white_background, which the release adds again")
+    foreign.options(train_test_exp=True)
+    refused("--train_test_exp")
+    foreign.options()
+    (foreign.folder / "runtime_breakdown.json").write_text('{"config": {"blur_up": false}}')
+    refused("without --blur_up")
+    (foreign.folder / "runtime_breakdown.json").unlink()
+    ply = foreign.folder / "L0" / "point_cloud" / "iteration_10" / "point_cloud.ply"
+    ply.write_bytes(ply.read_bytes()[:-100])
+    refused("point_cloud.ply is cut short")
+    (foreign.folder / "cfg_args").unlink()
+    refused("cfg_args does not exist")
+
+
+def test_a_scene_that_moved_and_a_folder_that_is_taken(foreign: Foreign, scene: Path) -> None:
+    foreign.field("", 30, blob_field())
+    foreign.options(source_path="/not/there/any/more")
+    with pytest.raises(RunFolderError, match="say where it is now with -s"):
+        lapgs("import-run", foreign.folder, "--backbone", "fastgs")
+    lapgs("import-run", foreign.folder, "--backbone", "fastgs", "-s", scene)
+    with pytest.raises(RunFolderError, match="already holds a run"):
+        lapgs("import-run", foreign.folder, "--backbone", "fastgs", "-s", scene)
