@@ -147,7 +147,7 @@ class Manifest:
         finished = ", ".join(str(record.level) for record in self.records) or "none"
         raise RunFolderError(
             f"level {level} is not in this run (finished: {finished} of {self.levels}); "
-            "continue it with `lapgs train --resume`"
+            "continue it with its own command and --resume"
         )
 
     @classmethod

@@ -401,10 +401,10 @@ class ActiveStage:
         level, exact = self.stage.level, self._album.exact
         cameras = (*self._loaded.train, *self._loaded.test)
         pixels = sum(math.prod(self._size(camera, level)) for camera in cameras)
-        precision = "uint8" if level == 0 and exact else "float16"
-        store = self._store((1 if precision == "uint8" else 2) * 3 * pixels, precision, "targets")
         supervised = {id(camera) for camera in self._loaded.train}
         of_laplacian = self.stage.signed and self._supervision is Supervision.GT_LAPLACIAN
+        precision = "uint8" if level == 0 and exact and not of_laplacian else "float16"
+        store = self._store((1 if precision == "uint8" else 2) * 3 * pixels, precision, "targets")
         for camera in cameras:
             key = self._keys[id(camera)]
             images = self._pyramid.gaussian(self._album.photo(key).image(self._device), level + 1 + of_laplacian)

@@ -47,7 +47,9 @@ def cuda_on_cpu(variant: str) -> Iterator[None]:
         stack.enter_context(_replaced(sys.modules, absent_modules()))
         stack.enter_context(_replaced(vars(torch.cuda), _WITHOUT_CUDA))
         stack.enter_context(_replaced(vars(torch), {"load": _loading_to_cpu(torch.load)}))
-        stack.enter_context(_CudaMeansCpu())
+        mode = _CudaMeansCpu()
+        stack.enter_context(_replaced(vars(torch.autograd), _engine_within(mode)))
+        stack.enter_context(mode)
         yield
 
 
@@ -61,11 +63,6 @@ class _CudaMeansCpu(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        if func is Tensor.backward:
-            # torch leaves the mode for as long as a function runs, but hooks and the backward passes of a checkout's
-            # own functions name devices too.
-            with self:
-                return _backward(*args, **(kwargs or {}))
         instead = _INSTEAD.get(func)
         if instead is not None:
             return instead(*args, **(kwargs or {}))
@@ -84,15 +81,20 @@ def _redirected(device: Any) -> Any:
     return _CPU if is_cuda else device
 
 
-def _backward(
-    tensor: Tensor,
-    gradient: Tensor | None = None,
-    retain_graph: bool | None = None,
-    create_graph: bool = False,
-    inputs: Any = None,
-) -> None:
-    """What `Tensor.backward` does, without asking the mode again."""
-    torch.autograd.backward(tensor, gradient, retain_graph, create_graph, inputs=inputs)
+def _engine_within(mode: _CudaMeansCpu) -> dict[str, Callable[..., Any]]:
+    """torch's way into its autograd engine, with the mode.
+
+    torch leaves a mode for as long as `backward` or `grad` runs, but hooks and the backward passes of a checkout's own
+    functions name devices too.
+    """
+    run_backward = torch.autograd.graph._engine_run_backward
+
+    @wraps(run_backward)
+    def running(*args: Any, **kwargs: Any) -> Any:
+        with mode:
+            return run_backward(*args, **kwargs)
+
+    return {"_engine_run_backward": running}
 
 
 def _cuda(tensor: Tensor, device: object = None, non_blocking: bool = False, **layout: Any) -> Tensor:
@@ -187,7 +189,6 @@ _INSTEAD: dict[Callable[..., Any], Callable[..., Any]] = {
     Tensor.cuda: _cuda,
     Tensor.to: _to,
     Tensor.pin_memory: _itself,
-    Tensor.record_stream: _returns(None),
 }
 
 _WITHOUT_CUDA: dict[str, object] = {

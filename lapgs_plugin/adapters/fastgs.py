@@ -107,6 +107,7 @@ class FastGSAdapter(BackboneAdapter):
         cameras = utils.sampling_cameras(self._scene.getTrainCameras().copy())
         background = torch.full((3,), float(self._stage.dataset.white_background), device=gaussians._xyz.device)
         _, score = utils.compute_gaussian_score_fastgs(cameras, gaussians, pipe, background, opt)
+        gaussians.tmp_radii = None  # pruning reads what only a densification before it would have set
         gaussians.final_prune_fastgs(min_opacity=LATE_MIN_OPACITY, pruning_score=score)
 
 

@@ -56,14 +56,16 @@ class GsplatRasterizer:
     Where it is not built yet, gsplat compiles its CUDA part with the first call, for some minutes.
 
     Args:
+        device: where it renders; what takes gsplat's place on a CPU renders there.
         antialiasing: dim Gaussians that are smaller than a pixel, as graphdeco's option of that name does.
 
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
     """
 
-    def __init__(self, *, antialiasing: bool = False) -> None:
-        if reason := missing():
+    def __init__(self, device: torch.device | str = "cuda", *, antialiasing: bool = False) -> None:
+        self._device = torch.device(device)
+        if self._device.type == "cuda" and (reason := missing()):
             raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
         self._mode = "antialiased" if antialiasing else "classic"
 
@@ -82,11 +84,13 @@ class GsplatRasterizer:
         """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
 
         Raises:
-            UserInputError: the field is not float32 on a CUDA device.
+            UserInputError: the field is not float32 on `device`.
         """
         means = field.means
-        if means.device.type != "cuda" or means.dtype != torch.float32:
-            raise UserInputError(f"means is {means.dtype} on {means.device}, expected float32 on cuda; use .to()")
+        if means.device.type != self._device.type or means.dtype != torch.float32:
+            raise UserInputError(
+                f"means is {means.dtype} on {means.device}, expected float32 on {self._device}; use .to()"
+            )
         from gsplat import rasterization, spherical_harmonics
 
         n, width, height = len(field), camera.width, camera.height

@@ -51,7 +51,7 @@ class StageRendering:
     def announce(self, key: str) -> None:
         """Bring a view's images while it is being rendered."""
         self.targets.announce(key)
-        if self.accumulated is not None:
+        if self.accumulated is not None and key in self.composed:
             self.accumulated.announce(key)
 
     def compose(self, key: str | None, image: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ def require_complete(archive: RunArchive) -> None:
     if not manifest.complete:
         raise RunFolderError(
             f"{archive.path()}: only {len(manifest.records)} of {manifest.levels} levels are trained; finish the run "
-            "with `lapgs train --resume`, or look at what is there with `lapgs render`"
+            "with its own command and --resume, or look at what is there with `lapgs render`"
         )
 
 
