@@ -111,7 +111,7 @@ def test_a_hierarchy_of_the_release_is_rendered_as_its_script_does(foreign: Fore
     assert fine.min() < -1.1
     expected = release_up(coarse.clamp(0, 1), (41, 57)) + fine.clamp(-1, 1)
     written = read_image(run / "renders" / "test" / "photos" / "00_composed.exr")
-    np.testing.assert_allclose(written, expected, atol=2e-5)  # worst seen 2e-6
+    np.testing.assert_allclose(written, expected, atol=1e-5)  # worst seen 8e-7
 
 
 def test_figures_of_the_release_count_from_its_first_stage(foreign: Foreign, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_opacities_that_taming_keeps_without_a_sigmoid(foreign: Foreign) -> None
     foreign.field("", 30000, replace(field, opacity_logits=linear))
     lapgs("import-run", foreign.folder, "--backbone", "taming")
     read = RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits
-    torch.testing.assert_close(read, logits, rtol=0, atol=1e-4)  # worst seen 2e-5: one epsilon of 1 - 0.993
+    torch.testing.assert_close(read, logits, rtol=0, atol=1e-4)  # worst seen 5e-6
     lapgs("import-run", foreign.folder, "--backbone", "fastgs", "--overwrite")  # which has no such thing
     assert torch.equal(RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits, linear)
 

@@ -1,0 +1,333 @@
+"""Which rasterizer renders a run, what it is told of the training, and that rendering pays for nothing else."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import gsplat
+import pytest
+import torch
+from gsplat.cuda import _torch_impl
+from torch import Tensor
+
+from lapgs_plugin.adapters import gsplat as gsplat_adapter
+from lapgs_plugin.adapters.extensions import CudaExtension
+from lapgs_plugin.adapters.gsplat import GsplatRasterizer
+from lapgs_plugin.archive import Manifest, SceneReference
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
+from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
+from lapgs_plugin.raster import render_transmittance
+from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.reference_raster.standins import install, stand_ins
+from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
+from lapgs_plugin.signed_color import SignedColorRasterizer
+
+FASTGS, GRAPHDECO = "diff_gaussian_rasterization_fastgs", "diff_gaussian_rasterization"
+LOGGER = "lapgs_plugin.rendering.rasterizers"
+
+
+def manifest(rasterizer: str, **raster: Any) -> Manifest:
+    scene = SceneReference("scene", "3dgs:-1", True, (0.0, 0.0, 0.0), "colmap")
+    return Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, rasterizer, 0, {"raster": raster})
+
+
+def scene(signed: bool = False) -> Case:
+    case = random_case(60, 45, 37, seed=5, sh_degree=2).to(torch.float32)
+    return replace(case, field=replace(case.field, signed=signed))
+
+
+@pytest.fixture
+def line(caplog: pytest.LogCaptureFixture) -> Iterator[Any]:
+    """The one line that was logged."""
+    caplog.set_level(logging.INFO, LOGGER)
+
+    def only() -> str:
+        (record,) = (record for record in caplog.records if record.name == LOGGER)
+        return record.getMessage()
+
+    return only
+
+
+@pytest.fixture
+def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that says it has a GPU; nothing is rendered on it."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "A GPU")
+
+
+def chosen(placed: PlacedRasterizer) -> tuple[str, str]:
+    return placed.rasterizer.name, placed.device.type
+
+
+# ------------------------------------------------------------------------------------------ without a CUDA device
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_without_cuda_the_fast_one_renders_and_says_what_it_cannot_honour(line: Any) -> None:
+    placed = rasterizer_for(manifest(FASTGS, mult=0.5))
+    assert chosen(placed) == ("cpu", "cpu")
+    assert placed.lost == {"mult": 0.5}
+    assert line() == (
+        f"rendering with cpu on the CPU: the fastest without a CUDA device; the run was trained with {FASTGS}, images "
+        "may differ slightly; cpu cannot honour mult = 0.5 of the training "
+        f"(--rasterizer {FASTGS} can, slowly on a CPU)"
+    )
+
+
+@pytest.mark.usefixtures("no_cuda")
+@pytest.mark.parametrize("trained", ["cpu", "oracle"])
+def test_a_run_of_ours_is_rendered_as_it_was_trained(trained: str, line: Any) -> None:
+    assert chosen(rasterizer_for(manifest(trained))) == (trained, "cpu")
+    assert line() == f"rendering with {trained} on the CPU: the one it was trained with"
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_settings_that_change_nothing_are_not_worth_a_word() -> None:
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=False)).lost == {}
+    assert rasterizer_for(manifest(FASTGS, mult=1.0)).lost == {}
+
+
+@pytest.mark.usefixtures("no_cuda")
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize(("name", "setting"), [(FASTGS, {"mult": 0.3}), (GRAPHDECO, {"antialiasing": True})])
+def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: dict[str, Any], signed: bool) -> None:
+    placed = rasterizer_for(manifest(name, **setting), device="cpu", rasterizer=name)
+    assert chosen(placed) == (name, "cpu")
+    assert placed.lost == {}
+    case = scene(signed)
+    with torch.no_grad():
+        honoured, plain = case.render(placed.rasterizer).image, case.render(OracleRasterizer()).image
+    assert (honoured - plain).abs().max() > 1e-2  # it does change this image
+    variant = "fastgs" if name == FASTGS else "graphdeco-aa"
+    direct = SignedColorRasterizer(CudaExtension(name, "cpu", settings=setting, module=stand_ins(variant)[name]))
+    assert torch.equal(case.render(direct).image, honoured)
+
+
+@pytest.mark.usefixtures("no_cuda")
+@pytest.mark.parametrize(
+    ("device", "rasterizer", "message"),
+    [
+        ("gpu", "auto", "--device gpu: expected auto, cuda, cpu"),
+        ("cuda", "auto", "--device cuda: PyTorch sees no CUDA device"),
+        ("auto", "my_own", "--rasterizer my_own: expected auto, cpu, oracle, gsplat, diff_gaussian"),
+        ("cpu", "gsplat", "--rasterizer gsplat --device cpu: it runs on CUDA only"),
+        ("auto", "gsplat", "--rasterizer gsplat: PyTorch sees no CUDA device"),
+    ],
+)
+def test_what_cannot_be_had_is_refused_in_one_line(device: str, rasterizer: str, message: str) -> None:
+    with pytest.raises((UserInputError, MissingExtraError), match=message) as caught:
+        rasterizer_for(manifest("cpu"), device, rasterizer)
+    assert "\n" not in str(caught.value)
+
+
+# --------------------------------------------------------------------------------------------- with a CUDA device
+
+
+@pytest.mark.usefixtures("cuda")
+def test_with_cuda_the_rasterizer_of_the_training_renders_with_its_settings(line: Any) -> None:
+    with install("fastgs"):
+        placed = rasterizer_for(manifest(FASTGS, mult=0.5))
+    assert chosen(placed) == (FASTGS, "cuda")
+    assert placed.lost == {}
+    assert line() == f"rendering with {FASTGS} on A GPU: the one it was trained with"
+
+
+@pytest.mark.usefixtures("cuda")
+def test_a_build_that_lacks_a_setting_says_so(line: Any) -> None:
+    with install("taming"):
+        placed = rasterizer_for(manifest(GRAPHDECO, antialiasing=True))
+    assert chosen(placed) == (GRAPHDECO, "cuda")
+    assert placed.lost == {"antialiasing": True}
+    assert "cannot honour antialiasing = True" in line()
+
+
+@pytest.mark.usefixtures("cuda")
+def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: Any) -> None:
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    placed = rasterizer_for(manifest(FASTGS, mult=0.5))
+    assert chosen(placed) == ("gsplat", "cuda")
+    assert placed.lost == {"mult": 0.5}
+    assert f"rendering with gsplat on A GPU: {FASTGS} cannot be imported" in line()
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).lost == {}
+
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "gsplat is not installed")
+    assert chosen(rasterizer_for(manifest(FASTGS))) == ("cpu", "cpu")
+    with pytest.raises(MissingExtraError, match=r"--device cuda: .*cannot be imported.* and gsplat is not installed"):
+        rasterizer_for(manifest(FASTGS), device="cuda")
+
+
+@pytest.mark.usefixtures("cuda")
+def test_the_device_decides_for_runs_of_either_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    assert chosen(rasterizer_for(manifest("cpu"))) == ("cpu", "cpu")
+    assert chosen(rasterizer_for(manifest("cpu"), device="cuda")) == ("gsplat", "cuda")
+    with install("fastgs"):
+        assert chosen(rasterizer_for(manifest(FASTGS), device="cpu")) == ("cpu", "cpu")
+        assert chosen(rasterizer_for(manifest("cpu"), rasterizer=FASTGS)) == (FASTGS, "cuda")
+        assert chosen(rasterizer_for(manifest(FASTGS), device="cpu", rasterizer=FASTGS)) == (FASTGS, "cpu")
+    with pytest.raises(UserInputError, match="--rasterizer cpu --device cuda: it runs on the CPU"):
+        rasterizer_for(manifest(FASTGS), device="cuda", rasterizer="cpu")
+
+
+# ------------------------------------------------------------------------------------------------ what a call costs
+
+
+def test_rendering_is_one_pass_that_keeps_nothing() -> None:
+    calls = []
+    with install("fastgs") as modules:
+        module = modules[FASTGS]
+
+        class Counting(module.GaussianRasterizer):  # type: ignore[name-defined, misc]  # the class of a loaded module
+            def forward(self, *args: Any, **kwargs: Any) -> Any:
+                calls.append(self.raster_settings.bg.tolist())
+                return super().forward(*args, **kwargs)
+
+        extension = CudaExtension(FASTGS, "cpu")
+        module.GaussianRasterizer = Counting
+        case = scene().with_leaves()
+        with torch.no_grad():
+            result = case.render(SignedColorRasterizer(extension))
+    assert len(calls) == 1
+    assert result.transmittance is None
+    assert result.absgrad2d is None
+    assert not any(value.requires_grad for value in (result.image, result.means2d))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_the_transmittance_is_there_for_who_asks(signed: bool) -> None:
+    case = scene(signed)
+    expected = case.render(OracleRasterizer(three_sigma_cut=False)).transmittance
+    with install("fastgs"):
+        rasterizer = SignedColorRasterizer(CudaExtension(FASTGS, "cpu"))
+        actual = render_transmittance(rasterizer, case.field, case.camera)
+    torch.testing.assert_close(
+        actual, expected, rtol=0, atol=2e-3
+    )  # a pixel at 1/255 may be either; worst seen WORST_T
+
+
+def test_settings_that_an_extension_does_not_have_are_refused() -> None:
+    with install("taming"), pytest.raises(UserInputError, match="has no setting mult; expected some of"):
+        CudaExtension(GRAPHDECO, "cpu", settings={"mult": 0.5})
+
+
+# ----------------------------------------------------------------------------------------------------------- gsplat
+
+
+class WithoutCuda:
+    """`gsplat.rasterization` and `spherical_harmonics` by gsplat's own PyTorch code, and what is asked of them."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, Any] = {}
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
+        return _torch_impl._spherical_harmonics(degree, directions, coefficients)
+
+    def rasterization(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        *,
+        near_plane: float,
+        eps2d: float,
+        backgrounds: Tensor,
+        **asked: Any,
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        self.asked = {"near_plane": near_plane, "eps2d": eps2d, **asked}
+        covariances, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        radii, means2d, depths, conics, _ = _torch_impl._fully_fused_projection(
+            means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
+        )
+        shown = (radii > 0).all(-1, keepdim=True)  # (1, n, 1)
+        means2d, conics = (
+            torch.where(shown, means2d, torch.nan),
+            torch.where(shown, conics, torch.nan),
+        )  # as never written
+        columns, rows = -(-width // 16), -(-height // 16)
+        _, tile_ids, ids = _torch_impl._isect_tiles(means2d.nan_to_num(), radii, depths, 16, columns, rows)
+        offsets = _torch_impl._isect_offset_encode(tile_ids, 1, columns, rows)
+        with _cuda_parts_replaced():
+            image, alpha = _torch_impl._rasterize_to_pixels(
+                means2d, conics, colors[None], opacities[None], width, height, 16, offsets, ids, backgrounds=backgrounds
+            )
+        if asked["absgrad"]:
+            means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
+        return image, alpha, {"radii": radii, "means2d": means2d, "conics": conics}
+
+
+@pytest.fixture
+def without_cuda(monkeypatch: pytest.MonkeyPatch) -> WithoutCuda:
+    code = WithoutCuda()
+    monkeypatch.setattr(gsplat, "rasterization", code.rasterization)
+    monkeypatch.setattr(gsplat, "spherical_harmonics", code.spherical_harmonics)
+    return code
+
+
+def faint(signed: bool) -> Case:
+    """Opacities whose alpha sinks under 1/255 well inside three sigma: no footprint is cut and no alpha capped."""
+    case = random_case(300, 70, 50, seed=3, background=(0.0, 0.0, 0.0)).to(torch.float32)
+    opacities = 0.01 + 0.19 * torch.rand(300, generator=torch.Generator().manual_seed(4))
+    field = case.field.with_parameters({"opacity_logits": torch.logit(opacities)})
+    return replace(case, field=replace(field, signed=signed))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_gsplat_is_the_oracle_where_their_semantics_agree(signed: bool, without_cuda: WithoutCuda) -> None:
+    case = faint(signed)
+    weights = pixel_weights(case)
+    found = {}
+    for name, rasterizer in (("theirs", GsplatRasterizer("cpu")), ("ours", OracleRasterizer())):
+        fresh = case.with_leaves()
+        result = fresh.render(rasterizer)
+        (result.image * weights).sum().backward()
+        gradients = {key: value.grad for key, value in fresh.field.parameters.items()}
+        found[name] = result, {**gradients, "means2d": result.means2d.grad}
+    (theirs, their_gradients), (ours, our_gradients) = found["theirs"], found["ours"]
+    assert ours.image.min() < -0.1 or not signed
+    # Rounding alone; worst seen: image 5e-7, transmittance 5e-7, centres 8e-6, gradients 3.5e-6 of their norm.
+    torch.testing.assert_close(theirs.image, ours.image, rtol=0, atol=1e-5)
+    torch.testing.assert_close(theirs.transmittance, ours.transmittance, rtol=0, atol=1e-5)
+    both = (theirs.radii > 0) & (ours.radii > 0)
+    assert both.float().mean() > 0.5
+    assert torch.equal(theirs.radii[both], ours.radii[both])
+    torch.testing.assert_close(theirs.means2d[both], ours.means2d[both], rtol=0, atol=1e-4)
+    assert (theirs.means2d[theirs.radii == 0] == 0).all()
+    for name, gradient in our_gradients.items():
+        assert gradient is not None
+        assert (their_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
+    assert theirs.absgrad2d is not None
+    torch.testing.assert_close(theirs.absgrad2d, theirs.means2d.grad.abs())
+
+
+def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: WithoutCuda) -> None:
+    with torch.no_grad():
+        result = faint(False).render(GsplatRasterizer("cpu", antialiasing=True))
+    assert without_cuda.asked == {
+        **{"near_plane": 0.2, "eps2d": 0.3, "radius_clip": 0.0, "packed": False},
+        **{"rasterize_mode": "antialiased", "absgrad": False},
+    }
+    assert result.absgrad2d is None
+
+
+def test_gsplat_without_gaussians_shows_the_background(without_cuda: WithoutCuda) -> None:
+    case = random_case(0, 20, 10, seed=0, background=(0.1, 0.2, 0.3)).to(torch.float32)
+    result = case.render(GsplatRasterizer("cpu"))
+    torch.testing.assert_close(result.image, torch.tensor([0.1, 0.2, 0.3])[:, None, None].expand(3, 10, 20))
+    assert without_cuda.asked == {}
+    with pytest.raises(UserInputError, match=r"means is torch\.float64 on cpu, expected float32 on cpu"):
+        case.to(torch.float64).render(GsplatRasterizer("cpu"))
