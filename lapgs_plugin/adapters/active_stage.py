@@ -22,7 +22,7 @@ from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCal
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.level_views import AnnouncingViews, PhotoAlbum, make_level_view
 from lapgs_plugin.adapters.shim import RasterizerShim, StageRendering
-from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
+from lapgs_plugin.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.field import GaussianField
@@ -267,7 +267,8 @@ class ActiveStage:
         self._hooks.stage_ends(stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
-        finished = self._finish(gaussians, field)
+        finished = self._finish(gaussians, field, self._adapter.carried_over(gaussians), self._moments(gaussians))
+        left = {"carried": dict(finished.carried), "moments": dict(finished.moments)}
         with self.timed("archive"):
             self._archive.finish_level(
                 LevelRecord(
@@ -282,6 +283,7 @@ class ActiveStage:
                     memory_bytes=memory,
                 ),
                 field,
+                left if stage.level > 0 and any(left.values()) else None,
             )
         return finished
 
@@ -291,7 +293,11 @@ class ActiveStage:
         gaussians = self._adapter.new_model(self._whole_call)
         self._adapter.import_field(gaussians, field.to(self._device))
         gaussians.active_sh_degree = field.sh_degree
-        return self._finish(gaussians, field)
+        left: dict[str, Any] = {"carried": {}, "moments": {}}
+        if self._archive.field_path(self.stage.level).with_name(OPTIMIZER).exists():
+            left = self._archive.optimizer_state(self.stage.level)
+        carried = {name: torch.nn.Parameter(value.detach().to(self._device)) for name, value in left["carried"].items()}
+        return self._finish(gaussians, field, carried, left["moments"])
 
     def close(self) -> None:
         """Let go of the stage's images, those that the next stage needs excepted."""
@@ -321,7 +327,13 @@ class ActiveStage:
             f"finished levels ({finished}) are kept, --resume continues after them [{str(error).splitlines()[0]}]"
         )
 
-    def _finish(self, gaussians: Any, field: GaussianField) -> Finished:
+    def _finish(
+        self,
+        gaussians: Any,
+        field: GaussianField,
+        carried: Mapping[str, Any],
+        moments: Mapping[str, dict[str, Tensor]],
+    ) -> Finished:
         predictions = None
         if self.stage.level > 0:
             with self.timed("cache"):
@@ -329,7 +341,7 @@ class ActiveStage:
         elif self._loaded.test:
             with self.timed("evaluation"):
                 self._report_held_out(gaussians)
-        return Finished(field, predictions, self._adapter.carried_over(gaussians), self._moments(gaussians))
+        return Finished(field, predictions, carried, moments)
 
     @torch.no_grad()
     def _predict(self, gaussians: Any) -> ImageStore:

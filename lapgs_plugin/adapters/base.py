@@ -258,7 +258,7 @@ class BackboneAdapter(ABC):
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
-        """What the next stage's model takes over besides its Gaussians."""
+        """Parameters that the next stage's model takes over besides its Gaussians."""
         return {}
 
     def optimizers(self, gaussians: Any) -> list[torch.optim.Optimizer]:
