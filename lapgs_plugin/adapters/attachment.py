@@ -56,13 +56,16 @@ class Attachment:
     def __enter__(self) -> Attachment:
         for replacement in self._replacements:
             _verify(replacement)
+        logged: set[str] = set()  # a symbol may be replaced by the driver and, around that, by an adapter
         try:
             for replacement in self._replacements:
                 # The class's own entry, not what attribute access makes of it: only that restores by identity.
                 original = vars(replacement.owner)[replacement.name]
                 self._originals.append(original)
                 setattr(replacement.owner, replacement.name, replacement.make(original))
-                logger.info("replaced %s, which %s uses", replacement.label, replacement.consumed_by)
+                if replacement.label not in logged:
+                    logger.info("replaced %s; used by %s", replacement.label, replacement.consumed_by)
+                    logged.add(replacement.label)
         except BaseException:
             self._restore()
             raise

@@ -86,7 +86,7 @@ def arguments(stub: Stub, scene: Path, folder: Path, more: Sequence[Any] = ()) -
 
 
 @contextmanager
-def _without_leftovers() -> Iterator[None]:
+def forgetting_stubs() -> Iterator[None]:
     """Forget modules that the stubs share: other checkouts have modules of the same names."""
     try:
         yield
@@ -112,7 +112,7 @@ def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
     sys.argv = [str(stub.script), *arguments(stub, scene, folder, more)]
     sys.path.insert(0, str(stub.script.parent))
     try:
-        with _without_leftovers(), captured(folder, results), cuda_on_cpu(stub.stand_in):
+        with forgetting_stubs(), captured(folder, results), cuda_on_cpu(stub.stand_in):
             runpy.run_path(str(stub.script), run_name="__main__")
     finally:
         sys.argv, sys.path[:] = before[:2]
@@ -134,7 +134,7 @@ def loaded(
     """
     script = stub.script if script is None else script
     with (
-        _without_leftovers(),
+        forgetting_stubs(),
         cuda_on_cpu(stub.stand_in if stand_in is None else stand_in),
         loaded_script(script, arguments(stub, scene, folder, more)) as definitions,
     ):

@@ -1,0 +1,135 @@
+"""`lapgs run --off` is the bare run to the bit, and so is one level of the plain backbone; nothing stays replaced."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lapgs_plugin.adapters.script import loaded_script
+from lapgs_plugin.cli.run import run
+from lapgs_plugin.hooks import StageContext, StageHook
+from tests.contract.stub_runs import (
+    NAMES,
+    SCHEDULE,
+    STUBS,
+    Result,
+    arguments,
+    captured,
+    drive,
+    forgetting_stubs,
+    loaded,
+    run_bare,
+    run_hierarchy,
+)
+
+SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Contents by name below the folder, which is not named in them."""
+    found = sorted(path for path in folder.rglob("*") if path.is_file())
+    name = str(folder).encode()
+    return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
+
+
+def run_off(name: str, scene: Path, folder: Path, *more: Any) -> Result:
+    results: list[Result] = []
+    stub = STUBS[name]
+    with forgetting_stubs(), captured(folder, results):
+        run(stub.script, arguments(stub, scene, folder, more), off=True, device="cpu")
+    return results[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_off_equals_the_bare_run_to_the_bit(name: str, scene: Path, tmp_path: Path) -> None:
+    bare = run_bare(STUBS[name], scene, tmp_path / "bare", *SAVING)
+    after_bare = torch.rand(1), sys.stdout, sys.argv
+    off = run_off(name, scene, tmp_path / "off", *SAVING)
+    assert (torch.rand(1), sys.stdout, sys.argv) == after_bare, "random state and process state as after the bare run"
+    assert [line.replace(str(off.folder), "OUT") for line in off.lines] == [
+        line.replace(str(bare.folder), "OUT") for line in bare.lines
+    ]
+    assert off.losses == bare.losses
+    assert files(tmp_path / "off") == files(tmp_path / "bare")
+    assert f"point_cloud/iteration_{SCHEDULE[2]}/point_cloud.ply" in files(tmp_path / "off")
+
+
+@pytest.mark.parametrize("name", ["taming", "graphdeco"])
+def test_one_level_is_the_backbone_alone(name: str, scene: Path, tmp_path: Path) -> None:
+    """FastGS's hard-coded iterations are rescaled, so its one level is not its bare run."""
+    bare = run_bare(STUBS[name], scene, tmp_path / "bare", *SAVING, "--densify_from_iter", 10)
+    _, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", *SAVING, "--densify_from_iter", 10, levels=1)
+    assert result.losses == bare.losses
+    for iteration in (40, 90):
+        ply = Path("point_cloud", f"iteration_{iteration}", "point_cloud.ply")
+        assert (tmp_path / "run" / "level_0" / ply).read_bytes() == (tmp_path / "bare" / ply).read_bytes()
+
+
+def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
+    """Everything that a replacement could have touched: modules of the checkout and the classes in them."""
+    modules = {"__main__": adapter.train}
+    modules |= {
+        name: module
+        for name, module in sys.modules.items()
+        if str(getattr(module, "__file__", None) or "").startswith(str(adapter.script.checkout))
+    }
+    found = {}
+    for name, module in modules.items():
+        for key, value in vars(module).items():
+            found[name, key] = value
+            if isinstance(value, type) and value.__module__ in modules:
+                found |= {(f"{name}.{key}", entry): part for entry, part in vars(value).items()}
+    return found
+
+
+class Failing(StageHook):
+    """Breaks in the second stage."""
+
+    def on_densify(self, context: StageContext) -> None:
+        if context.stage.signed:
+            raise RuntimeError("from inside")
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["whole", "broken"])
+@pytest.mark.parametrize("name", NAMES)
+def test_symbols_are_restored_by_identity(name: str, fails: bool, scene: Path, tmp_path: Path) -> None:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+        before = symbols(adapter)
+        assert ("gaussian_renderer", "GaussianRasterizer") in before
+        assert ("__main__.GaussianModel", "update_learning_rate") in before
+        if fails:
+            with pytest.raises(RuntimeError, match="from inside"):
+                drive(adapter, hooks=(Failing(),))
+        else:
+            drive(adapter)
+        after = symbols(adapter)
+    assert [key for key, value in before.items() if after.get(key) is not value] == []
+
+
+def test_process_state_is_that_of_before(scene: Path, tmp_path: Path) -> None:
+    argv, path, stdout, main, modules = sys.argv, sys.path[:], sys.stdout, sys.modules["__main__"], set(sys.modules)
+    with captured(tmp_path, []), loaded(STUBS["fastgs"], scene, tmp_path / "run") as adapter:
+        assert sys.argv[0].endswith("train.py")
+        assert sys.path[0] == str(adapter.script.checkout)
+        assert sys.modules["__main__"] is adapter.train
+        assert sys.modules["scene"].__file__ == str(adapter.script.checkout / "scene" / "__init__.py")
+    assert sys.argv is argv
+    assert sys.path == path
+    assert sys.stdout is stdout
+    assert sys.modules["__main__"] is main
+    assert not {"scene", "arguments", "gaussian_renderer", "utils"} & (set(sys.modules) - modules)
+
+
+def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
+    """Exit codes and exceptions come out as they are."""
+    for statement, raised in (("sys.exit(3)", SystemExit), ("1 / 0", ZeroDivisionError)):
+        script = tmp_path / "train.py"
+        script.write_text(f'import sys\nif __name__ == "__main__":\n    {statement}\n')
+        with loaded_script(script, []) as definitions, pytest.raises(raised) as caught:
+            definitions.run_main()
+        assert caught.traceback[-1].path == script
+        assert caught.traceback[-1].lineno == 2
