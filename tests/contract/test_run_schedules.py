@@ -1,0 +1,186 @@
+"""What a stage's training is told, and what it does: schedules of the whole run, scaled or mapped to stages."""
+
+from __future__ import annotations
+
+import sys
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import Stage
+from tests.contract.stub_runs import NAMES, STUBS, captured, drive, loaded, run_hierarchy
+
+TOTAL = 30_000
+BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0)
+FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0)
+
+
+def published_call(name: str, adapter: Any, **changes: Any) -> TrainingCall:
+    """The call that a checkout's main block makes with its defaults, parsed by its own parser."""
+    arguments = sys.modules["arguments"]
+    parser = ArgumentParser()
+    groups = [kind(parser) for kind in (arguments.ModelParams, arguments.OptimizationParams, arguments.PipelineParams)]
+    dataset, opt, pipe = (group.extract(parser.parse_args([])) for group in groups)
+    values: dict[str, Any] = {
+        "dataset": dataset,
+        "opt": opt,
+        "pipe": pipe,
+        "testing_iterations": [7_000, 30_000],
+        "saving_iterations": [7_000, 15_000, 30_000, 30_000],
+        "checkpoint_iterations": [10_000, 10_001],
+        "checkpoint": None,
+        "debug_from": -1,
+    }
+    if name != "graphdeco":
+        values["websockets"] = False
+    if name == "taming":
+        defaults = {"budget": 20.0, "mode": "multiplier", "ho_iteration": 15_000, "benchmark_dir": None}
+        values |= {"score_coefficients": {}, "args": Namespace(**defaults)}
+    return TrainingCall.bind(adapter.train.training, (), {**values, **changes})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_schedules_are_scaled_to_the_stage(name: str, scene: Path, tmp_path: Path) -> None:
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        adapter.first_points(1_000)
+        call = published_call(name, adapter)
+        base, finest = (adapter.stage_call(call, window, f"run/{window.stage.level}") for window in (BASE, FINEST))
+        assert (call.opt.iterations, call.dataset.model_path) == (TOTAL, ""), "the script's own call is left alone"
+    assert (base.opt.iterations, finest.opt.iterations) == (10_000, 20_000)
+    assert (base.opt.densify_until_iter, finest.opt.densify_until_iter) == (5_000, 10_000)
+    assert (base.opt.position_lr_max_steps, finest.opt.position_lr_max_steps) == (10_000, 20_000)
+    assert (base.dataset.model_path, finest.dataset.model_path) == ("run/1", "run/0")
+    for stage in (base, finest):
+        opt = stage.opt
+        kept = (opt.densify_from_iter, opt.densification_interval, opt.opacity_reset_interval)
+        assert kept == (500, 100, 3_000)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_iterations_of_the_whole_run_fall_into_stages(name: str, scene: Path, tmp_path: Path) -> None:
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        adapter.first_points(1_000)
+        call = published_call(name, adapter, debug_from=12_000)
+        base, finest = (adapter.stage_call(call, window, "run").values for window in (BASE, FINEST))
+    assert (base["testing_iterations"], finest["testing_iterations"]) == ([7_000], [20_000])
+    assert (base["saving_iterations"], finest["saving_iterations"]) == ([7_000], [5_000, 20_000, 20_000])
+    assert (base["checkpoint_iterations"], finest["checkpoint_iterations"]) == ([10_000], [1])
+    assert not 0 <= base["debug_from"] < 10_000
+    assert finest["debug_from"] == 2_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_only_residuals_lose_the_background_and_learn_colour_faster(name: str, scene: Path, tmp_path: Path) -> None:
+    rates = {"fastgs": ("lowfeature_lr", "highfeature_lr"), "taming": ("feature_lr", "shfeature_lr")}
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        adapter.first_points(1_000)
+        call = published_call(name, adapter)
+        call.dataset.white_background = call.pipe.convert_SHs_python = True
+        base, finest = (adapter.stage_call(call, window, "run") for window in (BASE, FINEST))
+    assert (base.dataset.white_background, base.pipe.convert_SHs_python) == (True, True)
+    assert (finest.dataset.white_background, finest.pipe.convert_SHs_python) == (False, False)
+    for rate in rates.get(name, ("feature_lr",)):
+        assert getattr(base.opt, rate) == getattr(call.opt, rate)
+        assert getattr(finest.opt, rate) == 4 * getattr(call.opt, rate)
+    assert finest.opt.opacity_lr == call.opt.opacity_lr
+
+
+@pytest.mark.parametrize(("mode", "budget"), [("multiplier", 20), ("final_count", 20_000)])
+def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene: Path, tmp_path: Path) -> None:
+    with loaded(STUBS["taming"], scene, tmp_path) as adapter:
+        adapter.first_points(1_000)
+        args = Namespace(budget=budget, mode=mode, ho_iteration=15_000, benchmark_dir=None)
+        call = published_call("taming", adapter, args=args)
+        stages = [adapter.stage_call(call, window, "run") for window in (BASE, FINEST)]
+        count_array = sys.modules["utils.taming_utils"].get_count_array
+        found = []
+        for start, stage in zip((1_000, 8_000), stages, strict=True):
+            given = stage.values["args"]
+            counts = count_array(start, given.budget, stage.opt, mode=given.mode)
+            # Densification number i looks up entry i + 1.
+            times = range(stage.opt.densify_from_iter + 1, stage.opt.densify_until_iter)
+            densifications = sum(i % stage.opt.densification_interval == 0 for i in times)
+            assert densifications < len(counts)
+            assert sorted(counts) == counts
+            found.append((given.budget, counts[-1] > 0.95 * given.budget, given.ho_iteration))
+    assert found == [(8_000, True, 5_000), (12_000, True, 10_000)]
+
+
+def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
+    """Bare, a start between two intervals makes the last densification look beyond the table."""
+    schedule = ("--densify_from_iter", 7, "--densification_interval", 5, "--densify_until_iter", 60)
+    archive, _ = run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *schedule)
+    assert archive.manifest.complete
+
+
+def test_taming_releases_opacities_at_the_share_of_each_stage(scene: Path, tmp_path: Path) -> None:
+    released: list[int] = []
+    now = [0]
+    with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", "--ho_iteration", 45) as adapter:
+        model = adapter.train.GaussianModel
+        update, modify = model.update_learning_rate, model.modify_functions
+
+        def spy_update(self: Any, iteration: int) -> Any:
+            now[0] = iteration
+            return update(self, iteration)
+
+        def spy_modify(self: Any) -> None:
+            released.append(now[0])
+            modify(self)
+
+        model.update_learning_rate, model.modify_functions = spy_update, spy_modify
+        drive(adapter)
+    assert released == [15, 30]
+
+
+def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict[str, list[tuple[int, int]]]:
+    """(stage by its iterations, iteration) of what FastGS's model is asked to do."""
+    found: dict[str, list[tuple[int, int]]] = {"prune": [], "step": [], "sh_step": []}
+    with captured(folder, []), loaded(STUBS["fastgs"], scene, folder, *more) as adapter:
+        model = adapter.train.GaussianModel
+        setup, prune = model.training_setup, model.final_prune_fastgs
+        now = [0, 0]
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            setup(self, training_args)
+            now[:] = [training_args.iterations, 0]
+            for name, optimizer in (("step", self.optimizer), ("sh_step", self.shoptimizer)):
+                optimizer.register_step_post_hook(lambda *_, name=name: found[name].append((now[0], now[1])))
+
+        def update_learning_rate(self: Any, iteration: int, update: Any = model.update_learning_rate) -> Any:
+            now[1] = iteration
+            return update(self, iteration)
+
+        def final_prune_fastgs(self: Any, min_opacity: float, pruning_score: Any = None) -> None:
+            # Called before the iteration after it.
+            found["prune"].append((now[0], now[1]))
+            assert min_opacity == 0.1
+            prune(self, min_opacity, pruning_score)
+
+        model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
+        model.final_prune_fastgs = final_prune_fastgs
+        drive(adapter, **options)
+    return found
+
+
+def test_fastgs_prunes_late_and_steps_by_the_share_of_each_stage(scene: Path, tmp_path: Path) -> None:
+    """Published for 30,000 iterations: pruning at 18,000, 21,000, 24,000 and 27,000; all steps until 15,000, then every
+    32nd until 20,000, then every 64th; higher SH every 16th at first."""
+    more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0, "-r", 2)
+    found = record_fastgs(scene, tmp_path / "run", *more, levels=1)
+    assert found["prune"] == [(600, i) for i in (360, 420, 480, 540)]
+    steps = [i for _, i in found["step"]]
+    assert steps[:300] == list(range(1, 301))
+    assert steps[300:] == [320, 352, 384, 448, 512, 576]
+    assert sum(i <= 300 for _, i in found["sh_step"]) == 300 // 16
+    assert [i for _, i in found["sh_step"] if i > 300] == steps[300:]
+
+
+def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:
+    more = ("--densify_from_iter", 50, "--densification_interval", 5)
+    with pytest.raises(UserInputError, match="level 1 would stop densifying at iteration 20 and start after 50"):
+        run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *more)
