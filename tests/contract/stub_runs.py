@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import runpy
 import sys
@@ -20,6 +21,8 @@ from lapgs_plugin.adapters.known import adapter_class
 from lapgs_plugin.adapters.script import loaded_script
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.hooks import StageHook
+from lapgs_plugin.plan import Stage
+from lapgs_plugin.rendering.run import run_renderer, run_scene
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
 
@@ -159,3 +162,25 @@ def run_hierarchy(
     with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
         drive(adapter, hooks=hooks, resume=resume, **options)
     return RunArchive.open(folder), results[0]
+
+
+class StopAt(StageHook):
+    """Ctrl-C when a stage begins."""
+
+    def __init__(self, level: int) -> None:
+        self.level = level
+
+    def on_stage_start(self, stage: Stage) -> None:
+        if stage.level == self.level:
+            raise KeyboardInterrupt
+
+
+def composed_psnr(archive: RunArchive) -> float:
+    """Of the held-out views, rendered from the archive by code that knows no checkout; averaged as the checkouts do,
+    over views and channels."""
+    renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
+    values = []
+    for view in run_scene(archive).test:
+        image = renderer.render(view.camera).composed[0].clamp(0, 1)
+        values += [-10 * math.log10(float(error)) for error in ((image - view.image) ** 2).mean((1, 2))]
+    return sum(values) / len(values)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +15,21 @@ from torch import Tensor
 from lapgs_plugin.archive import CACHE, RunArchive
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.scenes import load_scene
-from tests.contract.stub_runs import ITERATIONS, NAMES, STUBS, Result, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import (
+    ITERATIONS,
+    NAMES,
+    STUBS,
+    Result,
+    StopAt,
+    captured,
+    composed_psnr,
+    drive,
+    loaded,
+    run_hierarchy,
+)
 
 Run = tuple[RunArchive, Result]
 
@@ -73,13 +82,7 @@ def test_the_archive_renders_what_the_checkout_reported(name: str, run_of: Calla
     """The checkout's own report of held-out views, and a rendering of the PLYs by code that knows no checkout."""
     archive, result = run_of(name)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
-    renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
-    values = []
-    for view in run_scene(archive).test:
-        image = renderer.render(view.camera).composed[0].clamp(0, 1)
-        # As the checkouts average: over channels.
-        values += [-10 * math.log10(float(error)) for error in ((image - view.image) ** 2).mean((1, 2))]
-    assert sum(values) / len(values) == pytest.approx(reported, abs=0.01)  # 0.001 seen: predictions are float16
+    assert composed_psnr(archive) == pytest.approx(reported, abs=0.01)  # 0.001 seen: predictions are float16
 
 
 class Recorder(StageHook):
@@ -235,17 +238,6 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
         assert not started["_features_dc"].any(), "no colour: an empty residual"
     if inherit == "xyz":
         assert torch.sigmoid(started["_opacity"]).allclose(torch.tensor(0.1))
-
-
-class StopAt(StageHook):
-    """Ctrl-C when a stage begins."""
-
-    def __init__(self, level: int) -> None:
-        self.level = level
-
-    def on_stage_start(self, stage: Stage) -> None:
-        if stage.level == self.level:
-            raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("name", NAMES)

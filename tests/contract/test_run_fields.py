@@ -1,0 +1,120 @@
+"""Fields in and out of the checkouts' models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.field import GaussianField
+from tests.contract.stub_runs import NAMES, STUBS, loaded, run_hierarchy
+
+PARTS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def some_field(count: int = 50, degree: int = 3, signed: bool = True) -> GaussianField:
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator)
+
+    sh = normal(count, (degree + 1) ** 2, 3)
+    return GaussianField(normal(count, 3), normal(count, 4), normal(count, 3), 3 * normal(count), sh, signed)
+
+
+def model_of(adapter: Any, degree: int = 3) -> Any:
+    return adapter.train.GaussianModel(degree)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_field_comes_out_as_it_went_in(name: str, degree: int, scene: Path, tmp_path: Path) -> None:
+    field = some_field(degree=degree)
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        model = model_of(adapter, degree)
+        adapter.import_field(model, field)
+        out = adapter.export_field(model, signed=True)
+        # In the layout of the checkout's own parameters.
+        shapes = [tuple(getattr(model, part).shape) for part in ("_opacity", "_features_dc", "_features_rest")]
+        assert shapes == [(50, 1), (50, 1, 3), (50, (degree + 1) ** 2 - 1, 3)]
+        assert model._xyz.requires_grad
+    assert out.signed
+    for part in PARTS:
+        assert torch.equal(getattr(out, part), getattr(field, part)), part
+        assert getattr(out, part).data_ptr() != getattr(field, part).data_ptr(), "no shared memory"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_checkouts_ply_is_the_exported_field(name: str, scene: Path, tmp_path: Path) -> None:
+    """Both through files: the checkout writes what we read, and what it exports is what we write."""
+    field = some_field()
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        model = model_of(adapter)
+        adapter.import_field(model, field)
+        model.save_ply(str(tmp_path / "theirs" / "point_cloud.ply"))
+        adapter.export_field(model, signed=False).save_ply(tmp_path / "ours.ply")
+    theirs, ours = (GaussianField.load_ply(tmp_path / path) for path in ("theirs/point_cloud.ply", "ours.ply"))
+    for part in PARTS:
+        assert torch.equal(getattr(theirs, part), getattr(ours, part)), part
+
+
+def test_released_opacities_are_archived_as_logits(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Taming-3DGS: absolute values, which may exceed 1."""
+    with loaded(STUBS["taming"], scene, tmp_path) as adapter, torch.no_grad():
+        model = model_of(adapter)
+        adapter.import_field(model, some_field())
+        before = model.get_opacity.clone()
+        model.modify_functions()
+        assert torch.equal(model.get_opacity, before)
+        model._opacity[0], model._opacity[1] = -0.25, 1.5
+        out = adapter.export_field(model, signed=True)
+    opacities = torch.sigmoid(out.opacity_logits)
+    assert torch.allclose(opacities[2:], before[2:, 0], atol=1e-6)
+    assert opacities[0] == pytest.approx(0.25)
+    assert opacities[1] == pytest.approx(1.0, abs=1e-5)
+    assert "1 of 50 Gaussians have opacities above 1" in caplog.text
+
+
+def test_a_run_with_released_opacities_is_archived(scene: Path, tmp_path: Path) -> None:
+    """Released at a third of each stage, while densification still goes on, and at two thirds, after it."""
+    for ho_iteration in (30, 60):
+        folder = tmp_path / str(ho_iteration)
+        archive, result = run_hierarchy(STUBS["taming"], scene, folder, "--ho_iteration", ho_iteration)
+        assert result.output.count("Release opacity limit") == 2
+        for level in (1, 0):
+            archive.field(level).require_finite()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp_path: Path) -> None:
+    moments: list[dict[str, Tensor]] = []
+    with loaded(STUBS[name], scene, tmp_path / "run", "--quiet") as adapter:
+        from tests.contract.stub_runs import drive
+
+        model = adapter.train.GaussianModel
+        # Every model begins an iteration here: the last state of the base, and the first one of the residual.
+        update = model.update_learning_rate
+
+        def spy(self: Any, iteration: int) -> Any:
+            if iteration in (1, 30):
+                state = self.optimizer.state
+                moments.append({g["name"]: state[p]["exp_avg"].clone() for g, p in parameters(self) if p in state})
+            return update(self, iteration)
+
+        model.update_learning_rate = spy
+        drive(adapter, inherit="full")
+    none, base, residual, *_ = moments
+    assert none == {}
+    assert residual.keys() == base.keys() >= {"xyz", "f_dc", "opacity", "scaling", "rotation"}
+    for group in base:
+        # The last iteration of a stage takes no step, and here it does not densify either.
+        assert torch.equal(base[group], residual[group]), group
+
+
+def parameters(model: Any) -> list[tuple[dict[str, Any], Tensor]]:
+    return [(group, group["params"][0]) for group in model.optimizer.param_groups]

@@ -1,0 +1,245 @@
+"""Backgrounds, transparent images, depths, exposures, and the other options that act on a hierarchy."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.signed_color import signed_degree
+from tests.contract.stub_runs import (
+    ITERATIONS,
+    NAMES,
+    STUBS,
+    StopAt,
+    Stub,
+    captured,
+    composed_psnr,
+    drive,
+    loaded,
+    run_hierarchy,
+)
+
+SHORT = ("--iterations", 30)
+WHITE = ("--white_background", "--densify_from_iter", 0)
+"""Over white, the checkouts reset opacities at the first iteration that densifies. So few iterations as here do not bring
+them back before FastGS prunes what is faint, so there is none."""
+
+
+@pytest.fixture(scope="module")
+def blender(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample scene as NeRF's Blender scenes are: transforms, RGBA without a background, train and test folders."""
+    path = tmp_path_factory.mktemp("blender")
+    source = load_scene(scene, eval=True, progress=False)
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    for part, views in (("train", source.train), ("test", source.test)):
+        (path / part).mkdir()
+        frames = []
+        for index, view in enumerate(views):
+            pixels = (view.image.permute(1, 2, 0) * 255).round().byte().numpy()
+            alpha = np.full((*pixels.shape[:2], 1), 255, np.uint8)
+            alpha[:16] = 0
+            Image.fromarray(np.concatenate([pixels, alpha], axis=2)).save(path / part / f"r_{index}.png")
+            pose = torch.linalg.inv(view.camera.world_to_camera) @ flip
+            frames.append({"file_path": f"./{part}/r_{index}", "transform_matrix": pose.tolist()})
+        angle = 2 * float(np.arctan(source.train[0].camera.tan_half_fov[0]))
+        text = json.dumps({"camera_angle_x": angle, "frames": frames})
+        (path / f"transforms_{part}.json").write_text(text, encoding="utf-8")
+    names = ("x", "y", "z", "red", "green", "blue")
+    vertices = np.zeros(len(source.points), dtype=[(name, "u1" if len(name) > 1 else "f4") for name in names])
+    for name, column in zip(names, torch.cat([source.points, source.colors * 255], dim=1).T, strict=True):
+        vertices[name] = column
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path / "points3d.ply"))
+    return path
+
+
+def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any) -> list[Any]:
+    """The settings of every call of the checkout's rasterizer in a run."""
+    found = []
+    with captured(folder, []), loaded(stub, scene, folder, *more) as adapter:
+        renderer = sys.modules["gaussian_renderer"]
+        original = renderer.GaussianRasterizer
+
+        def spy(raster_settings: Any) -> Any:
+            found.append(raster_settings)
+            return original(raster_settings=raster_settings)
+
+        renderer.GaussianRasterizer = spy
+        drive(adapter, **options)
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, tmp_path: Path) -> None:
+    by_size: dict[int, set[tuple[float, ...]]] = {}
+    degrees: dict[int, set[int]] = {}
+    for settings in rasterized(STUBS[name], scene, tmp_path / "run", *WHITE):
+        by_size.setdefault(settings.image_width, set()).add(tuple(settings.bg.tolist()))
+        degrees.setdefault(settings.image_width, set()).add(settings.sh_degree)
+    assert by_size == {32: {(1.0, 1.0, 1.0)}, 64: {(0.0, 0.0, 0.0)}}
+    assert degrees == {32: {0}, 64: {signed_degree(0)}}
+
+
+@pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
+def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_path: Path) -> None:
+    """Blender images are blended over the background by the checkout, and by us when the run is rendered again."""
+    more = ("--test_iterations", ITERATIONS, *["--white_background"] * white)
+    archive, result = run_hierarchy(STUBS["taming"], blender, tmp_path / "run", *more)
+    assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
+    (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
+    assert composed_psnr(archive) == pytest.approx(reported, abs=0.05)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_transparent_images_train(name: str, blender: Path, tmp_path: Path) -> None:
+    """graphdeco masks its renders by alpha at each level's size; the others see the background in the photo."""
+    compared: list[tuple[Tensor, Tensor]] = []
+    with captured(tmp_path, []), loaded(STUBS[name], blender, tmp_path / "run", *WHITE) as adapter:
+        original = adapter.train.l1_loss
+
+        def spy(image: Tensor, photo: Tensor) -> Tensor:
+            compared.append((image.detach().clone(), photo.clone()))
+            return original(image, photo)
+
+        adapter.train.l1_loss = spy
+        drive(adapter)
+    assert RunArchive.open(tmp_path / "run").manifest.complete
+    for image, photo in compared:
+        clear = photo.shape[1] // 3 - 2  # the rows of the pyramid's blur left out
+        if name == "graphdeco":
+            assert not image[:, :clear].any()
+        else:
+            assert (photo[:, :clear] - 1).abs().max() < 1e-3
+
+
+@pytest.fixture(scope="module")
+def deep(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample scene with inverse depths; one photo's scale is not to be believed."""
+    path = tmp_path_factory.mktemp("deep") / "scene"
+    shutil.copytree(scene, path)
+    (path / "depths").mkdir()
+    params = {}
+    for index, photo in enumerate(sorted((path / "images").iterdir())):
+        stored = np.full((48, 64), 2**14, np.uint16)
+        cv2.imwrite(str(path / "depths" / f"{photo.stem}.png"), stored)
+        params[photo.stem] = {"scale": 100.0 if index == 1 else 1.0, "offset": 0.0}
+    (path / "sparse" / "0" / "depth_params.json").write_text(json.dumps(params), encoding="utf-8")
+    return path
+
+
+def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
+    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
+    shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
+    used = [value > 0 for value in shown]
+    assert used[0]
+    assert not used[-1]
+    assert used == sorted(used, reverse=True), "first the base with depths, then the residual without"
+
+
+def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> None:
+    """What the base saves at its last iteration is what the residual saves at its first one, before it steps."""
+    more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30)
+    base = json.loads(archive.path("level_1", "exposure.json").read_text())
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "again", *more, 31) as adapter:
+        at_first: dict[str, Any] = {}
+        save = adapter.train.Scene.save
+
+        def spy(self: Any, iteration: int) -> None:
+            save(self, iteration)
+            if iteration == 1:
+                at_first.update(json.loads(Path(self.model_path, "exposure.json").read_text()))
+
+        adapter.train.Scene.save = spy
+        drive(adapter)
+    assert at_first == base
+    assert np.abs(np.array(list(base.values())) - np.eye(3, 4)).max() > 0.01, "they were trained"
+
+
+def test_exposures_survive_a_stop(scene: Path, tmp_path: Path) -> None:
+    more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations", 30)
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *more, hooks=(StopAt(0),))
+    base = json.loads((folder / "level_1" / "exposure.json").read_text())
+    started: list[Tensor] = []
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, folder, *more) as adapter:
+        setup = adapter.train.GaussianModel.training_setup
+
+        def spy(self: Any, training_args: Any) -> None:
+            started.append(self._exposure.detach().clone())
+            setup(self, training_args)
+
+        adapter.train.GaussianModel.training_setup = spy
+        drive(adapter, resume=True)
+    assert torch.allclose(started[0], torch.tensor(list(base.values())), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["taming", "graphdeco"])
+def test_sparse_adam_trains_a_hierarchy(name: str, scene: Path, tmp_path: Path) -> None:
+    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
+    assert archive.manifest.complete
+    assert all(0 < loss < 1 for loss in result.losses)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_where_images_lie_changes_nothing(name: str, scene: Path, tmp_path: Path) -> None:
+    """On a GPU or not, in memory or on the disk, and wherever the checkout was told to keep its images."""
+    (_, memory), (_, disk), (_, told) = (
+        run_hierarchy(STUBS[name], scene, tmp_path / how, *more, images_on=where)
+        for how, where, more in (
+            ("memory", "memory", ()),
+            ("disk", "disk", ()),
+            ("told", "auto", ("--data_device", "cpu")),
+        )
+    )
+    assert memory.losses == disk.losses == told.losses
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_colours_evaluated_by_the_checkout_train_the_same(name: str, scene: Path, tmp_path: Path) -> None:
+    """--convert_SHs_python holds for the base; a residual has signed colours, which that code does not know."""
+    (_, raster), (_, python) = (
+        run_hierarchy(STUBS[name], scene, tmp_path / str(len(more)), *SHORT, *more)
+        for more in ((), ("--convert_SHs_python",))
+    )
+    assert python.losses == pytest.approx(raster.losses, abs=1e-4)
+
+
+def test_widths_are_those_of_the_checkouts(scene: Path, tmp_path: Path) -> None:
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, "-r", 50)
+    assert [record.image_size for record in archive.manifest.records] == [(25, 19), (50, 37)]
+    assert archive.manifest.scene.resolution == "3dgs:50"
+
+
+def test_a_viewer_sees_a_residual_around_grey(scene: Path, tmp_path: Path) -> None:
+    sent: list[np.ndarray[Any, Any]] = []
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT) as adapter:
+        gui = sys.modules["gaussian_renderer.network_gui"]
+        camera = load_scene(scene, progress=False).train[0].camera
+        tan_x, tan_y = camera.tan_half_fov
+        pose = camera.world_to_camera.T.contiguous()
+        projection = torch.zeros(4, 4)
+        projection[0, 0], projection[1, 1], projection[2, 2], projection[3, 2] = 1 / tan_x, 1 / tan_y, 1.0, 1.0
+        fov_x, fov_y = 2 * float(np.arctan(tan_x)), 2 * float(np.arctan(tan_y))
+        viewer = sys.modules["scene.cameras"].MiniCam(20, 15, fov_y, fov_x, 0.01, 100, pose, pose @ projection.T)
+        gui.conn = "somebody"
+        gui.receive = lambda: (viewer, True, False, False, False, 1.0)
+        gui.send = lambda pixels, verify: sent.append(np.frombuffer(pixels, np.uint8).reshape(15, 20, 3))
+        drive(adapter)
+    assert len(sent) == 30
+    assert sent[0].std() > 10, "the base, as it is"
+    assert (sent[10] == 127).all(), "a residual that is still empty"
