@@ -186,17 +186,15 @@ class ImageStore:
         image = self._images[name]
         if self._at_hand(image):
             assert image.stored is not None
-            stored = image.stored
-        else:
-            self.announce(name)
-            arrival = self._coming.pop(name).result()
-            stored = arrival.stored
-            if arrival.event is not None:
-                torch.cuda.current_stream(self._device).wait_event(arrival.event)
-        if self._stream is not None:
+            return _decode(image.stored, image, dtype)
+        self.announce(name)
+        arrival = self._coming.pop(name).result()
+        if arrival.event is not None:
+            stream = torch.cuda.current_stream(self._device)
+            stream.wait_event(arrival.event)
             # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
-            stored.record_stream(torch.cuda.current_stream(self._device))
-        return _decode(stored, image, dtype)
+            arrival.stored.record_stream(stream)
+        return _decode(arrival.stored, image, dtype)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -226,6 +224,8 @@ class ImageStore:
     def close(self) -> None:
         """Forget everything and remove the files."""
         self._loaders.shutdown(wait=True, cancel_futures=True)
+        if self._where == "gpu":
+            torch.cuda.synchronize(self._device)  # any stream may still be reading what is given back now
         self._coming.clear()
         self._images.clear()
         if self._folder is not None and self._folder.is_dir():

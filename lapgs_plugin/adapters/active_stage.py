@@ -368,11 +368,11 @@ class ActiveStage:
 
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) I_hat^l of a view, before exposure and clamping."""
-        self._rendering.composed = frozenset(self._keys.values())
+        self._rendering.composed, self._rendering.capture = frozenset(self._keys.values()), True
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
         self._adapter.render(self._call, self._view(camera), gaussians, background)
-        assert self._rendering.last_image is not None
-        return self._rendering.last_image
+        assert self._rendering.captured is not None
+        return self._rendering.captured
 
     def _initialise(self, gaussians: Any) -> None:
         """Points for the base; for a residual the field of the level before."""

@@ -34,6 +34,7 @@ class StageRendering:
         targets: the level's images by key.
         composed: keys of the views that composition is done for.
         on_image: called with key and composed image when gradients are recorded; what it returns takes its place.
+        capture: keep what was composed last, before exposure or clamping, in `captured`.
     """
 
     signed: bool
@@ -43,7 +44,8 @@ class StageRendering:
     accumulated: ImageStore | None = None
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor], Tensor] | None = None
-    last_image: Tensor | None = field(default=None, repr=False)
+    capture: bool = False
+    captured: Tensor | None = field(default=None, repr=False)
 
     def key(self, settings: Any) -> str | None:
         return self.views.get(id(settings.viewmatrix))
@@ -121,7 +123,8 @@ class _ComposingRasterizer:
             inputs = _with_signed_colors(inputs, self._settings)
         image, *others = self._original(**inputs)
         image = stage.compose(stage.key(self._settings), image)
-        stage.last_image = image.detach()
+        if stage.capture:
+            stage.captured = image
         return (image, *others)
 
 
