@@ -35,8 +35,8 @@ from tests.contract.stub_runs import (
 
 SHORT = ("--iterations", 30)
 WHITE = ("--white_background", "--densify_from_iter", 0)
-"""Over white, the checkouts reset opacities at the first iteration that densifies. So few iterations as here do not bring
-them back before FastGS prunes what is faint, so there is none."""
+"""Over white, the checkouts reset opacities at the first iteration that densifies; never, if that is 0. In as few
+iterations as here they do not recover before FastGS prunes what is faint."""
 
 
 @pytest.fixture(scope="module")
