@@ -36,6 +36,7 @@ from lapgs_plugin.adapters.attachment import Attachment, Replacement
 from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
 from lapgs_plugin.adapters.extensions import CudaExtension
 from lapgs_plugin.adapters.hooking import HookCaller
+from lapgs_plugin.adapters.installed_rasterizer import require_matching_rasterizer
 from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.archive import CACHE, Manifest, RunArchive, SceneReference
@@ -95,6 +96,7 @@ class HierarchyDriver:
                     "choose another --backbone, or train with `lapgs run --off`"
                 )
         renderer, loader = sys.modules["gaussian_renderer"], sys.modules["utils.camera_utils"]
+        require_matching_rasterizer(renderer, self._adapter.info.rasterizer, self._adapter.info.title)
         whoever = "render(), and through it the training loop, score functions and reports"
         missing = [name for name in ("GaussianModel", "Scene") if not hasattr(train, name)]
         if missing:

@@ -119,6 +119,7 @@ def run(
     from lapgs_plugin.adapters.active_stage import HierarchyOptions
     from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
     from lapgs_plugin.adapters.driver import HierarchyDriver
+    from lapgs_plugin.adapters.installed_rasterizer import explained
     from lapgs_plugin.adapters.known import adapter_class
     from lapgs_plugin.adapters.script import loaded_script, require_script
     from lapgs_plugin.inheritance import parse_inheritance
@@ -150,8 +151,14 @@ def run(
     chosen = device if device != "auto" else "cuda" if available else "cpu"
     kind: type[BackboneAdapter] = adapter_class(require_script(script).parent, backbone)
     on_device = cuda_on_cpu(kind.info.stand_in) if chosen == "cpu" else nullcontext()
-    with on_device, loaded_script(script, arguments or []) as loaded:
-        if off:
-            loaded.run_main()
-            return
-        HierarchyDriver(kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite).run()
+    try:
+        with on_device, loaded_script(script, arguments or []) as loaded:
+            if off:
+                loaded.run_main()
+                return
+            HierarchyDriver(kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite).run()
+    except ImportError as error:
+        line = None if off else explained(error, str(script))
+        if line is None:
+            raise
+        raise line from error

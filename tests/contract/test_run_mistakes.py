@@ -1,0 +1,305 @@
+"""What a person can get wrong with `lapgs run`: one line each, before training starts, and nothing written over."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+from lapgs_plugin.adapters.installed_rasterizer import explained
+from lapgs_plugin.adapters.known import adapter_class
+from lapgs_plugin.adapters.script import loaded_script, require_script
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.hooks import StageHook
+from lapgs_plugin.plan import Stage
+from tests.contract.stub_runs import (
+    CHECKOUTS,
+    NAMES,
+    STUBS,
+    StopAt,
+    Stub,
+    arguments,
+    captured,
+    drive,
+    loaded,
+    run_bare,
+    run_hierarchy,
+)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The stub checkouts, to be changed."""
+    return Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def one_line(error: LapgsError) -> str:
+    text = str(error)
+    assert "\n" not in text
+    return text
+
+
+def nothing_written(folder: Path) -> bool:
+    return not folder.exists() or not any(folder.iterdir())
+
+
+CHANGES: dict[str, tuple[str, str, str, str]] = {
+    "missing method": ("scene/gaussian_model.py", "def training_setup", "def setup_training", "training_setup"),
+    "other parameters": (
+        "scene/gaussian_model.py",
+        "def update_learning_rate(self, iteration)",
+        "def update_learning_rate(self, step)",
+        "update_learning_rate takes (self, step), expected it to begin with (self, iteration)",
+    ),
+    "other training": (
+        "train.py",
+        "    dataset, opt, pipe, testing_iterations",
+        "    scene_args, opt, pipe, testing_iterations",
+        "training takes (scene_args, opt",
+    ),
+    "no rasterizer in its renderer": (
+        "gaussian_renderer/__init__.py",
+        "import GaussianRasterizationSettings, GaussianRasterizer",
+        "import GaussianRasterizationSettings, GaussianRasterizer as Rasterizer",
+        "gaussian_renderer.GaussianRasterizer is missing",
+    ),
+    "no density control": (
+        "scene/gaussian_model.py",
+        "def densify_and_prune",
+        "def grow",
+        "densify_and_prune is missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_changed_checkout_is_named_by_its_symbol(change: str, copy: Path, scene: Path, tmp_path: Path) -> None:
+    file, old, new, message = CHANGES[change]
+    edit(copy / "graphdeco" / file, old, new)
+    with (
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", script=copy / "graphdeco" / "train.py") as adapter,
+        pytest.raises(UserInputError) as caught,
+    ):
+        drive(adapter)
+    assert message in one_line(caught.value)
+    assert "lapgs run --off" in str(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+def test_folders_that_are_no_checkout(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="is not a file; expected the training script") as caught:
+        require_script(tmp_path / "train.py")
+    one_line(caught.value)
+    (tmp_path / "train.py").write_text("print('no main block')\n")
+    with pytest.raises(UserInputError, match="not the root of a checkout that `lapgs run` knows") as caught:
+        adapter_class(tmp_path)
+    one_line(caught.value)
+    with pytest.raises(UserInputError, match="no `if __name__ ==") as caught, loaded_script(tmp_path / "train.py", []):
+        pass
+    one_line(caught.value)
+    (tmp_path / "train.py").write_text("def (:\n")
+    with pytest.raises(UserInputError, match="not a Python script") as caught, loaded_script(tmp_path / "train.py", []):
+        pass
+    one_line(caught.value)
+    with pytest.raises(UserInputError, match="--backbone nerf: expected") as caught:
+        adapter_class(tmp_path, "nerf")
+    one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "stand_in", "message"),
+    [
+        ("graphdeco", "graphdeco", "not the one of graphdeco 3DGS: it takes no antialiasing, expected"),
+        ("graphdeco", "taming", "takes no antialiasing and wants pixel_weights, expected"),
+        ("taming", "graphdeco-aa", "not the one of Taming-3DGS: it takes no pixel_weights and wants antialiasing"),
+        ("taming", "taming-rasterizer", "takes no pixel_weights"),
+    ],
+)
+def test_the_wrong_rasterizer_is_said_before_training(
+    name: str, stand_in: str, message: str, scene: Path, tmp_path: Path
+) -> None:
+    """Several code bases call different rasterizers by one name."""
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS[name], scene, tmp_path / "run", stand_in=stand_in) as adapter,
+        pytest.raises(UserInputError, match="the installed diff_gaussian_rasterization is") as caught,
+    ):
+        drive(adapter)
+    assert message in one_line(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("absent", "purpose"),
+    [
+        ("diff_gaussian_rasterization_fastgs", "rasterizer of FastGS"),
+        ("simple_knn._C", "nearest neighbours"),
+        ("fused_ssim", "fast SSIM"),
+    ],
+)
+def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without stand-ins, where the extension is not installed or was built for another PyTorch."""
+    monkeypatch.setitem(sys.modules, absent, None)  # which makes importing it fail
+    with pytest.raises(ImportError) as caught:
+        importlib.import_module(absent)
+    line = explained(caught.value, "train.py")
+    assert line is not None
+    for part in (f"train.py needs {absent.partition('.')[0]}", purpose, "--device cpu"):
+        assert part in one_line(line)
+    assert explained(ModuleNotFoundError("no", name="numpy"), "train.py") is None
+
+
+def test_sparse_adam_that_is_not_installed(scene: Path, tmp_path: Path) -> None:
+    stub = Stub("graphdeco", "graphdeco-aa", STUBS["graphdeco"].options)
+    with pytest.raises(UserInputError, match="has no SparseGaussianAdam") as caught:
+        run_hierarchy(stub, scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
+    one_line(caught.value)
+
+
+REFUSED: list[tuple[str, tuple[Any, ...], str]] = [
+    *((name, ("--start_checkpoint", "chkpnt.pth"), "a checkpoint holds one field, not a hierarchy") for name in NAMES),
+    *((name, ("--random_background",), "rendered over one background") for name in NAMES),
+    ("taming", ("--benchmark_dir", "times"), "would write every stage's timings over the last one's"),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "message"), REFUSED)
+def test_options_that_a_hierarchy_cannot_honour(
+    name: str, options: tuple[Any, ...], message: str, scene: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserInputError) as caught:
+        run_hierarchy(STUBS[name], scene, tmp_path / "run", *options)
+    assert message in one_line(caught.value)
+    assert str(options[0]) in str(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+def test_one_level_takes_a_random_background(scene: Path, tmp_path: Path) -> None:
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", "--random_background", levels=1)
+    assert archive.manifest.complete
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"levels": 3}, "level 2 of 3 would be 16x12 pixels"),
+        ({"split": "1/2,1/4,1/4"}, "--split has 3 shares, expected 2"),
+        ({"split": "1/2,1/3"}, "sum to 1"),
+        ({"inherit_ratio": 0.0}, "above 0 and at most 1"),
+    ],
+)
+def test_a_hierarchy_that_does_not_fit_the_scene(
+    options: dict[str, Any], message: str, scene: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserInputError) as caught:
+        run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", **options)
+    assert message in one_line(caught.value)
+
+
+def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    short = ("--iterations", 30)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *short)
+    before = {level: archive.field_path(level).read_bytes() for level in (1, 0)}
+    for name in ("graphdeco", "taming"):
+        with pytest.raises(RunFolderError, match=r"already holds a run; continue it with --resume or replace it"):
+            run_hierarchy(STUBS[name], scene, folder, *short)
+    with pytest.raises(RunFolderError, match="started with another"):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, grid="even")
+    assert {level: archive.field_path(level).read_bytes() for level in (1, 0)} == before
+
+
+def test_a_folder_of_the_backbone_itself_is_not_written_over(scene: Path, tmp_path: Path) -> None:
+    run_bare(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 2)
+    with pytest.raises(RunFolderError, match="is not empty and not a run"):
+        run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run")
+
+
+def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, hooks=(StopAt(0),))
+    for more, options in ((("--iterations", 120), {}), ((), {"inherit": "xyz"}), (("-r", 60), {})):
+        with pytest.raises(RunFolderError, match="started with another") as caught:
+            run_hierarchy(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
+        one_line(caught.value)
+
+
+class FillsTheGpu(StageHook):
+    def on_stage_start(self, stage: Stage) -> None:
+        if stage.signed:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nGPU 0 has ...")
+
+
+def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(UserInputError) as caught:
+        run_hierarchy(STUBS["graphdeco"], scene, folder, hooks=(FillsTheGpu(),))
+    message = one_line(caught.value)
+    for part in ("out of GPU memory at level 0", "finished levels (1) are kept", "--resume", "images", "2.00 GiB"):
+        assert part in message
+    assert RunArchive.open(folder).available_levels == (1,)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, resume=True)
+    assert archive.manifest.complete
+
+
+def lapgs_run(*words: Any, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "run", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+
+
+def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+    """From inside a checkout or anywhere else; mistakes are one line and exit code 2."""
+    stub = STUBS["graphdeco"]
+    words = arguments(stub, scene, tmp_path / "run", ("--iterations", 30))
+    done = lapgs_run("--device", "cpu", "train.py", *words, cwd=stub.script.parent)
+    assert done.returncode == 0, done.stderr
+    assert "Training complete." in done.stdout
+    assert RunArchive.open(tmp_path / "run").manifest.complete
+    again = lapgs_run("--device", "cpu", stub.script, *words)
+    assert again.returncode == 2
+    *_, last = again.stderr.strip().splitlines()
+    assert last.startswith("lapgs: ")
+    assert "--resume" in last
+    assert "Traceback" not in again.stderr
+
+
+def test_the_scripts_own_mistakes_are_its_own(scene: Path, tmp_path: Path) -> None:
+    unknown = lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option", "-m", tmp_path / "run")
+    assert unknown.returncode == 2
+    assert "unrecognized arguments: --no_such_option" in unknown.stderr, "argparse's own words"
+    missing = lapgs_run("--device", "cpu", STUBS["taming"].script, "-s", tmp_path / "nowhere", "-m", tmp_path / "run")
+    assert missing.returncode == 1
+    assert missing.stderr.strip().splitlines()[-1] == "AssertionError: Could not recognize scene type!"
+    assert "Traceback" in missing.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_cuda_that_is_not_there(scene: Path, tmp_path: Path) -> None:
+    result = lapgs_run("--device", "cuda", STUBS["taming"].script, "-s", scene)
+    assert result.returncode == 2
+    assert result.stderr.strip().startswith("lapgs: --device cuda: PyTorch sees no CUDA device")
+
+
+def test_nothing_is_left_of_a_refused_run(scene: Path, tmp_path: Path) -> None:
+    """After an error the same process can run another checkout."""
+    with pytest.raises(UserInputError):
+        run_hierarchy(STUBS["taming"], scene, tmp_path / "run", "--random_background")
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 30)
+    assert archive.manifest.settings["backbone"]["name"] == "graphdeco"
+    with cuda_on_cpu("fastgs"):
+        pass
