@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from lapgs_plugin.adapters.installed_rasterizer import explained
 from lapgs_plugin.adapters.known import adapter_class
 from lapgs_plugin.adapters.script import loaded_script, require_script
 from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.cli import app
 from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import Stage
@@ -29,6 +31,7 @@ from tests.contract.stub_runs import (
     arguments,
     captured,
     drive,
+    forgetting_stubs,
     loaded,
     run_bare,
     run_hierarchy,
@@ -257,42 +260,59 @@ def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp
     assert archive.manifest.complete
 
 
-def lapgs_run(*words: Any, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "run", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
-
-
 def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
-    """From inside a checkout or anywhere else; mistakes are one line and exit code 2."""
+    """From inside a checkout: the words after the script are its own, what it prints too."""
     stub = STUBS["graphdeco"]
     words = arguments(stub, scene, tmp_path / "run", ("--iterations", 30))
-    done = lapgs_run("--device", "cpu", "train.py", *words, cwd=stub.script.parent)
+    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "run", "--device", "cpu"]
+    done = subprocess.run(
+        [*command, "train.py", *words], capture_output=True, text=True, check=False, cwd=stub.script.parent
+    )
     assert done.returncode == 0, done.stderr
     assert "Training complete." in done.stdout
     assert RunArchive.open(tmp_path / "run").manifest.complete
-    again = lapgs_run("--device", "cpu", stub.script, *words)
-    assert again.returncode == 2
-    *_, last = again.stderr.strip().splitlines()
-    assert last.startswith("lapgs: ")
-    assert "--resume" in last
-    assert "Traceback" not in again.stderr
 
 
-def test_the_scripts_own_mistakes_are_its_own(scene: Path, tmp_path: Path) -> None:
-    unknown = lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option", "-m", tmp_path / "run")
-    assert unknown.returncode == 2
-    assert "unrecognized arguments: --no_such_option" in unknown.stderr, "argparse's own words"
-    missing = lapgs_run("--device", "cpu", STUBS["taming"].script, "-s", tmp_path / "nowhere", "-m", tmp_path / "run")
-    assert missing.returncode == 1
-    assert missing.stderr.strip().splitlines()[-1] == "AssertionError: Could not recognize scene type!"
-    assert "Traceback" in missing.stderr
+@pytest.fixture
+def lapgs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """`lapgs run` in this process: words -> exit code, lines of stderr."""
+    root = logging.getLogger()
+    before = root.handlers[:], logging.getLogger("lapgs_plugin").level
+
+    def run(*words: Any) -> tuple[int, list[str]]:
+        monkeypatch.setattr(sys, "argv", ["lapgs", "run", *map(str, words)])
+        with forgetting_stubs(), pytest.raises(SystemExit) as caught:
+            app.run()
+        return int(caught.value.code or 0), capsys.readouterr().err.strip().splitlines()
+
+    yield run
+    root.handlers[:] = before[0]
+    logging.getLogger("lapgs_plugin").setLevel(before[1])
+
+
+def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_path: Path) -> None:
+    run_bare(STUBS["taming"], scene, tmp_path / "run", "--iterations", 2, "--densify_from_iter", 10)
+    words = arguments(STUBS["taming"], scene, tmp_path / "run")
+    code, lines = lapgs_run("--device", "cpu", STUBS["taming"].script, *words)
+    assert code == 2
+    assert lines[-1].startswith("lapgs: ")
+    assert "is not empty and not a run" in lines[-1]
+    assert not any("Traceback" in line for line in lines)
+
+
+def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
+    code, lines = lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option", "-m", tmp_path / "run")
+    assert code == 2
+    assert "unrecognized arguments: --no_such_option" in lines[-1], "argparse's own words"
+    with pytest.raises(AssertionError, match="Could not recognize scene type!"):
+        lapgs_run("--device", "cpu", STUBS["taming"].script, "-s", tmp_path / "nowhere", "-m", tmp_path / "run")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_that_is_not_there(scene: Path, tmp_path: Path) -> None:
-    result = lapgs_run("--device", "cuda", STUBS["taming"].script, "-s", scene)
-    assert result.returncode == 2
-    assert result.stderr.strip().startswith("lapgs: --device cuda: PyTorch sees no CUDA device")
+def test_cuda_that_is_not_there(lapgs_run: Any, scene: Path) -> None:
+    code, lines = lapgs_run("--device", "cuda", STUBS["taming"].script, "-s", scene)
+    assert code == 2
+    assert lines[-1].startswith("lapgs: --device cuda: PyTorch sees no CUDA device")
 
 
 def test_nothing_is_left_of_a_refused_run(scene: Path, tmp_path: Path) -> None:
