@@ -83,7 +83,7 @@ def test_the_archive_renders_what_the_checkout_reported(name: str, run_of: Calla
     """The checkout's own report of held-out views, and a rendering of the PLYs by code that knows no checkout."""
     archive, result = run_of(name)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
-    assert composed_psnr(archive) == pytest.approx(reported, abs=0.01)  # 0.001 seen: predictions are float16
+    assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 5e-5 seen: predictions are float16
 
 
 class Recorder(StageHook):
@@ -145,9 +145,9 @@ def test_composed_images_build_on_the_finished_levels(recorded: tuple[RunArchive
         height, width = context.target.shape[1:]
         below = pyramid.up(renderer.render(cameras[context.view], level + 1).composed[level + 1], (height, width))
         assert context.accumulated is not None
-        assert (context.accumulated - below).abs().max() < 2e-3  # 5e-4 seen: float16
+        assert (context.accumulated - below).abs().max() < 2e-3  # 3.8e-4 seen: float16
         # Inherited geometry with no colour renders nothing, so the first composed image is what lies below.
-        assert (image - context.accumulated.clamp(0, 1)).abs().max() < 1e-3
+        assert torch.equal(image, context.accumulated)
 
 
 @pytest.mark.parametrize("name", ["fastgs", "taming"])
@@ -167,8 +167,8 @@ def test_score_functions_compare_composed_images(name: str, scene: Path, tmp_pat
         setattr(utils, function, spy)
         drive(adapter)
     assert seen.keys() == {(3, 24, 32), (3, 48, 64)}
-    # A bare residual would be off by the photo itself: 1. Composed ones were off by 0.45 to 0.6.
-    assert max(sum(values) / len(values) for values in seen.values()) < 0.8
+    # A bare residual would be off by the photo itself: 1. Composed ones were off by 0.30 to 0.40.
+    assert max(sum(values) / len(values) for values in seen.values()) < 0.6
 
 
 @pytest.mark.parametrize(("name", "levels"), [("fastgs", 1), ("fastgs", 3), ("taming", 3), ("graphdeco", 3)])
@@ -205,7 +205,7 @@ def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene
         pyramid = Pyramid("camera")
         below = pyramid.up(pyramid.gaussian(photo, 2)[1], (48, 64))
     assert below is not None
-    assert (target - (photo - below)).abs().max() < 5e-4  # 2.4e-4 seen: float16
+    assert (target - (photo - below)).abs().max() < 5e-4  # 1.2e-4 seen: float16
 
 
 @pytest.mark.parametrize("inherit", ["geometry", "xyz", "full"])

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from torch import Tensor
 
 from lapgs_plugin.hooks import StageContext, StageHook
@@ -118,7 +117,7 @@ def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path,
             drive(adapter, levels=1, hooks=(Term(),) if how == "hook" else ())
     for a, b in zip(gradients["hook"][0], gradients["loop"][0], strict=True):
         assert a.abs().max() > 0
-        assert torch.allclose(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))  # rounding of the sums: 2e-6 seen
+        assert (a - b).abs().max() < 1e-5 * b.abs().max()  # 2.1e-7 seen: rounding of the sums
 
 
 @pytest.mark.parametrize("name", NAMES)

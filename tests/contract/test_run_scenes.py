@@ -100,7 +100,7 @@ def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_p
     archive, result = run_hierarchy(STUBS["taming"], blender, tmp_path / "run", *more)
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
-    assert composed_psnr(archive) == pytest.approx(reported, abs=0.05)
+    assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 8e-5 seen: predictions are float16
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -122,7 +122,7 @@ def test_transparent_images_train(name: str, blender: Path, tmp_path: Path) -> N
         if name == "graphdeco":
             assert not image[:, :clear].any()
         else:
-            assert (photo[:, :clear] - 1).abs().max() < 1e-3
+            assert (photo[:, :clear] == 1).all()
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def test_exposures_survive_a_stop(scene: Path, tmp_path: Path) -> None:
 
         adapter.train.GaussianModel.training_setup = spy
         drive(adapter, resume=True)
-    assert torch.allclose(started[0], torch.tensor(list(base.values())), atol=1e-6)
+    assert torch.equal(started[0], torch.tensor(list(base.values())))
 
 
 @pytest.mark.parametrize("name", ["taming", "graphdeco"])
@@ -216,7 +216,7 @@ def test_colours_evaluated_by_the_checkout_train_the_same(name: str, scene: Path
         run_hierarchy(STUBS[name], scene, tmp_path / str(len(more)), *SHORT, *more)
         for more in ((), ("--convert_SHs_python",))
     )
-    assert python.losses == pytest.approx(raster.losses, abs=1e-4)
+    assert python.losses == pytest.approx(raster.losses, abs=1e-4)  # 0 seen
 
 
 def test_widths_are_those_of_the_checkouts(scene: Path, tmp_path: Path) -> None:
