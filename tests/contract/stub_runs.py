@@ -88,15 +88,18 @@ def arguments(stub: Stub, scene: Path, folder: Path, more: Sequence[Any] = ()) -
     return [str(a) for a in ("-s", scene, "-m", folder, *SCHEDULE, *stub.options, *more)]
 
 
+PACKAGES = {"arguments", "gaussian_renderer", "scene", "utils"}
+"""Of every checkout: all have packages of the same names."""
+
+
 @contextmanager
 def forgetting_stubs() -> Iterator[None]:
-    """Forget modules that the stubs share: other checkouts have modules of the same names."""
+    """Forget a checkout's modules on leaving, those included that `lapgs run` cannot know of, as stubs share them."""
     try:
         yield
     finally:
-        for name, module in list(sys.modules.items()):
-            if str(getattr(module, "__file__", None) or "").startswith(str(CHECKOUTS)):
-                del sys.modules[name]
+        for name in [name for name in sys.modules if name.partition(".")[0] in PACKAGES]:
+            del sys.modules[name]
 
 
 @contextmanager
@@ -111,17 +114,14 @@ def captured(folder: Path, results: list[Result]) -> Iterator[None]:
 def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
     """The script as Python runs it, without anything of `lapgs run`."""
     results: list[Result] = []
-    before = sys.argv, sys.path[:], set(sys.modules)
+    before = sys.argv, sys.path[:]
     sys.argv = [str(stub.script), *arguments(stub, scene, folder, more)]
     sys.path.insert(0, str(stub.script.parent))
     try:
         with forgetting_stubs(), captured(folder, results), cuda_on_cpu(stub.stand_in):
             runpy.run_path(str(stub.script), run_name="__main__")
     finally:
-        sys.argv, sys.path[:] = before[:2]
-        for name in ("utils", *(n for n in sys.modules if n.startswith("utils."))):
-            if name not in before[2]:
-                sys.modules.pop(name, None)
+        sys.argv, sys.path[:] = before
     return results[0]
 
 
