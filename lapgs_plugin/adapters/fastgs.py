@@ -50,13 +50,6 @@ class FastGSAdapter(BackboneAdapter):
         return [
             Replacement(
                 model,
-                "optimizer_step",
-                lambda original: _rescaled_steps(original, iteration_of),
-                ("self", "iteration"),
-                "training() after every backward pass",
-            ),
-            Replacement(
-                model,
                 "update_learning_rate",
                 lambda original: self._with_late_pruning(original, iteration_of),
                 ("self", "iteration"),
@@ -107,8 +100,6 @@ class FastGSAdapter(BackboneAdapter):
         cameras = utils.sampling_cameras(self._scene.getTrainCameras().copy())
         background = torch.full((3,), float(self._stage.dataset.white_background), device=gaussians._xyz.device)
         _, score = utils.compute_gaussian_score_fastgs(cameras, gaussians, pipe, background, opt)
-        if not hasattr(gaussians, "tmp_radii"):
-            gaussians.tmp_radii = None  # only densification makes it, and this stage may be over before any
         gaussians.tmp_radii = None  # pruning reads what only a densification before it would have set
         gaussians.final_prune_fastgs(min_opacity=LATE_MIN_OPACITY, pruning_score=score)
 
