@@ -35,7 +35,7 @@ from lapgs_plugin.files import one_line_errors
 PLACES = ("gpu", "memory", "disk")
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "uint8": torch.uint8}
 
-GPU_LIMIT = 2 << 30
+GPU_LIMIT = 1 << 30
 """Bytes of images that `place` keeps on a GPU at most, however large it is."""
 GPU_SHARE = 0.1
 """The same as a share of the GPU's memory: the rest is for Gaussians and what they need to be trained."""
