@@ -26,7 +26,8 @@ class Composition:
 
     Attributes:
         base: (3, h, w) the coarsest level's render, background blended in.
-        residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size.
+        residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size. Base and residuals
+            include their gains, where any were asked for.
         composed: by level, finest last: (3, h, w) I_hat^l at that level's size; at the coarsest level it is `base`.
     """
 
@@ -142,42 +143,59 @@ class HierarchyRenderer:
             )
 
     @torch.no_grad()
-    def render(self, camera: Camera, level: int = 0) -> Composition:
+    def render(self, camera: Camera, level: int = 0, gains: Mapping[int, float] | None = None) -> Composition:
         """Render a view from the coarsest level down to `level`.
 
         Args:
             camera: of the full-resolution view.
             level: finest level to add.
+            gains: by level, what its band is multiplied by; 1 where nothing is said, which is the image as trained. A
+                level with gain 0 is not rendered.
 
         Raises:
-            UserInputError: that level is not there.
+            UserInputError: that level is not there, or a gain is given for one that is not.
         """
         self.require_level(level)
+        gains = {} if gains is None else gains
+        for each in gains:
+            self.require_level(each)
         rendered: dict[int, Tensor] = {}
         composed: dict[int, Tensor] = {}
         for each in range(self.levels - 1, level - 1, -1):
-            rendered[each], composed[each] = self.render_level(camera, each, composed.get(each + 1))
+            rendered[each], composed[each] = self.render_level(
+                camera, each, composed.get(each + 1), gains.get(each, 1.0)
+            )
         base = rendered.pop(self.levels - 1)
         return Composition(base, residuals=rendered, composed=composed)
 
-    def render_level(self, camera: Camera, level: int, coarser: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Render one level and add it to what the coarser levels made: I_hat^l = Up(I_hat^(l+1)) + R_hat^l.
+    def render_level(
+        self, camera: Camera, level: int, coarser: Tensor | None, gain: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
+        """Render one level and add it to what the coarser levels made: I_hat^l = Up(I_hat^(l+1)) + gain * R_hat^l.
 
         Args:
             camera: of the full-resolution view.
             level: which field to render.
             coarser: (3, h, w) I_hat^(l+1) of the same view, None for the coarsest level.
+            gain: what the render is multiplied by; 0 gives zeros without rendering.
 
         Returns:
-            The field's own render and the composed image I_hat^l, both (3, h, w) at the level's size.
+            The field's own render times its gain and the composed image I_hat^l, both (3, h, w) at the level's size.
         """
-        field = self.fields[level]
         at_level = level_camera(camera, level)
+        image = self._render_band(level, at_level, gain)
+        if coarser is None:
+            return image, image
+        return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image
+
+    def _render_band(self, level: int, at_level: Camera, gain: float) -> Tensor:
+        """A field's own render times its gain, (3, h, w) at the size of `at_level`."""
+        field = self.fields[level]
+        if gain == 0.0:
+            return torch.zeros(3, at_level.height, at_level.width).to(field.means)
         # A residual adds to the image; a background behind it would be added twice.
         color = torch.zeros(3) if field.signed else torch.tensor(self.background)
         image = self.rasterizer(field, at_level, background=color.to(field.means)).image
         if self.clamped:
             image = image.clamp(-1.0 if field.signed else 0.0, 1.0)
-        if coarser is None:
-            return image, image
-        return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image
+        return image if gain == 1.0 else gain * image

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.archive import RunArchive, SceneReference
+from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import rasterizer_for
-from lapgs_plugin.scenes.scene import Scene, load_scene
+from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 
 
 def run_renderer(archive: RunArchive, device: str = "auto", rasterizer: str = "auto") -> HierarchyRenderer:
@@ -38,12 +39,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         RunFolderError: it is not there, or not the scene that the run was trained on.
         SceneError: it cannot be read.
     """
-    reference = archive.manifest.scene
-    path = Path(reference.path) if moved_to is None else moved_to
-    if moved_to is None and not path.is_dir():
-        raise RunFolderError(
-            f"{archive.path()} was trained on {path}, which is not there any more; say where it is now with --scene"
-        )
+    reference, path = _scene_place(archive, moved_to)
     scene = load_scene(
         path,
         resolution=reference.resolution,
@@ -51,16 +47,41 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         eval=reference.eval,
         background=reference.background,
     )
-    _require_same(archive, scene)
+    _require_same(archive, scene.path, scene.smallest_size)
     return scene
 
 
-def _require_same(archive: RunArchive, scene: Scene) -> None:
+def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
+    """The cameras a run was trained on and those held out, by view name, without reading their images.
+
+    Args, Raises:
+        As `run_scene`.
+    """
+    reference, path = _scene_place(archive, moved_to)
+    train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
+    cameras = [*train.values(), *test.values()]
+    smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+    _require_same(archive, path, smallest)
+    return train, test
+
+
+def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
+    """How a run read its scene, and where that is now."""
+    reference = archive.manifest.scene
+    path = Path(reference.path) if moved_to is None else moved_to
+    if moved_to is None and not path.is_dir():
+        raise RunFolderError(
+            f"{archive.path()} was trained on {path}, which is not there any more; say where it is now with --scene"
+        )
+    return reference, path
+
+
+def _require_same(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
     """Refuse a scene whose images are not of the size that was trained, before figures of it mislead."""
     for record in archive.manifest.records:
-        size = level_size(scene.smallest_size, record.level)
+        size = level_size(smallest, record.level)
         if size != record.image_size:
             raise RunFolderError(
-                f"{scene.path}: level {record.level} would be {size[0]}x{size[1]} pixels, the run was trained at "
+                f"{path}: level {record.level} would be {size[0]}x{size[1]} pixels, the run was trained at "
                 f"{record.image_size[0]}x{record.image_size[1]}; give the scene of {archive.path()} with --scene"
             )

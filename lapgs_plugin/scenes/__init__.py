@@ -2,12 +2,13 @@
 
 from lapgs_plugin.scenes.images import read_image, write_image
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
-from lapgs_plugin.scenes.scene import Scene, View, load_scene, smallest_size
+from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene, smallest_size
 
 __all__ = [
     "Resolution",
     "Scene",
     "View",
+    "load_cameras",
     "load_scene",
     "parse_resolution",
     "read_image",

@@ -134,6 +134,23 @@ def load_scene(
     )
 
 
+def load_cameras(
+    path: Path | str, *, resolution: str = "full", images: str = "images", eval: bool = False
+) -> tuple[dict[str, Camera], dict[str, Camera]]:
+    """The cameras of `Scene.train` and `Scene.test` by view name, without reading the images' pixels.
+
+    Args:
+        path, resolution, images, eval: as `load_scene` takes them.
+
+    Raises:
+        SceneError, UserInputError: as `load_scene`.
+    """
+    rule = parse_resolution(resolution)
+    source = _checked_source(Path(path), images, eval)
+    train, test = ({f.name: _sized_camera(f, rule) for f in frames} for frames in (source.train, source.test))
+    return train, test
+
+
 def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "images") -> tuple[int, int]:
     """`Scene.smallest_size` of a scene, from its model and the headers of its images alone.
 

@@ -137,3 +137,33 @@ def test_an_unfinished_hierarchy_renders_what_it_has() -> None:
 def test_fields_that_make_no_hierarchy_are_refused(fields: dict[int, GaussianField], message: str) -> None:
     with pytest.raises(UserInputError, match=message):
         HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer())
+
+
+def test_gains_weigh_bands_by_the_formula() -> None:
+    fields = {2: blobs(2, False), 1: blobs(1, True), 0: blobs(0, True)}
+    renderer = HierarchyRenderer(fields, 3, Pyramid("camera"), OracleRasterizer(), BACKGROUND)
+    plain = renderer.render(CAMERA)
+    gains = {2: 0.5, 1: 3.0, 0: 1.7}
+    weighed = renderer.render(CAMERA, gains=gains)
+    middle = renderer.pyramid.up(0.5 * plain.base, (15, 23)) + 3.0 * plain.residuals[1]
+    finest = renderer.pyramid.up(middle, (30, 45)) + 1.7 * plain.residuals[0]
+    torch.testing.assert_close(weighed.base, 0.5 * plain.base)
+    torch.testing.assert_close(weighed.residuals[0], 1.7 * plain.residuals[0])
+    torch.testing.assert_close(weighed.composed[0], finest)
+
+
+def test_a_band_of_gain_zero_is_not_rendered() -> None:
+    constant = Constant()
+    fields = {1: constant_field(0.25, False), 0: constant_field(0.5, True)}
+    renderer = HierarchyRenderer(fields, 2, Pyramid("camera"), constant)
+    without = renderer.render(CAMERA, gains={0: 0.0})
+    assert [signed for signed, *_ in constant.calls] == [False]
+    torch.testing.assert_close(without.composed[0], torch.full((3, 30, 45), 0.25))
+    assert not without.residuals[0].any()
+    torch.testing.assert_close(renderer.render(CAMERA, gains={1: 0.0}).composed[0], torch.full((3, 30, 45), 0.5))
+
+
+def test_a_gain_of_a_level_that_is_not_there_is_refused() -> None:
+    renderer = HierarchyRenderer({1: blobs(1, False)}, 2, Pyramid("camera"), OracleRasterizer())
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
+        renderer.render(CAMERA, level=1, gains={0: 2.0})

@@ -1,0 +1,84 @@
+"""What a scene's cameras have in common: the point they look at, which way is up, how far away they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_plugin.camera import Camera
+
+Vector = NDArray[np.float64]  # (3,)
+
+RIDGE = 1e-3
+"""Weight of the guess that settles where nearly parallel optical axes meet, against 1 for each axis."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a scene, seen as one thing.
+
+    Attributes:
+        cameras: at least one.
+        focus: (3,) point that the optical axes pass nearest to, in world units.
+        up: (3,) unit vector, the mean of what is up in the images.
+        distance: median distance of a camera from the focus, in world units.
+    """
+
+    cameras: tuple[Camera, ...]
+    focus: Vector
+    up: Vector
+    distance: float
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> Rig:
+        """Measure a set of cameras."""
+        assert cameras, "a rig has at least one camera"
+        positions, forwards = camera_positions(cameras), np.stack([forward(camera) for camera in cameras])
+        focus = _nearest_to_axes(positions, forwards)
+        up = _unit(np.mean([-_rotation(camera)[1] for camera in cameras], axis=0), fallback=-_rotation(cameras[0])[1])
+        distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
+        return cls(tuple(cameras), focus, up, distance)
+
+    @property
+    def surrounds(self) -> bool:
+        """Whether the cameras stand around the focus rather than on one side of it."""
+        outwards = camera_positions(self.cameras) - self.focus
+        flat = outwards - np.outer(outwards @ self.up, self.up)
+        lengths = np.linalg.norm(flat, axis=1)
+        directions = flat[lengths > 1e-9] / lengths[lengths > 1e-9, None]
+        # Directions spread evenly over an angle of 180 degrees have a mean of length 2 / pi.
+        return len(directions) > 2 and float(np.linalg.norm(directions.mean(axis=0))) < 2.0 / np.pi
+
+
+def camera_positions(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """Centres in world coordinates, (n, 3)."""
+    return np.stack([camera.position.double().numpy() for camera in cameras])
+
+
+def forward(camera: Camera) -> Vector:
+    """Unit vector along the optical axis in world coordinates, (3,)."""
+    return _rotation(camera)[2]
+
+
+def _rotation(camera: Camera) -> NDArray[np.float64]:
+    """World to camera, (3, 3): its rows are the image's right, down and forward in world coordinates."""
+    return np.asarray(camera.world_to_camera[:3, :3].double().numpy())
+
+
+def _nearest_to_axes(positions: NDArray[np.float64], forwards: NDArray[np.float64]) -> Vector:
+    """The point with the least sum of squared distances from the lines positions + t * forwards, both (n, 3)."""
+    spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+    guess = positions.mean(axis=0) + max(spread, 1.0) * forwards.mean(axis=0)
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # (n, 3, 3)
+    left = across.sum(axis=0) + RIDGE * len(positions) * np.eye(3)
+    right = np.einsum("nij,nj->i", across, positions) + RIDGE * len(positions) * guess
+    return np.asarray(np.linalg.solve(left, right))
+
+
+def _unit(vector: Vector, fallback: Vector) -> Vector:
+    """The vector at length 1, or `fallback` where it has none."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-9 else fallback
