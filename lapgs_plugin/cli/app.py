@@ -21,6 +21,7 @@ from lapgs_plugin.cli.run import CONTEXT as RUN_CONTEXT
 from lapgs_plugin.cli.run import run as run_backbone
 from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
+from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError
 
 app = typer.Typer(
@@ -57,6 +58,7 @@ app.command("run", context_settings=RUN_CONTEXT)(run_backbone)
 app.command("eval")(evaluate)
 app.command("render")(render)
 app.command("report")(report)
+app.command("view")(view)
 app.command("import-run")(import_run)
 app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)

@@ -60,7 +60,7 @@ def camera_positions(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 def forward(camera: Camera) -> Vector:
     """Unit vector along the optical axis in world coordinates, (3,)."""
-    return _rotation(camera)[2]
+    return np.asarray(_rotation(camera)[2])
 
 
 def _rotation(camera: Camera) -> NDArray[np.float64]:

@@ -1,0 +1,138 @@
+"""The panel of one client: what it shows of the bands, and what it lets them change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import viser
+
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun
+
+MAX_GAIN, GAIN_STEP = 3.0, 0.05
+COMPOSITION = "composition"
+BY_SIZE = "by distance and window"
+
+
+class Controls:
+    """Builds a client's panel and reads it.
+
+    Args:
+        client: whose panel.
+        run: what is looked at.
+        other: what the split view shows to the right, None without.
+        views: names of the cameras that can be gone to.
+        changed: called when another picture is wanted.
+        go_to: called with the index of a camera.
+        show_cameras: called with whether their frustums are wanted.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        run: ShownRun,
+        other: ShownRun | None,
+        views: Sequence[str],
+        *,
+        changed: Callable[[], None],
+        go_to: Callable[[int], None],
+        show_cameras: Callable[[bool], None],
+    ) -> None:
+        self._gui = client.gui
+        self._run = run
+        self._changed = changed
+        with self._gui.add_folder("Bands"):
+            self._bands = {level: self._add_band(level) for level in run.counts}
+        with self._gui.add_folder("Picture"):
+            self._show = self._add_choice("Show", [COMPOSITION, *map(self._band_name, run.counts)])
+            levels = [f"level {level}" for level in sorted(run.counts)]
+            self._level = self._add_choice("Detail", [levels[0], *levels[1:], BY_SIZE])
+            self._split, self._divider = self._add_split(other)
+        if views:
+            with self._gui.add_folder("Cameras"):
+                self._add_cameras(views, go_to, show_cameras)
+        with self._gui.add_folder("Figures"):
+            self._figures = self._gui.add_markdown("")
+
+    @property
+    def settings(self) -> PictureSettings:
+        """What is chosen now."""
+        gains = {level: gain.value if drawn.value else 0.0 for level, (drawn, gain) in self._bands.items()}
+        shown = {self._band_name(level): level for level in self._run.counts}
+        level = None if self._level.value == BY_SIZE else int(self._level.value.removeprefix("level "))
+        divider = self.divider if self._split is not None and self._split.value else None
+        return PictureSettings(gains, shown.get(self._show.value), level, divider)
+
+    @property
+    def divider(self) -> float:
+        """Where the divider is, as a share of the picture's width, whether it is shown or not."""
+        return 0.5 if self._divider is None else float(self._divider.value)
+
+    @divider.setter
+    def divider(self, share: float) -> None:
+        assert self._divider is not None, "there is nothing to compare with"
+        self._divider.value = min(max(share, 0.0), 1.0)
+
+    def report(self, picture: Picture, seconds: float) -> None:
+        """Show what a picture took.
+
+        Args:
+            picture: as drawn.
+            seconds: from its request to the moment it was sent.
+        """
+        height, width = picture.image.shape[1:]
+        rows = ["| band | Gaussians | ms |", "|:--|--:|--:|"]
+        for level, count in self._run.counts.items():
+            lap = picture.milliseconds.get(level)
+            rows.append(f"| {self._band_name(level)} | {count:,} | {'-' if lap is None else f'{lap:.1f}'} |")
+        line = (
+            f"{width} x {height} in {1e3 * seconds:.0f} ms, level {picture.level}, {self._run.renderer.rasterizer.name}"
+        )
+        self._figures.content = "\n".join([*rows, "", line])
+
+    def _add_band(self, level: int) -> tuple[Any, Any]:
+        drawn = self._gui.add_checkbox(self._band_name(level), initial_value=True)
+        gain = self._gui.add_slider(
+            f"gain {level}", min=0.0, max=MAX_GAIN, step=GAIN_STEP, initial_value=1.0, marks=(0.0, 1.0, 2.0, 3.0)
+        )
+        for handle in (drawn, gain):
+            handle.on_update(lambda _: self._changed())
+        return drawn, gain
+
+    def _add_choice(self, label: str, choices: Sequence[str]) -> Any:
+        handle = self._gui.add_dropdown(label, tuple(choices), initial_value=choices[0])
+        handle.on_update(lambda _: self._changed())
+        return handle
+
+    def _add_split(self, other: ShownRun | None) -> tuple[Any, Any]:
+        if other is None:
+            return None, None
+        split = self._gui.add_checkbox("split", initial_value=True, hint=f"{self._run.name} | {other.name}")
+        divider = self._gui.add_slider("divider", min=0.0, max=1.0, step=0.005, initial_value=0.5)
+        for handle in (split, divider):
+            handle.on_update(lambda _: self._changed())
+        return split, divider
+
+    def _add_cameras(
+        self, views: Sequence[str], go_to: Callable[[int], None], show_cameras: Callable[[bool], None]
+    ) -> None:
+        frustums = self._gui.add_checkbox("frustums", initial_value=False)
+        frustums.on_update(lambda _: show_cameras(frustums.value))
+        chosen: Any = self._gui.add_dropdown("view", tuple(views), initial_value=views[0])
+        step = self._gui.add_button_group("go", ("previous", "here", "next"))
+
+        @step.on_click
+        def _(_: object) -> None:
+            offset = {"previous": -1, "here": 0, "next": 1}[step.value]
+            index = (views.index(chosen.value) + offset) % len(views)
+            if offset == 0:
+                go_to(index)
+            else:
+                chosen.value = views[index]  # tells `on_update`, which goes there
+
+        chosen.on_update(lambda _: go_to(views.index(chosen.value)))
+
+    def _band_name(self, level: int) -> str:
+        if self._run.renderer.levels == 1:
+            return "level 0"
+        return f"level {level}, {'base' if level == self._run.renderer.levels - 1 else 'residual'}"

@@ -1,0 +1,206 @@
+"""The picture a client sees: which bands, how strong, at which level of detail, of one run or of two side by side."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import Rasterizer, RenderResult
+from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
+from lapgs_plugin.rendering.images import around_grey
+from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.run import run_renderer
+
+DIVIDER_PIXELS = 2
+
+
+class Stopwatch:
+    """A rasterizer that remembers how long each field took, in milliseconds."""
+
+    def __init__(self, rasterizer: Rasterizer) -> None:
+        self._rasterizer = rasterizer
+        self.laps: list[tuple[GaussianField, float]] = []
+
+    @property
+    def name(self) -> str:
+        return self._rasterizer.name
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """As `Rasterizer`."""
+        begin = time.perf_counter()
+        result = self._rasterizer(field, camera, background=background, sh_degree=sh_degree)
+        if result.image.is_cuda:
+            torch.cuda.synchronize(result.image.device)
+        self.laps.append((field, 1e3 * (time.perf_counter() - begin)))
+        return result
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """A run that is looked at.
+
+    Attributes:
+        name: how it is called on the page.
+        renderer: of its finished levels.
+        pixels_per_angle: focal length in pixels of the trained images, at full resolution; None where their cameras are
+            not known.
+        distance: of the training cameras from what they look at, in world units.
+    """
+
+    name: str
+    renderer: HierarchyRenderer
+    pixels_per_angle: float | None
+    distance: float
+
+    @classmethod
+    def load(cls, archive: RunArchive, rig: Rig | None, device: str, rasterizer: str) -> ShownRun:
+        """Read the fields of a run.
+
+        Args:
+            rig: the cameras it was trained on, where they are known.
+            device, rasterizer: as `run_renderer` takes them.
+
+        Raises:
+            RunFolderError: no level is finished, or one is damaged.
+        """
+        focal = None
+        if rig is not None:
+            focal = sorted(camera.fy for camera in rig.cameras)[len(rig.cameras) // 2]
+        renderer = run_renderer(archive, device, rasterizer)
+        return cls(archive.path().name, renderer, focal, rig.distance if rig else 1.0)
+
+    @property
+    def counts(self) -> dict[int, int]:
+        """Gaussians by level, coarsest first."""
+        fields = self.renderer.fields
+        return {level: len(fields[level]) for level in sorted(fields, reverse=True)}
+
+    def fitting_level(self, camera: Camera, distance: float) -> int:
+        """The finest level that a picture shows: finer ones have more detail than its pixels.
+
+        Args:
+            camera: of the picture.
+            distance: of the camera from what it looks at, in world units.
+
+        Returns:
+            A finished level. A level's detail doubles with each step; what lies between two is shown by the finer.
+        """
+        if self.pixels_per_angle is None:
+            return self.renderer.finest
+        trained = self.pixels_per_angle / self.distance  # pixels a world unit
+        shown = camera.fy / max(distance, 1e-9)
+        octaves = math.log2(trained / shown)
+        return self._finished(math.floor(octaves + 1e-6))  # a window of just half the size is not a rounding too large
+
+    def level_for(self, settings: PictureSettings, window: Camera, distance: float) -> int:
+        """The finest level to add: the one chosen by hand, or the one that fits the window; the nearest finished."""
+        return self.fitting_level(window, distance) if settings.level is None else self._finished(settings.level)
+
+    def _finished(self, level: int) -> int:
+        return min(max(level, self.renderer.finest), self.renderer.levels - 1)
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """What a client chose.
+
+    Attributes:
+        gains: by level; 0 for a level that is switched off.
+        band: the level whose own render is shown, residuals around mid-grey; None for the composition.
+        level: finest level to add; None takes `ShownRun.fitting_level`.
+        divider: where the picture changes from one run to the other, as a share of its width from the left; None shows
+            the first run alone.
+    """
+
+    gains: Mapping[int, float] = field(default_factory=dict)
+    band: int | None = None
+    level: int | None = 0
+    divider: float | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What was drawn.
+
+    Attributes:
+        image: (3, h, w) in [0, 1].
+        level: the finest level that was added.
+        milliseconds: what rendering each level's field took, by level; those that were not rendered are missing.
+    """
+
+    image: Tensor
+    level: int
+    milliseconds: dict[int, float]
+
+
+def draw(
+    run: ShownRun, other: ShownRun | None, camera: Camera, settings: PictureSettings, *, distance: float, zoom: float
+) -> Picture:
+    """Render a picture.
+
+    Args:
+        run: what the settings are about.
+        other: what is shown to the right of the divider, as it was trained.
+        camera: of the picture, at its size.
+        settings: what to show.
+        distance: of the camera from what it looks at, in world units.
+        zoom: size of the window as a multiple of the picture's.
+
+    Raises:
+        UserInputError: a gain or the band of the settings is of a level that is not finished.
+    """
+    window = camera.resized(round(camera.width * zoom), round(camera.height * zoom))
+    stopwatch = Stopwatch(run.renderer.rasterizer)
+    shown = replace(run, renderer=replace(run.renderer, rasterizer=stopwatch))
+    image, level = _shown(shown, camera, settings, shown.level_for(settings, window, distance))
+    if settings.divider is not None and other is not None:
+        as_trained = PictureSettings(level=settings.level)
+        right, _ = _shown(other, camera, as_trained, other.level_for(settings, window, distance))
+        image = side_by_side(image, right.to(image), settings.divider)
+    levels = {id(field): each for each, field in run.renderer.fields.items()}
+    return Picture(image, level, {levels[id(field)]: lap for field, lap in stopwatch.laps})
+
+
+def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:
+    """Two (3, h, w) images as one: `left` up to the divider, a white line, `right` after it.
+
+    Args:
+        divider: share of the width that is of `left`, in [0, 1].
+    """
+    width = left.shape[2]
+    column = round(divider * width)
+    image = torch.cat([left[:, :, :column], right[:, :, column:]], dim=2)
+    if 0 < column < width:
+        image[:, :, max(column - DIVIDER_PIXELS // 2, 0) : column + DIVIDER_PIXELS // 2] = 1.0
+    return image
+
+
+def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int) -> tuple[Tensor, int]:
+    """The image of one run, (3, h, w) in [0, 1] at the camera's size, and the finest level in it."""
+    renderer = run.renderer
+    if settings.band is not None:
+        level = settings.band
+    # By hand, the picture is of full resolution and a coarser level is magnified. Otherwise the picture is of the
+    # resolution of `level`, and full resolution is what it would be if the window were larger.
+    top = level if settings.level is None else 0
+    full = camera.resized(camera.width << top, camera.height << top)
+    if settings.band is None:
+        image = renderer.render(full, level, settings.gains).composed[level]
+    else:
+        image, _ = renderer.render_level(full, level, None, settings.gains.get(level, 1.0))
+        if renderer.fields[level].signed:
+            image = around_grey(image)
+    for finer in range(level - 1, top - 1, -1):
+        at_finer = level_camera(full, finer)
+        image = renderer.pyramid.up(image, (at_finer.height, at_finer.width))
+    return image.clamp(0.0, 1.0), level

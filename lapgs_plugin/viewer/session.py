@@ -1,0 +1,160 @@
+"""One client: its camera, its panel, and the pictures it is sent."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+import viser
+from numpy.typing import NDArray
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.viewer.controls import Controls
+from lapgs_plugin.viewer.navigation import Pose, turning_distance
+from lapgs_plugin.viewer.pacing import Pacing
+from lapgs_plugin.viewer.pictures import Picture, ShownRun, draw
+
+MAX_SIDE = 2048
+"""Longest side of a picture in pixels; the browser stretches it to larger windows."""
+
+JPEG_MOVING, JPEG_STILL = 75, 92
+REPORT_SECONDS = 0.3
+"""The figures change no oftener than this while the picture moves."""
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """What every client looks at.
+
+    Attributes:
+        run: the hierarchy.
+        other: what it is compared with, None without.
+        cameras: of the scene by view name; empty where they are not known.
+        rig: of these cameras, None without.
+    """
+
+    run: ShownRun
+    other: ShownRun | None
+    cameras: Mapping[str, Camera]
+    rig: Rig | None
+
+
+class Session:
+    """A connected client. Its callbacks come from viser's threads, its pictures are drawn by the viewer's.
+
+    Args:
+        client: viser's handle.
+        exhibit: what it looks at.
+        wake: called when there may be something to draw.
+    """
+
+    def __init__(self, client: viser.ClientHandle, exhibit: Exhibit, wake: Callable[[], None]) -> None:
+        self._client = client
+        self._exhibit = exhibit
+        self._wake = wake
+        self._pacing = Pacing()
+        self._lock = threading.Lock()
+        self._last_report = 0.0
+        self._frustums: list[viser.CameraFrustumHandle] = []
+        self.pictures = 0
+        self._controls = Controls(
+            client,
+            exhibit.run,
+            exhibit.other,
+            list(exhibit.cameras),
+            changed=self._change,
+            go_to=self._go_to,
+            show_cameras=self._show_cameras,
+        )
+        client.camera.on_update(lambda _: self._change())
+        self._change()
+
+    def due(self) -> float | None:
+        """When its next picture is to be drawn, by time.perf_counter(); None for not before something changes."""
+        with self._lock:
+            return self._pacing.due()
+
+    def draw(self) -> None:
+        """Draw the next picture and send it."""
+        begin = time.perf_counter()
+        with self._lock:
+            scale = self._pacing.begin()
+        picture = self._draw(scale)
+        self._send(picture, JPEG_STILL if scale >= 1.0 else JPEG_MOVING)
+        seconds = time.perf_counter() - begin
+        with self._lock:
+            self._pacing.end(scale, seconds)
+            self.pictures += 1
+        now = time.perf_counter()
+        if scale >= 1.0 or now - self._last_report > REPORT_SECONDS:
+            self._last_report = now
+            self._controls.report(picture, seconds)
+
+    def _draw(self, scale: float) -> Picture:
+        camera = self._client.camera
+        pose = Pose(np.asarray(camera.wxyz), np.asarray(camera.position), float(camera.fov))
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        share = scale * min(1.0, MAX_SIDE / max(width, height))
+        size = max(round(share * width), 1), max(round(share * height), 1)
+        distance = float(np.linalg.norm(np.asarray(camera.look_at) - pose.position))
+        exhibit, settings = self._exhibit, self._controls.settings
+        return draw(exhibit.run, exhibit.other, pose.camera(*size), settings, distance=distance, zoom=1.0 / share)
+
+    def _send(self, picture: Picture, quality: int) -> None:
+        self._client.scene.set_background_image(as_bytes(picture.image), format="jpeg", jpeg_quality=quality)
+
+    def _change(self) -> None:
+        with self._lock:
+            self._pacing.change(time.perf_counter())
+        self._wake()
+
+    def _go_to(self, index: int) -> None:
+        """Stand where a camera of the scene stands."""
+        assert self._exhibit.rig is not None, "there are cameras"
+        pose = Pose.of(list(self._exhibit.cameras.values())[index])
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.fov = pose.fov
+            camera.position = pose.position
+            camera.wxyz = pose.wxyz
+            ahead = viser.transforms.SO3(pose.wxyz).as_matrix()[:, 2]
+            camera.look_at = pose.position + turning_distance(pose.position, self._exhibit.rig) * ahead
+
+    def _clicked(self, index: int, _: object) -> None:
+        self._go_to(index)
+
+    def _show_cameras(self, wanted: bool) -> None:
+        if wanted and not self._frustums:
+            self._frustums = self._add_frustums()
+        for frustum in self._frustums:
+            frustum.visible = wanted
+
+    def _add_frustums(self) -> list[viser.CameraFrustumHandle]:
+        assert self._exhibit.rig is not None, "there are cameras"
+        frustums = []
+        for index, (name, camera) in enumerate(self._exhibit.cameras.items()):
+            pose = Pose.of(camera)
+            frustum = self._client.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov=pose.fov,
+                aspect=camera.width / camera.height,
+                scale=0.05 * self._exhibit.rig.distance,
+                thickness=0.001 * self._exhibit.rig.distance,
+                color=(240, 150, 40),
+                wxyz=pose.wxyz,
+                position=pose.position,
+            )
+            frustum.on_click(partial(self._clicked, index))
+            frustums.append(frustum)
+        return frustums
+
+
+def as_bytes(image: torch.Tensor) -> NDArray[np.uint8]:
+    """An image of (3, h, w) in [0, 1] as (h, w, 3) pixels of 8 bits."""
+    return np.ascontiguousarray((255.0 * image + 0.5).to(torch.uint8).permute(1, 2, 0).cpu().numpy())

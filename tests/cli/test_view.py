@@ -1,0 +1,92 @@
+"""`lapgs view` up to the moment it serves: what it says, and what it refuses."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.view import view
+from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
+from tests.cli.run_folder import write_run, write_scene
+
+viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from lapgs_plugin.viewer.server import Viewer, free_port  # noqa: E402  # needs viser
+
+app = typer.Typer()
+app.command("view")(view)
+
+
+def lapgs_view(*arguments: object) -> str:
+    """What the command prints until somebody presses Ctrl-C."""
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(autouse=True)
+def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C as soon as the viewer serves."""
+
+    def interrupt(self: Viewer, stop: threading.Event | None = None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "serve", interrupt)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def test_it_says_how_to_reach_it_and_takes_the_next_port(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        output = lapgs_view(run, "--port", port)
+    assert f"port {port} is taken, using {port + 1}" in output
+    assert f"open http://localhost:{port + 1} in a browser" in output
+    assert free_port("127.0.0.1", port) == port  # nothing listens any more
+
+
+def test_a_run_still_being_written_shows_what_is_finished(scene: Path, tmp_path: Path) -> None:
+    output = lapgs_view(write_run(tmp_path / "run", scene, finished=1))
+    assert "is not complete: showing level 1 of 2" in output
+    with pytest.raises(RunFolderError, match="level 1 is not in this run"):
+        lapgs_view(write_run(tmp_path / "none", scene, finished=0))
+
+
+def test_a_run_without_its_scene_is_shown_without_cameras(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    run = write_run(tmp_path / "run", scene)
+    shutil.rmtree(scene)
+    assert "without the scene's cameras" in lapgs_view(run)
+    with pytest.raises(LapgsError, match="no such scene folder"):
+        lapgs_view(run, "--scene", tmp_path / "nowhere")
+
+
+def test_a_missing_level_is_one_line(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    (run / "level_0" / "point_cloud.ply").unlink()
+    with pytest.raises(RunFolderError, match=r"level 0 of .* is missing"):
+        lapgs_view(run)
+
+
+def test_an_address_of_another_machine_is_refused(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match=r"--host 192\.0\.2\.1: cannot listen there"):
+        lapgs_view(write_run(tmp_path / "run", scene), "--host", "192.0.2.1")
+
+
+def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[viewer\]"):
+        lapgs_view(tmp_path)
