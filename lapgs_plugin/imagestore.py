@@ -130,9 +130,9 @@ class ImageStore:
         """Raise what the constructor would about its arguments."""
         places = PLACES if torch.device(device).type == "cuda" else PLACES[1:]
         if where not in places:
-            raise UserInputError(f"--cache {where}: expected {' or '.join(places)}")
+            raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
         if precision not in PRECISIONS:
-            raise UserInputError(f"--cache-precision {precision}: expected {', '.join(PRECISIONS)}")
+            raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
 
     def put(self, name: str, image: Tensor) -> None:
         """Keep an image, in place of what was kept under the name before.
@@ -195,6 +195,11 @@ class ImageStore:
             # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
             arrival.stored.record_stream(stream)
         return _decode(arrival.stored, image, dtype)
+
+    @property
+    def where(self) -> str:
+        """One of `PLACES`."""
+        return self._where
 
     @property
     def names(self) -> tuple[str, ...]:
