@@ -9,9 +9,11 @@ from __future__ import annotations
 import copy
 import inspect
 import logging
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -28,6 +30,9 @@ logger = logging.getLogger(__name__)
 
 LARGEST_OPACITY = 1 - 1e-6
 """Opacities are archived as logits; an activation without an upper limit is cut here."""
+
+SPARSE_ADAM = "SparseGaussianAdam"
+"""What the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
 
 PARAMETERS = {
     "_xyz": "means",
@@ -48,9 +53,12 @@ class BackboneInfo:
         name: for `--backbone` and the manifest.
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
-        stand_in: the variant of `reference_raster.standins` that takes that module's place on a CPU.
+        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU.
         density_control: methods of its GaussianModel that add, remove or reset Gaussians.
         color_rates: its options that are learning rates of SH coefficients.
+        raster_defaults: what its options set in the rasterizer unless a user says otherwise, where that changes the
+            image and is not in `extensions.CONSTANTS`.
+        telling_options: of the model, in the `cfg_args` that it writes and no other backbone does.
     """
 
     name: str
@@ -59,6 +67,8 @@ class BackboneInfo:
     stand_in: str
     density_control: tuple[str, ...]
     color_rates: tuple[str, ...]
+    raster_defaults: Mapping[str, Any] = field(default_factory=dict)
+    telling_options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -132,6 +142,21 @@ class BackboneAdapter(ABC):
     def __init__(self, script: Script) -> None:
         self.script = script
 
+    @classmethod
+    def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
+        """The variant of `reference_raster.standins` that a checkout wants.
+
+        Args:
+            checkout: its folder.
+            arguments: of its script.
+        """
+        return cls.info.stand_in
+
+    @staticmethod
+    def saved_logits(stored: Tensor) -> Tensor:
+        """(n,) logits of opacities from what a PLY that the backbone wrote calls opacity, (n,)."""
+        return stored
+
     @property
     def train(self) -> ModuleType:
         """The training script's namespace."""
@@ -144,6 +169,10 @@ class BackboneAdapter(ABC):
     @abstractmethod
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
         """Settings of the rasterizer that the images depend on, for whoever renders the run later."""
+
+    @abstractmethod
+    def passes_dc_apart(self, call: TrainingCall) -> bool:
+        """Whether the checkout's render gives its rasterizer the first SH coefficient by itself."""
 
     def refuse(self, call: TrainingCall, levels: int) -> None:
         """Check that a hierarchy can honour the options of this call.
@@ -160,6 +189,17 @@ class BackboneAdapter(ABC):
             raise UserInputError(
                 "--random_background: residual stages build on images rendered over one background; "
                 "leave it out, or train with --levels 1"
+            )
+        model = sys.modules[self.train.GaussianModel.__module__]
+        if getattr(call.opt, "optimizer_type", "default") == "sparse_adam" and not hasattr(model, SPARSE_ADAM):
+            raise UserInputError(
+                f"--optimizer_type sparse_adam: {model.__name__} found no {SPARSE_ADAM} to import; install a "
+                "rasterizer that has it, as the checkout's README says, or leave the option out"
+            )
+        if call.pipe.convert_SHs_python and self.passes_dc_apart(call):
+            raise UserInputError(
+                "--convert_SHs_python: this checkout's render passes on SH that it has not read with that option, and "
+                "fails without lapgs too; leave it out"
             )
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
@@ -184,11 +224,11 @@ class BackboneAdapter(ABC):
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
         return call.changed(**values)
 
-    def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         """Symbols to replace besides those that the driver replaces in every backbone.
 
         Args:
-            iteration_of: the running stage, None between stages.
+            window_of: gives the running stage, None between stages.
         """
         return []
 
@@ -212,7 +252,11 @@ class BackboneAdapter(ABC):
 
     def new_model(self, call: TrainingCall) -> Any:
         """A GaussianModel without Gaussians, as the script makes it."""
-        return self.train.GaussianModel(call.dataset.sh_degree, call.opt.optimizer_type)
+        return self.train.GaussianModel(call.dataset.sh_degree, *self.model_options(call))
+
+    def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
+        """What the script gives its GaussianModel after the SH degree."""
+        return (call.opt.optimizer_type,)
 
     @torch.no_grad()
     def export_field(self, gaussians: Any, signed: bool) -> GaussianField:
@@ -265,10 +309,3 @@ class BackboneAdapter(ABC):
         """The optimizers that step Gaussians."""
         found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
         return [optimizer for optimizer in found if optimizer is not None]
-
-
-def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """(..., h, w) averaged down to (width, height) `size`."""
-    width, height = size
-    result: Tensor = nn.functional.interpolate(image[None].float(), (height, width), mode="area")[0]
-    return result

@@ -24,25 +24,20 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.active_stage import (
-    ActiveStage,
-    Finished,
-    HierarchyOptions,
-    LoadedScene,
-    RunContext,
-    with_attributes,
-)
+from lapgs_plugin.adapters.active_stage import ActiveStage, with_attributes
 from lapgs_plugin.adapters.attachment import Attachment, Replacement
 from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
 from lapgs_plugin.adapters.extensions import CudaExtension
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.installed_rasterizer import require_matching_rasterizer
 from lapgs_plugin.adapters.level_views import PhotoAlbum
+from lapgs_plugin.adapters.run_state import Finished, HierarchyOptions, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.archive import CACHE, Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import StagePlan
+from lapgs_plugin.rendering.rasterizers import RASTER_SETTINGS
 from lapgs_plugin.signed_color import ColorPath, SignedColorRasterizer
 
 logger = logging.getLogger(__name__)
@@ -178,7 +173,7 @@ class HierarchyDriver:
         def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
             if self._active is not None:
-                self._active.densified()
+                self._active.densified(gaussians)
             return result
 
         return control
@@ -196,9 +191,12 @@ class HierarchyDriver:
             plan = StagePlan.create(
                 self._album.smallest_size(), call.opt.iterations, self._options.levels, self._options.shares()
             )
-            with self._open_archive(folder, call, scene, plan) as archive:
-                self._run_stages(call, scene, plan, archive, path, Path(scratch))
-                shutil.rmtree(archive.path(CACHE), ignore_errors=True)
+            with self._open_archive(folder, self._manifest(call, plan)) as archive:
+                try:
+                    self._run_stages(call, scene, plan, archive, path, Path(scratch))
+                finally:
+                    # A run that stops in between makes its images again when it goes on.
+                    shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         logger.info("run folder: %s", folder)
 
     def _run_stages(
@@ -217,6 +215,7 @@ class HierarchyDriver:
             active = ActiveStage(self._context, call, scene, archive, window, before, path)
             self._active = active
             try:
+                active.load_images()
                 if stage.level in archive.available_levels:
                     before = active.restore()
                 else:
@@ -225,29 +224,49 @@ class HierarchyDriver:
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
-                self._active = self._shim.stage = None
+                self._active = None
                 active.close()
             start += stage.iterations
 
     def _color_path(self) -> ColorPath:
         """How signed colour is evaluated by the installed rasterizer, found by trying it."""
-        name = self._adapter.info.rasterizer
-        rasterizer = SignedColorRasterizer(
-            CudaExtension(name, self._context.device), checkout=self._adapter.script.checkout
-        )
-        return ColorPath.NATIVE if self._options.levels == 1 else rasterizer.path
+        extension = CudaExtension(self._adapter.info.rasterizer, self._context.device)
+        if self._options.levels == 1:
+            return ColorPath.NATIVE  # never asked for: the base is not signed
+        return SignedColorRasterizer(extension, checkout=self._adapter.script.checkout).path
 
     def _load_scene(self, call: TrainingCall, scratch: Path) -> LoadedScene:
         """The checkout's Scene over a model that only notes what it would be initialised from."""
         recorder = _PointRecorder()
         dataset = with_attributes(call.dataset, model_path=str(scratch))
         scene = self._scene_class(dataset, recorder)
+        if not hasattr(recorder, "points"):
+            raise UserInputError(
+                f"the Scene of {self._adapter.script.checkout} initialised no model with create_from_pcd, expected of "
+                f"{self._adapter.info.title}; choose another --backbone, or train with `lapgs run --off`"
+            )
         self._adapter.first_points(len(recorder.points.points))
         return LoadedScene(scene, recorder.points, recorder.others)
 
-    def _open_archive(self, folder: Path, call: TrainingCall, scene: LoadedScene, plan: StagePlan) -> RunArchive:
+    def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
+        """The run folder, new or continued.
+
+        Raises:
+            RunFolderError: it is in use, or was started with other options.
+        """
+        if not self._resume:
+            return RunArchive.create(folder, manifest, self._overwrite)
+        archive = RunArchive.open(folder, resume=True)
+        try:
+            _require_same_run(archive.manifest, manifest)
+        except BaseException:
+            archive.close()
+            raise
+        return archive
+
+    def _manifest(self, call: TrainingCall, plan: StagePlan) -> Manifest:
         dataset = call.dataset
-        manifest = Manifest(
+        return Manifest(
             scene=SceneReference(
                 path=str(Path(dataset.source_path).absolute()),
                 resolution=f"3dgs:{dataset.resolution}",
@@ -269,7 +288,7 @@ class HierarchyDriver:
                     "checkout": str(self._adapter.script.checkout),
                     "arguments": sys.argv[1:],
                 },
-                "raster": self._adapter.raster_settings(call),
+                RASTER_SETTINGS: self._adapter.raster_settings(call),
                 "iterations": plan.iterations,
                 **{
                     name: value
@@ -278,15 +297,6 @@ class HierarchyDriver:
                 },
             },
         )
-        if not self._resume:
-            return RunArchive.create(folder, manifest, self._overwrite)
-        archive = RunArchive.open(folder, resume=True)
-        try:
-            _require_same_run(archive.manifest, manifest)
-        except BaseException:
-            archive.close()
-            raise
-        return archive
 
 
 class _PointRecorder:
@@ -303,14 +313,21 @@ def _folder_as_the_checkouts_name_it() -> str:
 
 def _require_same_run(found: Manifest, wanted: Manifest) -> None:
     """Refuse to continue a run with other settings: its levels would not belong together."""
-    before, now = asdict(found), asdict(wanted)
-    for values in (before, now):
-        for name in ("records", "created", "created_by"):
-            values.pop(name)
-        values["settings"].get("backbone", {}).pop("arguments", None)
-    different = [name for name in now if before[name] != now[name]]
-    if different:
-        raise RunFolderError(
-            f"this run was started with another {different[0]} ({before[different[0]]!r}, now {now[different[0]]!r}); "
-            "resume with the same options, or start again with --overwrite"
-        )
+    before, now = _identity(found), _identity(wanted)
+    for name in {**before, **now}:
+        if before.get(name) != now.get(name):
+            raise RunFolderError(
+                f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
+                "resume with the same options, or start again with --overwrite"
+            )
+
+
+def _identity(manifest: Manifest) -> dict[str, Any]:
+    """What cannot change while a run is continued. Where images lie can: running out of memory asks for it."""
+    values = asdict(manifest)
+    for name in ("records", "created", "created_by"):
+        values.pop(name)
+    settings = values.pop("settings")
+    backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
+    settings.pop("images_on", None)
+    return {**values, **settings, **backbone}

@@ -1,4 +1,8 @@
-"""FastGS: multi-view scores for densification and pruning, a compact box, an optimizer that steps ever more rarely."""
+"""FastGS: multi-view scores for densification and pruning, a compact box, an optimizer that steps ever more rarely.
+
+It hard-codes two schedules by iteration. Late pruning is rescaled to a stage, which would never reach it. When the
+optimizer steps is left alone: it counts from 1 in each stage, as in the paper authors' release.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +19,13 @@ from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindo
 LATE_PRUNING_FROM, LATE_PRUNING_EVERY = 1 / 2, 1 / 10
 """When FastGS prunes late, as shares of the iterations: hard-coded there for 30,000."""
 
-PUBLISHED_ITERATIONS = 30_000
-"""Length of the run that FastGS's hard-coded constants were made for."""
-
-STEP_PHASE = 64
-"""After so many iterations FastGS's choice of when to step repeats itself: it steps every 1, 16, 32 or 64."""
-
 LATE_MIN_OPACITY = 0.1
 """Opacity below which its late pruning removes Gaussians."""
 
 
 class FastGSAdapter(BackboneAdapter):
     """Drives a FastGS checkout. Its score functions see composed images and each level's ground truth by themselves,
-    because both are put in place below them; what is adapted here is what it hard-codes for 30,000 iterations.
+    because both are put in place below them; what is adapted here is its late pruning.
     """
 
     info = BackboneInfo(
@@ -37,6 +35,7 @@ class FastGSAdapter(BackboneAdapter):
         stand_in="fastgs",
         density_control=("densify_and_prune_fastgs", "reset_opacity", "final_prune_fastgs"),
         color_rates=("lowfeature_lr", "highfeature_lr"),
+        raster_defaults={"mult": 0.5},
     )
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
@@ -45,20 +44,23 @@ class FastGSAdapter(BackboneAdapter):
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
         return {"mult": call.opt.mult}
 
-    def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def passes_dc_apart(self, call: TrainingCall) -> bool:
+        return True
+
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         model = self.train.GaussianModel
         return [
             Replacement(
                 model,
                 "update_learning_rate",
-                lambda original: self._with_late_pruning(original, iteration_of),
+                lambda original: self._with_late_pruning(original, window_of),
                 ("self", "iteration"),
                 "training() at the start of every iteration",
             ),
             Replacement(
                 self.train,
                 "compute_gaussian_score_fastgs",
-                lambda original: _scores_for_densification_only(original, iteration_of),
+                lambda original: _scores_for_densification_only(original, window_of),
                 ("camlist", "gaussians", "pipe", "bg", "args", "DENSIFY"),
                 "training() when it densifies, and when it prunes at hard-coded iterations",
             ),
@@ -112,28 +114,6 @@ def late_pruning_due(iteration: int, iterations: int) -> bool:
     """
     every = max(1, round(iterations * LATE_PRUNING_EVERY))
     return iteration % every == 0 and iterations * LATE_PRUNING_FROM < iteration < iterations
-
-
-def same_phase(iteration: int, iterations: int) -> int:
-    """An iteration of a 30,000 run at which FastGS decides about stepping as it should at this one of a shorter stage.
-
-    What it decides depends on a third of the run and on the iteration modulo 64: the third is that of the same share of
-    the stage, the remainder is kept, so that every 16th, 32nd or 64th iteration steps as it would.
-    """
-    share = iteration * PUBLISHED_ITERATIONS / iterations
-    first = 0 if share <= 15_000 else 15_000 if share <= 20_000 else 20_000
-    start = -(-(first + 1) // STEP_PHASE) * STEP_PHASE
-    return start + iteration % STEP_PHASE
-
-
-def _rescaled_steps(
-    original: Callable[[Any, int], None], window_of: Callable[[], StageWindow | None]
-) -> Callable[[Any, int], None]:
-    def optimizer_step(gaussians: Any, iteration: int) -> None:
-        window = window_of()
-        original(gaussians, iteration if window is None else same_phase(iteration, window.stage.iterations))
-
-    return optimizer_step
 
 
 def _scores_for_densification_only(

@@ -1,14 +1,18 @@
-"""The graphdeco 3DGS repository, with either of its rasterizers: exposure, depth supervision, masks, sparse Adam."""
+"""The graphdeco 3DGS repository, with any of its rasterizers: exposure, depth supervision, masks, sparse Adam.
+
+All of these came in October 2024, in one piece; a checkout from before has none of them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall, shrunk
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 
 
 class GraphdecoAdapter(BackboneAdapter):
@@ -22,48 +26,65 @@ class GraphdecoAdapter(BackboneAdapter):
         name="graphdeco",
         title="graphdeco 3DGS",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="graphdeco-accel",
+        stand_in="graphdeco-aa",
         density_control=("densify_and_prune", "reset_opacity"),
         color_rates=("feature_lr",),
+        telling_options=("depths",),
     )
+
+    @classmethod
+    def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
+        renderer = checkout / "gaussian_renderer" / "__init__.py"
+        if "antialiasing" not in renderer.read_text(encoding="utf-8", errors="replace"):
+            return "graphdeco"
+        wants_sparse_adam = any(argument.rpartition("=")[2] == "sparse_adam" for argument in arguments)
+        return "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in
+
+    @property
+    def _of_2023(self) -> bool:
+        return not hasattr(self.train, "SPARSE_ADAM_AVAILABLE")
+
+    def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
+        return () if self._of_2023 else super().model_options(call)
+
+    def passes_dc_apart(self, call: TrainingCall) -> bool:
+        return not self._of_2023 and bool(self.train.SPARSE_ADAM_AVAILABLE)
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
         # Without exposure: predictions of finished levels lie before it.
-        self.train.render(
-            view, gaussians, call.pipe, background, separate_sh=self.train.SPARSE_ADAM_AVAILABLE, use_trained_exp=False
-        )
+        options = {} if self._of_2023 else {"separate_sh": self.passes_dc_apart(call), "use_trained_exp": False}
+        self.train.render(view, gaussians, call.pipe, background, **options)
 
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        return {"antialiasing": call.pipe.antialiasing}
+        return {} if self._of_2023 else {"antialiasing": call.pipe.antialiasing}
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
-        opt = changed.opt
-        if window.stage.signed:
-            opt.depth_l1_weight_init = opt.depth_l1_weight_final = 0.0
+        if window.stage.signed and not self._of_2023:
+            changed.opt.depth_l1_weight_init = changed.opt.depth_l1_weight_final = 0.0
         return changed
 
     def level_view(self, view: Any, original: Any, size: tuple[int, int], signed: bool) -> None:
+        if self._of_2023:
+            return
         if original.alpha_mask is not None:
             # Most photos have no mask; without one the training loop saves a pass over the image.
             opaque = bool((original.alpha_mask == 1).all())
-            view.alpha_mask = None if opaque else shrunk(original.alpha_mask, size)
+            view.alpha_mask = None if opaque else _shrunk(original.alpha_mask, size)
         if original.invdepthmap is not None:
             if signed:
                 view.invdepthmap, view.depth_mask, view.depth_reliable = None, None, False
             else:
-                view.invdepthmap = shrunk(original.invdepthmap, size)
-                view.depth_mask = shrunk(original.depth_mask, size)
+                view.invdepthmap = _shrunk(original.invdepthmap, size)
+                view.depth_mask = _shrunk(original.depth_mask, size)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
         """Exposures, which belong to the photos and not to a level."""
-        return {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
+        return {} if self._of_2023 else {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
 
-    def refuse(self, call: TrainingCall, levels: int) -> None:
-        super().refuse(call, levels)
-        wanted = call.opt.optimizer_type == "sparse_adam"
-        if wanted and not self.train.SPARSE_ADAM_AVAILABLE:
-            raise UserInputError(
-                "--optimizer_type sparse_adam: the installed diff_gaussian_rasterization has no SparseGaussianAdam; "
-                "install the accelerated rasterizer as the checkout's README says, or leave the option out"
-            )
+
+def _shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """(..., h, w) averaged down to (width, height) `size`, float32."""
+    width, height = size
+    result: Tensor = torch.nn.functional.interpolate(image[None].float(), (height, width), mode="area")[0]
+    return result

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from lapgs_plugin.adapters.level_views import view_name
 from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
 from lapgs_plugin.plan import Stage
 
@@ -55,27 +56,36 @@ class HookCaller:
         if self._hooks is not None:
             self._hooks.on_stage_end(stage)
 
-    def iteration_begins(self, stage: Stage, iteration: int) -> None:
+    def iteration_begins(self, iteration: int) -> None:
         self._iteration = iteration
 
     def on_image(self, key: str, image: Tensor) -> Tensor:
-        """(3, h, w) the composed image of a training view -> what the loop compares with the ground truth."""
+        """(3, h, w) what a training view's render gives the loop, as hooks and their terms make it."""
         assert self._hooks is not None
+        context = self._context = self._make_context(key)
+        assert self._rendering is not None
+        # Hooks see composed images; where the loop is to see the residual alone, it is taken apart again behind them.
+        below = None if key in self._rendering.composed else context.accumulated
+        if below is not None:
+            image = image + below
+        self._hooks.before_render(context)
+        image = self._hooks.compose(context, image)
+        term = self._hooks.extra_loss(context, image)
+        result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
+        return result if below is None else result - below
+
+    def _make_context(self, key: str) -> StageContext:
         assert self._stage is not None
         assert self._rendering is not None
-        accumulated = self._rendering.accumulated
-        self._context = StageContext(
+        accumulated, coarse = self._rendering.accumulated, self._rendering.coarse
+        return StageContext(
             stage=self._stage,
             iteration=self._iteration,
-            view=key.partition("-")[2],
+            view=view_name(key),
             target=self._rendering.targets.get(key),
             accumulated=None if accumulated is None else accumulated.get(key),
+            coarse_target=None if coarse is None else coarse.get(key),
         )
-        self._hooks.before_render(self._context)
-        image = self._hooks.compose(self._context, image)
-        term = self._hooks.extra_loss(self._context, image)
-        result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
-        return result
 
     def densified(self) -> None:
         if self._hooks is not None and self._context is not None:

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.adapters.extensions import CONSTANTS
+from lapgs_plugin.adapters.known import adapters
 from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
@@ -36,31 +36,6 @@ from lapgs_plugin.scenes import smallest_size
 
 CFG_ARGS, TRAIN_INFO, BREAKDOWN = "cfg_args", "TRAIN_INFO", "runtime_breakdown.json"
 REQUIRED_OPTIONS = ("source_path", "resolution", "sh_degree", "eval")
-LARGEST_OPACITY = 1 - 1e-6
-LOW_LOGIT = -1.0
-"""Logits of a trained field go down to about -5.3, opacity 0.005, where training prunes; opacities kept as they are
-hover above 0."""
-
-
-@dataclass(frozen=True)
-class Codebase:
-    """What is rendered with, unless the user knows better.
-
-    Attributes:
-        rasterizer: module of its extension.
-        settings: those of its options' defaults that change the image.
-    """
-
-    rasterizer: str
-    settings: Mapping[str, Any]
-
-
-CODEBASES = {
-    "fastgs": Codebase("diff_gaussian_rasterization_fastgs", {"mult": 0.5}),
-    "taming": Codebase("diff_gaussian_rasterization", {}),
-    "graphdeco": Codebase("diff_gaussian_rasterization", {"antialiasing": False}),
-}
-"""Their folders do not say which of them wrote them, nor with which options of the rasterizer."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +65,7 @@ class ForeignRun:
         folder: it.
         options: the model's options, from cfg_args.
         levels: coarsest first, without gaps.
-        codebase: one of `CODEBASES`, None where the folder does not tell.
+        codebase: name of the backbone, None where the folder does not tell.
     """
 
     folder: Path
@@ -146,8 +121,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
     if breakdown.get("config", {}).get("blur_up") is False:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
-    codebase = "graphdeco" if "depths" in options else breakdown.get("backbone")
-    return ForeignRun(folder, options, levels, codebase if codebase in CODEBASES else None)
+    return ForeignRun(folder, options, levels, _recognised(options, breakdown))
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:
@@ -193,7 +167,7 @@ def import_run(
     Args:
         run: what is there.
         out: the run folder.
-        codebase: which of `CODEBASES` it was trained with; None takes the folder's word for it.
+        codebase: name of the backbone it was trained with; None takes the folder's word for it.
         scene: where its scene is now; None when it is still where it was.
         settings: options of its rasterizer that were not the defaults, such as {"mult": 1.0}.
         overwrite: replace a run that is already in `out`.
@@ -206,16 +180,17 @@ def import_run(
         RunFolderError: the scene is not there, a field is damaged, or `out` cannot be written.
         SceneError: the scene cannot be read.
     """
-    name = codebase or run.codebase
-    if name not in CODEBASES:
+    known, name = adapters(), codebase or run.codebase
+    if name not in known:
         raise UserInputError(
             f"--backbone {name or '(not given)'}: {run.folder} does not say what it was trained with, expected "
-            f"{', '.join(CODEBASES)}"
+            f"{', '.join(known)}"
         )
+    backbone = known[name]
     RunArchive.require_room(out, overwrite)
-    manifest = _manifest(run, name, scene, {**CODEBASES[name].settings, **_checked(settings or {})})
+    manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
     size = smallest_size(manifest.scene.path, resolution=manifest.scene.resolution, images=manifest.scene.images)
-    fields = {level.level: _field(level, manifest.levels, name) for level in run.levels}
+    fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0
         for level in run.levels:
@@ -260,6 +235,16 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
     )
 
 
+def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str | None:
+    """The backbone by its own options, or by what the authors' release noted. Most folders do not tell."""
+    known = adapters()
+    for name, adapter in known.items():
+        if any(option in options for option in adapter.info.telling_options):
+            return name
+    noted = breakdown.get("backbone")
+    return noted if noted in known else None
+
+
 def _breakdown(folder: Path) -> dict[str, Any]:
     path = folder / BREAKDOWN
     if not path.is_file():
@@ -280,7 +265,7 @@ def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return settings
 
 
-def _manifest(run: ForeignRun, codebase: str, scene: Path | None, settings: Mapping[str, Any]) -> Manifest:
+def _manifest(run: ForeignRun, backbone: BackboneInfo, scene: Path | None, settings: Mapping[str, Any]) -> Manifest:
     options = run.options
     path = (Path(options["source_path"]) if scene is None else scene).absolute()
     if not path.is_dir():
@@ -301,10 +286,10 @@ def _manifest(run: ForeignRun, codebase: str, scene: Path | None, settings: Mapp
         supervision="reconstructed",
         inherit="not recorded",
         sh_degree=int(options["sh_degree"]),
-        rasterizer=CODEBASES[codebase].rasterizer,
+        rasterizer=backbone.rasterizer,
         seed=0,
         settings={
-            "backbone": {"name": codebase, "imported_from": str(run.folder)},
+            "backbone": {"name": backbone.name, "imported_from": str(run.folder)},
             "iterations": sum(level.iterations for level in run.levels),
             RASTER_SETTINGS: dict(settings),
             CLAMPED: run.is_hierarchy,
@@ -312,10 +297,7 @@ def _manifest(run: ForeignRun, codebase: str, scene: Path | None, settings: Mapp
     )
 
 
-def _field(level: ForeignLevel, levels: int, codebase: str) -> GaussianField:
+def _field(level: ForeignLevel, levels: int, backbone: type[BackboneAdapter]) -> GaussianField:
     field = GaussianField.load_ply(level.ply)
-    logits = field.opacity_logits  # (n,)
-    if codebase == "taming" and bool((logits > LOW_LOGIT).all()):
-        # Half way through it replaces the sigmoid by the absolute value, and saves what that is taken of.
-        logits = torch.logit(logits.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
+    logits = backbone.saved_logits(field.opacity_logits)  # (n,)
     return replace(field, opacity_logits=logits, signed=level.level != levels - 1)

@@ -40,6 +40,9 @@ KNOWN_CHECKOUTS = (
 )
 """Most specific first: FastGS and Taming-3DGS are forks of graphdeco's code, and FastGS took over files of Taming's."""
 
+DRIVABLE = {checkout.key: checkout for checkout in KNOWN_CHECKOUTS if checkout.key is not None}
+"""Those that `lapgs run` drives, by what `--backbone` calls them."""
+
 KNOWN_EXTENSIONS = {
     "diff_gaussian_rasterization": "rasterizer of graphdeco 3DGS and Taming-3DGS",
     "diff_gaussian_rasterization_fastgs": "rasterizer of FastGS",
@@ -63,16 +66,24 @@ def adapter_class(folder: Path, key: str | None = None) -> type[BackboneAdapter]
     Raises:
         UserInputError: the checkout is none that is known, or no adapter is called that.
     """
-    drivable = {checkout.key: checkout for checkout in KNOWN_CHECKOUTS if checkout.key is not None}
-    if key is not None and key not in drivable:
-        raise UserInputError(f"--backbone {key}: expected {', '.join(drivable)}")
-    found = recognise_checkout(folder) if key is None else drivable[key]
+    if key is not None and key not in DRIVABLE:
+        raise UserInputError(f"--backbone {key}: expected {', '.join(DRIVABLE)}")
+    found = recognise_checkout(folder) if key is None else DRIVABLE[key]
     if found is None or found.key is None:
+        names = ", ".join(checkout.name for checkout in DRIVABLE.values())
         raise UserInputError(
-            f"{folder} is not the root of a checkout that `lapgs run` knows (FastGS, Taming-3DGS, "
-            f"graphdeco 3DGS), which have {', '.join(GRAPHDECO_FILES)}; "
-            "name it with --backbone, or use `lapgs train` without a checkout"
+            f"{folder} is not the root of a checkout that `lapgs run` knows ({names}), which have "
+            f"{', '.join(GRAPHDECO_FILES)}; name it with --backbone, or use `lapgs train` without a checkout"
         )
-    module, name = found.adapter.split(":")
+    return _adapter(found)
+
+
+def adapters() -> dict[str, type[BackboneAdapter]]:
+    """All adapters by what `--backbone` calls them."""
+    return {name: _adapter(checkout) for name, checkout in DRIVABLE.items()}
+
+
+def _adapter(checkout: KnownCheckout) -> type[BackboneAdapter]:
+    module, name = checkout.adapter.split(":")
     adapter: Any = getattr(import_module(f"lapgs_plugin.adapters.{module}"), name)
     return adapter  # type: ignore[no-any-return]  # found by name

@@ -99,6 +99,11 @@ class PhotoAlbum:
         return min((photo.size for photo in self._photos.values()), key=lambda size: size[0] * size[1])
 
 
+def view_name(key: str) -> str:
+    """The checkout's name of the image that an album calls `key`."""
+    return key.partition("-")[2]
+
+
 def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tensor]) -> Any:
     """A camera with another size whose `original_image` is asked for whenever it is looked at.
 

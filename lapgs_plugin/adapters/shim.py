@@ -30,9 +30,10 @@ class StageRendering:
         path: how signed colour is evaluated.
         views: key of each view by the identity of its world-to-camera matrix, which level views share with the
             checkout's cameras.
+        targets: I^l by key.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
-        targets: the level's images by key.
-        composed: keys of the views that composition is done for.
+        coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
+        composed: keys of the views that composition is done for; of the others, a residual is compared with a residual.
         on_image: called with key and composed image when gradients are recorded; what it returns takes its place.
         capture: keep what was composed last, before exposure or clamping, in `captured`.
     """
@@ -42,6 +43,7 @@ class StageRendering:
     views: Mapping[int, str]
     targets: ImageStore
     accumulated: ImageStore | None = None
+    coarse: ImageStore | None = None
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor], Tensor] | None = None
     capture: bool = False
@@ -53,8 +55,16 @@ class StageRendering:
     def announce(self, key: str) -> None:
         """Bring a view's images while it is being rendered."""
         self.targets.announce(key)
-        if self.accumulated is not None and key in self.composed:
-            self.accumulated.announce(key)
+        below = self.accumulated if key in self.composed else self._below_target
+        if below is not None:
+            below.announce(key)
+
+    def target(self, key: str) -> Tensor:
+        """(3, h, w) what `compose` is compared with: I^l, or what is missing of it."""
+        target = self.targets.get(key)
+        if key in self.composed or self._below_target is None:
+            return target
+        return target - self._below_target.get(key)
 
     def compose(self, key: str | None, image: Tensor) -> Tensor:
         """(3, h, w) what a rasterizer made of a view -> what `render` returns of it."""
@@ -65,6 +75,11 @@ class StageRendering:
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image)
         return image
+
+    @property
+    def _below_target(self) -> ImageStore | None:
+        """What is taken from a target where a residual is supervised alone."""
+        return self.accumulated if self.coarse is None else self.coarse
 
 
 class RasterizerShim:

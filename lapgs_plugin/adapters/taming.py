@@ -7,10 +7,11 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.attachment import Replacement
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 
 logger = logging.getLogger(__name__)
@@ -21,6 +22,10 @@ BASE_SHARE, FINEST_SHARE = 0.4, 0.6
 Both end below the whole budget, so that every iteration is cheaper than the backbone's own at the same progress, and
 each residual has room to grow from what it inherits.
 """
+
+LOW_LOGIT = -1.0
+"""Logits of a trained field go down to about -5.3, opacity 0.005, where training prunes; opacities kept as they are
+hover above 0."""
 
 
 class TamingAdapter(BackboneAdapter):
@@ -37,13 +42,20 @@ class TamingAdapter(BackboneAdapter):
         color_rates=("feature_lr", "shfeature_lr"),
     )
 
+    @staticmethod
+    def saved_logits(stored: Tensor) -> Tensor:
+        if not bool((stored > LOW_LOGIT).all()):
+            return stored
+        # Half way through it replaces the sigmoid by the absolute value, and saves what that is taken of.
+        return torch.logit(stored.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
+
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
         self.train.render(view, gaussians, call.pipe, background)
 
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
         return {}
 
-    def replacements(self, iteration_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"
         model = self.train.GaussianModel
         return [
@@ -56,13 +68,33 @@ class TamingAdapter(BackboneAdapter):
             ),
         ]
 
+    def passes_dc_apart(self, call: TrainingCall) -> bool:
+        return bool(call.pipe.separate_sh)
+
     def refuse(self, call: TrainingCall, levels: int) -> None:
         super().refuse(call, levels)
+        self._try_lpips(call)
         if levels > 1 and call.values["args"].benchmark_dir:
             raise UserInputError(
                 f"--benchmark_dir {call.values['args'].benchmark_dir}: the checkout would write every stage's timings "
                 "over the last one's; leave it out, the manifest holds the time of each stage"
             )
+
+    def _try_lpips(self, call: TrainingCall) -> None:
+        """Compute an LPIPS if reports will: its networks are downloaded at the first, hours into the training."""
+        due = [i for i in call.values["testing_iterations"] if 0 < i <= call.opt.iterations]
+        if not due or not hasattr(self.train, "lpips"):
+            return
+        image = torch.zeros(1, 3, 64, 64)
+        try:
+            with torch.no_grad(), torch.random.fork_rng():  # drawing their first weights is not to change the training
+                self.train.lpips(image, image, net_type="vgg")
+        except Exception as error:  # a package, a download, a damaged file: training would stop at any of them
+            raise UserInputError(
+                f"--test_iterations {' '.join(map(str, due))}: the checkout computes LPIPS then, which fails now "
+                f"already ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}); "
+                "mend that, or leave these reports out with --test_iterations -1: `lapgs eval` measures the run"
+            ) from error
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)

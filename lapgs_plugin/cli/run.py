@@ -116,11 +116,11 @@ def run(
 
     import torch
 
-    from lapgs_plugin.adapters.active_stage import HierarchyOptions
     from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
     from lapgs_plugin.adapters.driver import HierarchyDriver
     from lapgs_plugin.adapters.installed_rasterizer import explained
     from lapgs_plugin.adapters.known import adapter_class
+    from lapgs_plugin.adapters.run_state import HierarchyOptions
     from lapgs_plugin.adapters.script import loaded_script, require_script
     from lapgs_plugin.inheritance import parse_inheritance
 
@@ -149,10 +149,11 @@ def run(
             "--device cuda: PyTorch sees no CUDA device here; --device cpu runs the checkout on stand-ins"
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
-    kind: type[BackboneAdapter] = adapter_class(require_script(script).parent, backbone)
-    on_device = cuda_on_cpu(kind.info.stand_in) if chosen == "cpu" else nullcontext()
+    checkout, words = require_script(script).parent, arguments or []
+    kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
+    on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
     try:
-        with on_device, loaded_script(script, arguments or []) as loaded:
+        with on_device, loaded_script(script, words) as loaded:
             if off:
                 loaded.run_main()
                 return

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.adapters.active_stage import HierarchyOptions
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
 from lapgs_plugin.adapters.driver import HierarchyDriver
 from lapgs_plugin.adapters.known import adapter_class
+from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.adapters.script import loaded_script
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.hooks import StageHook

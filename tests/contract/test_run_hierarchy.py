@@ -196,15 +196,19 @@ def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene
         drive(adapter, hooks=(recorder,), supervision=supervision)
     image, target = next(pair for pair in compared if pair[0].shape == (3, 48, 64))
     assert not image.any(), "a residual without colour, not composed"
-    context, _ = recorder.contexts[0][0]
+    context, told = recorder.contexts[0][0]
     (photo,) = [
         view.image for view in load_scene(scene, progress=False).train if view.name.startswith(Path(context.view).stem)
     ]
+    assert context.accumulated is not None
+    assert torch.equal(told, context.accumulated), "hooks see composed images"
+    assert (context.target - photo).abs().max() < 5e-4, "and I^l"  # 0 seen
     below = context.accumulated
     if supervision == "gt_laplacian":
         pyramid = Pyramid("camera")
         below = pyramid.up(pyramid.gaussian(photo, 2)[1], (48, 64))
-    assert below is not None
+        assert context.coarse_target is not None
+        assert (context.coarse_target - below).abs().max() < 5e-4  # 2.4e-4 seen: float16
     assert (target - (photo - below)).abs().max() < 5e-4  # 1.2e-4 seen: float16
 
 

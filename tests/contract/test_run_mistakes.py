@@ -7,6 +7,7 @@ import logging
 import shutil
 import subprocess
 import sys
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ import torch
 from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
 from lapgs_plugin.adapters.installed_rasterizer import explained
 from lapgs_plugin.adapters.known import adapter_class
+from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.adapters.script import loaded_script, require_script
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.archive import CACHE, RunArchive
 from lapgs_plugin.cli import app
-from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.errors import LapgsError, RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import Stage
 from tests.contract.stub_runs import (
@@ -166,16 +168,72 @@ def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.Mon
     assert explained(ModuleNotFoundError("no", name="numpy"), "train.py") is None
 
 
-def test_sparse_adam_that_is_not_installed(scene: Path, tmp_path: Path) -> None:
-    stub = Stub("graphdeco", "graphdeco-aa", STUBS["graphdeco"].options)
-    with pytest.raises(UserInputError, match="has no SparseGaussianAdam") as caught:
+@pytest.mark.parametrize("stub", [Stub("graphdeco", "graphdeco-aa", ("--disable_viewer",)), STUBS["fastgs"]])
+def test_sparse_adam_that_is_not_installed(stub: Stub, scene: Path, tmp_path: Path) -> None:
+    """FastGS looks for it in a module that is not its own rasterizer."""
+    with pytest.raises(UserInputError, match="found no SparseGaussianAdam to import") as caught:
         run_hierarchy(stub, scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
     one_line(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+def test_lpips_of_a_report_is_tried_before_training(scene: Path, tmp_path: Path) -> None:
+    """Taming-3DGS downloads its networks at the first report; without a connection hours of training would be lost."""
+    tried: list[str] = []
+
+    def lpips(image: torch.Tensor, photo: torch.Tensor, net_type: str) -> torch.Tensor:
+        tried.append(net_type)
+        torch.rand(7)
+        raise OSError("no route to host\nsecond line")
+
+    more = ("--test_iterations", 7_000, 60)
+    with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", *more) as adapter:
+        vars(adapter.train)["lpips"] = lpips
+        with pytest.raises(UserInputError, match=r"--test_iterations 60: .*OSError: no route to host") as caught:
+            drive(adapter)
+    assert tried == ["vgg"]
+    assert "--test_iterations -1" in one_line(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_path: Path) -> None:
+    """Every Gaussian turns transparent in the second stage, just before the backbone prunes."""
+    folder = tmp_path / "run"
+    method = {"fastgs": "final_prune_fastgs", "taming": "densify_with_score", "graphdeco": "densify_and_prune"}[name]
+    with captured(tmp_path, []), loaded(STUBS[name], scene, folder) as adapter:
+        model = adapter.train.GaussianModel
+        original = getattr(model, method)
+
+        @wraps(original)
+        def spy(self: Any, *args: Any, **kwargs: Any) -> None:
+            original(self, *args, **kwargs)
+            if RunArchive.open(folder).available_levels:
+                self.prune_points(torch.ones(len(self.get_xyz), dtype=torch.bool))
+
+        setattr(model, method, spy)
+        with pytest.raises(TrainingDivergedError, match=r"no Gaussian at level 0, iteration [0-9]+ of 60") as caught:
+            drive(adapter)
+    assert "finished levels (1) are kept" in one_line(caught.value)
+    assert RunArchive.open(folder).available_levels == (1,)
+
+
+def test_options_of_the_hierarchy_are_checked_before_anything_is_read() -> None:
+    for options, message in (
+        ({"prediction_precision": "int4"}, "--prediction-precision int4: expected float32, float16, uint8"),
+        ({"images_on": "tape"}, "--images-on tape: expected auto, gpu, memory, disk"),
+        ({"residual_color_rate": 0.0}, "--residual-color-rate 0.0: expected a positive factor"),
+        ({"split": "half"}, "--split 'half'"),
+    ):
+        with pytest.raises(UserInputError, match=message) as caught:
+            HierarchyOptions(**options)
+        one_line(caught.value)
 
 
 REFUSED: list[tuple[str, tuple[Any, ...], str]] = [
     *((name, ("--start_checkpoint", "chkpnt.pth"), "a checkpoint holds one field, not a hierarchy") for name in NAMES),
     *((name, ("--random_background",), "rendered over one background") for name in NAMES),
+    *((name, ("--convert_SHs_python",), "fails without lapgs too") for name in NAMES),
     ("taming", ("--benchmark_dir", "times"), "would write every stage's timings over the last one's"),
 ]
 
@@ -237,7 +295,7 @@ def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         run_hierarchy(STUBS["graphdeco"], scene, folder, hooks=(StopAt(0),))
     for more, options in ((("--iterations", 120), {}), ((), {"inherit": "xyz"}), (("-r", 60), {})):
-        with pytest.raises(RunFolderError, match="started with another") as caught:
+        with pytest.raises(RunFolderError, match=r"started with another (iterations|inherit|scene) ") as caught:
             run_hierarchy(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
         one_line(caught.value)
 
@@ -256,8 +314,10 @@ def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp
     for part in ("out of GPU memory at level 0", "finished levels (1) are kept", "--resume", "images", "2.00 GiB"):
         assert part in message
     assert RunArchive.open(folder).available_levels == (1,)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, resume=True)
+    # Where images lie is what the message offers to change.
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, resume=True, images_on="disk")
     assert archive.manifest.complete
+    assert not archive.path(CACHE).exists()
 
 
 def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:

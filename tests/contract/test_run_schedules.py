@@ -167,17 +167,14 @@ def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict
     return found
 
 
-def test_fastgs_prunes_late_and_steps_by_the_share_of_each_stage(scene: Path, tmp_path: Path) -> None:
-    """Published for 30,000 iterations: pruning at 18,000, 21,000, 24,000 and 27,000; all steps until 15,000, then every
-    32nd until 20,000, then every 64th; higher SH every 16th at first."""
-    more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0, "-r", 2)
-    found = record_fastgs(scene, tmp_path / "run", *more, levels=1)
-    assert found["prune"] == [(600, i) for i in (360, 420, 480, 540)]
-    steps = [i for _, i in found["step"]]
-    assert steps[:300] == list(range(1, 301))
-    assert steps[300:] == [320, 352, 384, 448, 512, 576]
-    assert sum(i <= 300 for _, i in found["sh_step"]) == 300 // 16
-    assert [i for _, i in found["sh_step"] if i > 300] == steps[300:]
+def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_stage(scene: Path, tmp_path: Path) -> None:
+    """Published for 30,000 iterations: pruning at 18,000, 21,000, 24,000 and 27,000; all steps until 15,000, higher SH
+    every 16th. A stage's last iteration does not step."""
+    more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0)
+    found = record_fastgs(scene, tmp_path / "run", *more)
+    assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
+    assert found["step"] == [(n, i) for n in (200, 400) for i in range(1, n)]
+    assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
 
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:

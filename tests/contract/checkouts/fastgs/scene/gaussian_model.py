@@ -1,5 +1,7 @@
 """FastGS's Gaussians: scored by several views, with an optimizer of their own for the higher SH."""
 
+import contextlib
+
 import numpy as np
 import torch
 from simple_knn._C import distCUDA2
@@ -8,10 +10,8 @@ from utils.general_utils import identity_gate, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 
-try:
+with contextlib.suppress(ImportError):
     from diff_gaussian_rasterization import SparseGaussianAdam
-except ImportError:
-    SparseGaussianAdam = None
 
 
 class GaussianModel(GaussianBase):

@@ -1,5 +1,7 @@
 """graphdeco's Gaussians, with the exposure of each photo."""
 
+import contextlib
+
 import numpy as np
 import torch
 from simple_knn._C import distCUDA2
@@ -9,10 +11,8 @@ from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 
-try:
+with contextlib.suppress(ImportError):
     from diff_gaussian_rasterization import SparseGaussianAdam
-except ImportError:
-    SparseGaussianAdam = torch.optim.Adam
 
 
 class GaussianModel(GaussianBase):

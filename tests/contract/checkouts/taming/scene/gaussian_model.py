@@ -1,5 +1,7 @@
 """Taming-3DGS's Gaussians: grown to a budget by scores, their opacities without an upper limit towards the end."""
 
+import contextlib
+
 import numpy as np
 import torch
 from simple_knn._C import distCUDA2
@@ -8,10 +10,8 @@ from utils.general_utils import identity_gate
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 
-try:
+with contextlib.suppress(ImportError):
     from diff_gaussian_rasterization import SparseGaussianAdam
-except ImportError:
-    SparseGaussianAdam = None
 
 
 class GaussianModel(GaussianBase):

@@ -1,0 +1,132 @@
+"""What the stages of a run over a checkout share, and what each hands on to the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.hooking import HookCaller
+from lapgs_plugin.adapters.level_views import PhotoAlbum
+from lapgs_plugin.adapters.shim import RasterizerShim
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore
+from lapgs_plugin.plan import parse_split
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.supervision import parse_supervision
+
+PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
+"""10k and 20k of 30k iterations for two levels, as in the paper's main tables; more levels take `StagePlan`'s."""
+
+
+@dataclass(frozen=True)
+class HierarchyOptions:
+    """What a user can choose about the hierarchy; everything else is the backbone's.
+
+    Attributes:
+        levels: number of levels; 1 is the plain backbone, archived as a run.
+        split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
+        grid: of the pyramid.
+        supervision, inherit, inherit_ratio: see their modules.
+        residual_color_rate: factor on the SH learning rates of residual stages, above 0.
+        images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
+        prediction_precision: what cached predictions are stored as, a key of `imagestore.PRECISIONS`.
+        fused_adam: let PyTorch's Adam step each tensor in one kernel.
+        seed: of the draw of inherited Gaussians.
+
+    Raises:
+        UserInputError: one of them is none of what it can be.
+    """
+
+    levels: int = 2
+    split: str | None = None
+    grid: str = "camera"
+    supervision: str = "reconstructed"
+    inherit: str = "geometry"
+    inherit_ratio: float = 1.0
+    residual_color_rate: float = 4.0
+    images_on: str = "auto"
+    prediction_precision: str = "float16"
+    fused_adam: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        parse_supervision(self.supervision)
+        Pyramid(self.grid)
+        self.shares()
+        if self.residual_color_rate <= 0 or not math.isfinite(self.residual_color_rate):
+            raise UserInputError(f"--residual-color-rate {self.residual_color_rate}: expected a positive factor")
+        if self.images_on not in ("auto", *PLACES):
+            raise UserInputError(f"--images-on {self.images_on}: expected {', '.join(('auto', *PLACES))}")
+        if self.prediction_precision not in PRECISIONS:
+            raise UserInputError(
+                f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
+            )
+
+    def shares(self) -> tuple[Fraction, ...] | None:
+        """Of the iterations for each stage, coarsest first; None leaves them to `StagePlan`."""
+        if self.split is not None:
+            return parse_split(self.split)
+        return PAPER_SPLIT if self.levels == len(PAPER_SPLIT) else None
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What all stages of a run share.
+
+    Attributes:
+        adapter: of the checkout.
+        options: of the hierarchy.
+        device: where the checkout renders.
+        album: the images of its scene.
+        shim: between its render and its rasterizer.
+        hooks: of the user.
+    """
+
+    adapter: BackboneAdapter
+    options: HierarchyOptions
+    device: torch.device
+    album: PhotoAlbum
+    shim: RasterizerShim
+    hooks: HookCaller
+
+
+@dataclass(frozen=True)
+class LoadedScene:
+    """A checkout's scene, its cameras without images."""
+
+    scene: Any
+    points: Any  # the checkout's BasicPointCloud
+    others: tuple[Any, ...]  # what create_from_pcd takes after the points
+
+    @property
+    def train(self) -> list[Any]:
+        return list(self.scene.getTrainCameras())
+
+    @property
+    def test(self) -> list[Any]:
+        return list(self.scene.getTestCameras())
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a stage leaves for the next one.
+
+    Attributes:
+        field: its Gaussians, on the CPU.
+        predictions: Up(I_hat^l) of every view by key; None after the finest level.
+        carried: attributes for the next model.
+        moments: optimizer state by parameter group, for full inheritance.
+    """
+
+    field: GaussianField
+    predictions: ImageStore | None
+    carried: Mapping[str, Any]
+    moments: Mapping[str, dict[str, Tensor]]

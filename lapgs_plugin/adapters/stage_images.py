@@ -1,0 +1,120 @@
+"""The images of one stage: its level of the photos, what lies below them, and where all of them wait."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lapgs_plugin.adapters.level_views import PhotoAlbum
+from lapgs_plugin.adapters.run_state import HierarchyOptions, LoadedScene
+from lapgs_plugin.imagestore import PRECISIONS, ImageStore, place
+from lapgs_plugin.plan import Stage, level_size
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.supervision import Supervision, parse_supervision
+
+
+class StageImages:
+    """Images of a stage by the album's keys; empty stores until `load`.
+
+    Args:
+        album: full-size images of the scene.
+        scene: whose cameras they are.
+        stage: which level.
+        options: of the hierarchy.
+        device: where images are handed out.
+        folder: for images on the disk.
+        accumulated: Up(I_hat^(l+1)) of every view, closed with the rest; None for the base.
+    """
+
+    def __init__(
+        self,
+        album: PhotoAlbum,
+        scene: LoadedScene,
+        stage: Stage,
+        options: HierarchyOptions,
+        device: torch.device,
+        folder: Path,
+        accumulated: ImageStore | None,
+    ) -> None:
+        self._album, self._stage, self._options = album, stage, options
+        self._device, self._folder = device, folder
+        self._pyramid, self._supervision = Pyramid(options.grid), parse_supervision(options.supervision)
+        self.train, self.test = scene.train, scene.test
+        self._keys = {id(camera): album.key(camera) for camera in self.cameras}
+        self.accumulated = accumulated
+        # Photos of 8 bits are themselves only at full size: averages need more.
+        self.targets = self._store("uint8" if stage.level == 0 and album.exact else "float16", stage.level, "targets")
+        of_laplacian = stage.signed and self._supervision is Supervision.GT_LAPLACIAN
+        self.coarse = self._store("float16", stage.level, "coarse") if of_laplacian else None
+
+    @property
+    def cameras(self) -> list[Any]:
+        return [*self.train, *self.test]
+
+    @property
+    def keys(self) -> frozenset[str]:
+        return frozenset(self._keys.values())
+
+    @property
+    def composed_keys(self) -> frozenset[str]:
+        """Views whose rendered residual is composed: all, but for the ablations that supervise residuals alone."""
+        cameras = self.cameras if self._supervision is Supervision.RECONSTRUCTED else self.test
+        return frozenset(self.key(camera) for camera in cameras)
+
+    def key(self, camera: Any) -> str:
+        return self._keys[id(camera)]
+
+    def size(self, camera: Any, level: int) -> tuple[int, int]:
+        """(width, height) of a camera's image at a level."""
+        return level_size(self._album.photo(self.key(camera)).size, level)
+
+    def load(self) -> None:
+        """Make the level's images of every view: I^l, and Up(I^(l+1)) of training views if the supervision needs it."""
+        level = self._stage.level
+        of_laplacian = set() if self.coarse is None else {self.key(camera) for camera in self.train}
+        for camera in self.cameras:
+            key = self.key(camera)
+            photo = self._album.photo(key).image(self._device)
+            images = self._pyramid.gaussian(photo, level + 1 + (key in of_laplacian))
+            self.targets.put(key, images[level])
+            if self.coarse is not None and key in of_laplacian:
+                height, width = images[level].shape[1:]
+                self.coarse.put(key, self._pyramid.up(images[level + 1], (height, width)))
+
+    def new_predictions(self) -> ImageStore:
+        """An empty store for Up(I_hat^l) of every view."""
+        return self._store(self._options.prediction_precision, self._stage.level - 1, "predictions")
+
+    @property
+    def bytes_on_device(self) -> int:
+        """Bytes of this stage's images on the GPU."""
+        return sum(store.bytes_on_device for store in self._stores)
+
+    @property
+    def wait_elsewhere(self) -> bool:
+        """Whether some have to be brought to the device before they can be read."""
+        from_memory = self._device.type == "cuda"
+        return any(store.bytes_on_disk or (from_memory and store.bytes_in_memory) for store in self._stores)
+
+    def close(self) -> None:
+        """Let go of all of them."""
+        for store in self._stores:
+            store.close()
+
+    @property
+    def _stores(self) -> tuple[ImageStore, ...]:
+        return tuple(store for store in (self.targets, self.coarse, self.accumulated) if store is not None)
+
+    def _store(self, precision: str, level: int, name: str) -> ImageStore:
+        """A store for an image of every view at a level, where the user wants it or where it fits."""
+        where = self._options.images_on
+        if where == "auto":
+            values = 3 * sum(math.prod(self.size(camera, level)) for camera in self.cameras)
+            where = place(values * PRECISIONS[precision].itemsize, self._device)
+        elif where == "gpu" and self._device.type == "cpu":
+            where = "memory"
+        folder = self._folder / f"{name}_{self._stage.level}"
+        return ImageStore(where, precision, device=self._device, folder=folder)
