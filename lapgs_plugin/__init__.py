@@ -1,6 +1,66 @@
 """Laplacian frequency hierarchies for 3D Gaussian Splatting codebases.
 
-Importing this package pulls in neither torch nor a backbone, so that `lapgs --help` is instant.
+The names below are what a training loop of one's own needs; `examples/` adds them to two. Importing this package pulls
+in neither torch nor a backbone, so that `lapgs --help` is instant: each name is imported when it is first looked at.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
+    from lapgs_plugin.camera import Camera, level_intrinsics
+    from lapgs_plugin.field import GaussianField
+    from lapgs_plugin.imagestore import ImageStore
+    from lapgs_plugin.inheritance import field_from_points, inherit
+    from lapgs_plugin.plan import Stage, StagePlan, level_size
+    from lapgs_plugin.pyramid import Pyramid
+    from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
+    from lapgs_plugin.splats import field_from_splats, splats_from_field
+    from lapgs_plugin.supervision import photometric_loss
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "Camera",
+    "GaussianField",
+    "HierarchyRenderer",
+    "ImageStore",
+    "LevelRecord",
+    "Manifest",
+    "Pyramid",
+    "RunArchive",
+    "SceneReference",
+    "Stage",
+    "StagePlan",
+    "field_from_points",
+    "field_from_splats",
+    "inherit",
+    "level_camera",
+    "level_intrinsics",
+    "level_size",
+    "photometric_loss",
+    "splats_from_field",
+]
+
+_MODULES = {
+    "archive": ("LevelRecord", "Manifest", "RunArchive", "SceneReference"),
+    "camera": ("Camera", "level_intrinsics"),
+    "field": ("GaussianField",),
+    "imagestore": ("ImageStore",),
+    "inheritance": ("field_from_points", "inherit"),
+    "plan": ("Stage", "StagePlan", "level_size"),
+    "pyramid": ("Pyramid",),
+    "rendering.compose": ("HierarchyRenderer", "level_camera"),
+    "splats": ("field_from_splats", "splats_from_field"),
+    "supervision": ("photometric_loss",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

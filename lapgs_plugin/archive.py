@@ -27,6 +27,7 @@ from lapgs_plugin import __version__
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField, count_gaussians
 from lapgs_plugin.files import LOCK, TEMPORARY_PATTERN, FolderLock, atomic_write, one_line_errors
+from lapgs_plugin.plan import Stage
 
 FORMAT_VERSION = 1
 
@@ -82,6 +83,12 @@ class LevelRecord:
     image_size: tuple[int, int]
     memory_bytes: dict[str, int] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:
+        """The record of a stage that one's own loop trained, and of which no more was measured than its time."""
+        n = len(field)
+        return cls(stage.level, stage.signed, stage.iterations, n, n, train_seconds, {}, stage.image_size)
+
 
 @dataclass(frozen=True)
 class Manifest:
@@ -124,6 +131,23 @@ class Manifest:
         expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
         if finished != expected:
             raise UserInputError(f"finished levels {finished}, expected {expected} of {self.levels}, coarsest first")
+
+    @classmethod
+    def of_loop(
+        cls,
+        scene: SceneReference,
+        levels: int,
+        rasterizer: str,
+        *,
+        grid: str = "camera",
+        inherit: str = "geometry",
+        sh_degree: int = 3,
+    ) -> Manifest:
+        """The manifest of a run that one's own loop trains, composed images against photographs.
+
+        Such a run is rendered and measured as any other; `lapgs train --resume` does not continue it.
+        """
+        return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings={})
 
     @property
     def complete(self) -> bool:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from lapgs_plugin.plan import level_size
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -41,6 +43,11 @@ class Camera:
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
+    @property
+    def intrinsics(self) -> Tensor:
+        """The (3, 3) matrix K, with the pose's type and device."""
+        return self.world_to_camera.new_tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
     def resized(self, width: int, height: int) -> Camera:
         """The camera with exactly the same field of view at another image size: how a pyramid level is rendered."""
         sx, sy = width / self.width, height / self.height
@@ -51,3 +58,21 @@ class Camera:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The camera with its pose on another device or in another precision."""
         return replace(self, world_to_camera=self.world_to_camera.to(device=device, dtype=dtype))
+
+
+def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> Tensor:
+    """The intrinsics of a pyramid level's camera, for loops that keep cameras as matrices.
+
+    Odd sizes are rounded up, and the field of view stays: focal lengths are not simply halved.
+
+    Args:
+        intrinsics: (..., 3, 3) matrices K of the full-resolution camera.
+        size: (width, height) of the full-resolution image.
+        level: 0 is full resolution.
+
+    Returns:
+        (..., 3, 3) with the type and device of `intrinsics`.
+    """
+    width, height = level_size(size, level)
+    factors = intrinsics.new_tensor([width / size[0], height / size[1], 1.0])
+    return intrinsics * factors[:, None]

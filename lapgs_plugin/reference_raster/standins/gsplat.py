@@ -1,0 +1,134 @@
+"""`gsplat.rasterization` and `gsplat.spherical_harmonics` on the CPU, for loops that are written against gsplat.
+
+One camera a call, plain colours or SH, no depths. What is rendered is what `CpuRasterizer` renders: alpha is capped at
+0.99 instead of 0.999, and footprints end at three sigma.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.inheritance import SH_C0
+from lapgs_plugin.reference_raster.fast import CpuRasterizer
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+
+__all__ = ["rasterization", "spherical_harmonics"]
+
+TILE = 16
+HIGHEST_OPACITY = 1 - 1e-6
+"""Opacities are handed on as logits; that of 1 is infinite."""
+CONVENTIONS = {
+    "near_plane": (0.01, 0.2),
+    "far_plane": (1e10,),
+    "radius_clip": (0.0,),
+    "eps2d": (0.3,),
+    "render_mode": ("RGB",),
+    "rasterize_mode": ("classic",),
+    "camera_model": ("pinhole",),
+    "sparse_grad": (False,),
+    "packed": (False,),
+}
+"""Arguments of which only these values are honoured. Everything nearer than 0.2 is culled."""
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Raw SH values, (n, 3): nothing added, nothing clamped, zero where `masks` (n,) is False.
+
+    Args:
+        degrees_to_use: highest degree, 0 to 3.
+        dirs: (n, 3), of any length.
+        coeffs: (n, k, 3).
+    """
+    values = sh_to_color(coeffs, torch.nn.functional.normalize(dirs, dim=-1), degrees_to_use, signed=True)  # (n, 3)
+    return values if masks is None else torch.where(masks[:, None], values, 0.0)
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    absgrad: bool = False,
+    tile_size: int = TILE,
+    **conventions: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render n Gaussians from one camera.
+
+    Args:
+        means: (n, 3).
+        quats: (n, 4), wxyz.
+        scales: (n, 3), not logarithms.
+        opacities: (n,) in [0, 1], not logits.
+        colors: (n, 3), shown as they are; or, with `sh_degree`, SH coefficients (n, k, 3) for max(SH + 0.5, 0).
+        viewmats: (1, 4, 4) world to camera.
+        Ks: (1, 3, 3) intrinsics.
+        sh_degree: highest degree to evaluate.
+        backgrounds: (1, 3), zero when None.
+        absgrad: leave absolute gradients of the centres in `info["means2d"].absgrad`.
+        conventions: the other arguments of gsplat, as far as they ask for what is done anyway.
+
+    Returns:
+        (1, h, w, 3) colours, (1, h, w, 1) opacities, and what densification looks at: "means2d" (1, n, 2) whose
+        gradient is there after `backward()`, "radii" (1, n, 2), "gaussian_ids", "width", "height", "n_cameras".
+
+    Raises:
+        UserInputError: more than one camera, or an argument asks for what this does not do.
+    """
+    if len(viewmats) != 1:
+        raise UserInputError(f"{len(viewmats)} cameras, expected one a call")
+    for name, value in conventions.items():
+        if value not in CONVENTIONS.get(name, ()):
+            raise UserInputError(f"{name}={value!r}: expected {CONVENTIONS.get(name, 'no such argument')} on the CPU")
+    field = GaussianField(
+        means,
+        quats,
+        scales.log(),
+        torch.logit(opacities.clamp_max(HIGHEST_OPACITY)),
+        colors[:, None] / SH_C0 if sh_degree is None else colors,
+        signed=sh_degree is None,
+    )
+    k = Ks[0].tolist()
+    camera = Camera(width, height, k[0][0], k[1][1], k[0][2], k[1][2], viewmats[0])
+    background = means.new_zeros(3) if backgrounds is None else backgrounds[0]
+    result = CpuRasterizer()(field, camera, background=background, sh_degree=0 if sh_degree is None else sh_degree)
+    assert result.transmittance is not None
+    info = {
+        "means2d": _with_gradient(result.means2d, result.absgrad2d if absgrad else None),
+        "radii": result.radii[None, :, None].expand(1, -1, 2),
+        "gaussian_ids": None,
+        "width": width,
+        "height": height,
+        "n_cameras": 1,
+        "tile_size": tile_size,
+    }
+    return result.image.permute(1, 2, 0)[None], 1 - result.transmittance[None, :, :, None], info
+
+
+def _with_gradient(means2d: Tensor, absgrad2d: Tensor | None) -> Tensor:
+    """Centres (1, n, 2) that get the gradient which the backward pass leaves for `means2d` (n, 2)."""
+    centres: Any = means2d.detach()[None].requires_grad_(means2d.requires_grad)
+    if means2d.requires_grad:
+
+        def hand_over(source: Tensor) -> None:
+            assert source.grad is not None
+            centres.grad = source.grad[None]
+            if absgrad2d is not None:
+                centres.absgrad = absgrad2d[None]
+
+        means2d.register_post_accumulate_grad_hook(hand_over)  # type: ignore[no-untyped-call]  # torch leaves it without types
+    found: Tensor = centres
+    return found
