@@ -13,11 +13,15 @@ from lapgs_plugin.errors import UserInputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.camera import Camera
     from lapgs_plugin.rendering.compose import HierarchyRenderer
     from lapgs_plugin.scenes import Scene, View
 
 SPLITS = ("test", "train", "all")
 FORMATS = ("png", "exr")
+OTHER_VIDEOS = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".webm")
+DEFAULT_FRAMES, DEFAULT_FPS = 240, 30
 
 
 def render(
@@ -32,9 +36,41 @@ def render(
     level: Annotated[
         int | None, typer.Option(help="Finest level to add; 0 is full resolution. Default: the finest that is trained.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/renders.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write to. Default: RUN/renders. With --trajectory an .mp4 file or a folder of images; "
+            "default: RUN/renders/<trajectory>.mp4.",
+        ),
+    ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Also write photo, composition and their difference side by side.")
+    ] = False,
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            help="Render a camera path instead of views: orbit (around what the cameras look at), spline (through the "
+            "training cameras) or a JSON file of cameras, laid out like transforms.json."
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help=f"Frames of the path. Default: {DEFAULT_FRAMES}, or each camera of a file once; with it, a smooth "
+            "path through those.",
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(min=1.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="Size of a path's views, such as 1280x720. Default: the cameras' own.")
+    ] = None,
+    panels: Annotated[
+        bool, typer.Option("--panels", help="Base, residuals and composition side by side; with --trajectory.")
     ] = False,
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
@@ -42,7 +78,7 @@ def render(
     device: DeviceOption = "auto",
     rasterizer: RasterizerOption = "auto",
 ) -> None:
-    """Write the images of RUN: base, each residual, and their composition, for every view.
+    """Write the images of RUN: base, each residual, and their composition, for every view or along a camera path.
 
     Files are called <view>_base, <view>_residual_<level> and <view>_composed, in one folder for held-out and one for
     training views. Base and residuals have their own level's size. In PNG residuals lie around mid-grey: zero is grey,
@@ -53,7 +89,15 @@ def render(
         lapgs render runs/garden
 
         lapgs render runs/garden --views all --format exr --out /tmp/garden
+
+        lapgs render runs/garden --trajectory orbit --size 1280x720 --out garden.mp4
+
+        lapgs render runs/garden --trajectory spline --panels --format exr --out frames/
     """
+    if trajectory is None:
+        _refuse({"--frames": frames, "--fps": fps, "--size": size, "--panels": panels or None}, "needs --trajectory")
+    else:
+        _refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
     from lapgs_plugin.archive import RENDERS, RunArchive
     from lapgs_plugin.reference_raster.threads import one_pool
     from lapgs_plugin.rendering.run import run_renderer, run_scene
@@ -65,12 +109,72 @@ def render(
     renderer = run_renderer(archive, device, rasterizer)
     level = renderer.finest if level is None else level
     renderer.require_level(level)
+    if trajectory is not None:
+        clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
+        with one_pool():
+            cameras = _path_cameras(archive, trajectory, frames, scene)
+            _write_clip(renderer, cameras, clip, level, size, fps=fps, panels=panels, image_format=image_format)
+        print(f"{clip} holds the clip, {len(cameras)} frames")
+        return
     folder = archive.path(RENDERS) if out is None else out
     with one_pool():
         loaded = run_scene(archive, scene)
         for split, chosen in _choose(loaded, views).items():
             _write_views(renderer, chosen, level, folder=folder / split, image_format=image_format, compare=compare)
     print(f"{folder} holds the images")
+
+
+def _refuse(options: dict[str, object], why: str) -> None:
+    """Say that an option would have no effect."""
+    for option, value in options.items():
+        if value is not None:
+            raise UserInputError(f"{option} {why}; leave it out")
+
+
+def _path_cameras(archive: RunArchive, trajectory: str, frames: int | None, scene: Path | None) -> list[Camera]:
+    """The cameras of a path, one a frame."""
+    from lapgs_plugin.rendering.rig import Rig
+    from lapgs_plugin.rendering.run import run_cameras
+    from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
+
+    if trajectory not in ("orbit", "spline"):
+        cameras = read_trajectory(Path(trajectory))
+        return cameras if frames is None else spline(cameras, frames)
+    train = list(run_cameras(archive, scene)[0].values())
+    count = DEFAULT_FRAMES if frames is None else frames
+    return orbit(Rig.of(train), count) if trajectory == "orbit" else spline(walking_order(train), count)
+
+
+def _write_clip(
+    renderer: HierarchyRenderer,
+    cameras: Sequence[Camera],
+    out: Path,
+    level: int,
+    size: str | None,
+    *,
+    fps: float | None,
+    panels: bool,
+    image_format: str,
+) -> None:
+    from lapgs_plugin.rendering.clip import VIDEO, clip_size, parse_size, render_clip
+
+    if out.suffix.lower() in OTHER_VIDEOS:
+        raise UserInputError(f"--out {out}: expected an {VIDEO} file or a folder for images")
+    if out.suffix == VIDEO and image_format != "png":
+        raise UserInputError(f"--format {image_format}: a video has 8 bits; give --out a folder")
+    if out.suffix != VIDEO:
+        _refuse({"--fps": fps}, f"needs an {VIDEO} file as --out")
+    wanted = None if size is None else parse_size(size)
+    render_clip(
+        renderer,
+        cameras,
+        out,
+        level=level,
+        size=clip_size(cameras[0], wanted, out),
+        fps=DEFAULT_FPS if fps is None else fps,
+        panels=panels,
+        image_format=image_format,
+    )
 
 
 def _require_one_of(option: str, value: str | None, accepted: Sequence[str | None]) -> None:

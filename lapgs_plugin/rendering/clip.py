@@ -1,0 +1,137 @@
+"""A camera path as a clip: a video, or a folder of numbered images."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.progress import item_progress
+from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.images import around_grey
+from lapgs_plugin.rendering.trajectory import with_size
+from lapgs_plugin.rendering.video import FrameSink, video_writer
+from lapgs_plugin.scenes.images import write_image
+
+VIDEO = ".mp4"
+MIN_SIDE, MAX_SIDE = 16, 16384
+MAX_PENDING = 16
+"""Images that wait to be written; more would only fill the memory."""
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """A size as (width, height) from "1280x720".
+
+    Raises:
+        UserInputError: it is not of that form, or out of range.
+    """
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not all(MIN_SIDE <= side <= MAX_SIDE for side in size):
+        raise UserInputError(
+            f"--size {text}: expected WIDTHxHEIGHT in pixels, each from {MIN_SIDE} to {MAX_SIDE}, such as 1280x720"
+        )
+    return size
+
+
+def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tuple[int, int]:
+    """Width and height of each view of a clip.
+
+    Args:
+        camera: of the path.
+        wanted: as asked for, None for the camera's own size.
+        out: where the clip goes; a video's sides are even.
+
+    Raises:
+        UserInputError: a video of an odd size was asked for.
+    """
+    width, height = wanted or (camera.width, camera.height)
+    if out.suffix != VIDEO or width % 2 == height % 2 == 0:
+        return width, height
+    if wanted is not None:
+        raise UserInputError(
+            f"--size {width}x{height}: a video's sides are even; use {width + width % 2}x{height + height % 2}"
+        )
+    return width - width % 2, height - height % 2
+
+
+def render_clip(
+    renderer: HierarchyRenderer,
+    cameras: Sequence[Camera],
+    out: Path,
+    *,
+    level: int,
+    size: tuple[int, int],
+    fps: float,
+    panels: bool,
+    image_format: str = "png",
+) -> None:
+    """Render a path and write it.
+
+    Args:
+        renderer: of the run.
+        cameras: one a frame.
+        out: an .mp4 file, or a folder for frame_00000.png and so on.
+        level: finest level to add; coarser ones are brought to full size.
+        size: (width, height) of a view.
+        fps: frames a second of a video.
+        panels: base, residuals and composition side by side instead of the composition alone.
+        image_format: "png" or "exr", of a folder's images; EXR holds residuals as they are.
+
+    Raises:
+        LapgsError: what is written cannot be.
+    """
+    shown = renderer.levels - level + 1 if panels else 1
+    writer = (
+        video_writer(out, (size[0] * shown, size[1]), fps) if out.suffix == VIDEO else _image_writer(out, image_format)
+    )
+    raw = out.suffix != VIDEO and image_format == "exr"
+    with item_progress("frames") as progress, writer as write:
+        task = progress.add_task(f"Rendering {out.name}", total=len(cameras))
+        for camera in cameras:
+            sized = with_size(camera, size)
+            composition = renderer.render(sized, level)
+            write(_panels(renderer, composition, sized, raw) if panels else _whole(renderer, composition, sized))
+            progress.advance(task)
+
+
+def _whole(renderer: HierarchyRenderer, composition: Composition, camera: Camera) -> Tensor:
+    """The composition at the size of the view, (3, h, w)."""
+    finest = min(composition.composed)
+    return to_full_size(composition.composed[finest], camera, finest, renderer.pyramid)
+
+
+def _panels(renderer: HierarchyRenderer, composition: Composition, camera: Camera, raw: bool) -> Tensor:
+    """Base, residuals and composition side by side at the size of the view, (3, h, panels * w)."""
+    base = to_full_size(composition.base, camera, renderer.levels - 1, renderer.pyramid)
+    residuals = [
+        to_full_size(residual, camera, level, renderer.pyramid) for level, residual in composition.residuals.items()
+    ]
+    shown = residuals if raw else [around_grey(residual) for residual in residuals]
+    return torch.cat([base, *shown, _whole(renderer, composition, camera)], dim=2)
+
+
+@contextmanager
+def _image_writer(folder: Path, image_format: str) -> Iterator[FrameSink]:
+    """Write frames as numbered images, on threads: compressing a PNG takes longer than rendering it."""
+    pending: deque[Future[None]] = deque()
+    numbers = count()
+    with ThreadPoolExecutor() as pool:
+
+        def add(image: Tensor) -> None:
+            pending.append(pool.submit(write_image, folder / f"frame_{next(numbers):05d}.{image_format}", image))
+            if len(pending) > MAX_PENDING:
+                pending.popleft().result()
+
+        yield add
+        for written in pending:
+            written.result()

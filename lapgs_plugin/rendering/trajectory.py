@@ -1,0 +1,242 @@
+"""Camera paths: around what a scene's cameras look at, through the cameras themselves, or from a file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.rendering.rig import Rig, Vector, camera_positions
+
+MAX_KEYS = 24
+"""Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
+
+JUMPING = 2.0
+"""How much longer than a short way through all cameras their order makes it, where it is not one they were taken in."""
+
+FACING_SHARE = 0.5
+"""Radius of an orbit before cameras that all stand on one side, as a share of their spread."""
+
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+RIGID_TOLERANCE = 1e-3
+
+
+def orbit(rig: Rig, frames: int) -> list[Camera]:
+    """A closed circle, always looking at the rig's focus.
+
+    Around the focus at the cameras' mean height and distance where they surround it; otherwise a small circle about
+    their mean position, so that nothing is seen from where no photo was taken.
+
+    Args:
+        rig: the scene's cameras; the path has the size and lens of the median one.
+        frames: of the clip; the one after the last would be the first again.
+    """
+    positions = camera_positions(rig.cameras)
+    middle = positions.mean(axis=0)
+    if rig.surrounds:
+        height = float((middle - rig.focus) @ rig.up)
+        centre, axis = rig.focus + height * rig.up, rig.up
+        radius = float(np.median(np.linalg.norm(np.cross(positions - rig.focus, rig.up), axis=1)))
+        start = positions[0] - centre
+    else:
+        centre, axis = middle, _unit(rig.focus - middle)
+        radius = FACING_SHARE * float(np.sqrt(np.mean(np.sum((positions - middle) ** 2, axis=1))))
+        start = rig.up
+    first = _unit(start - (start @ axis) * axis)
+    second = np.cross(axis, first)
+    lens = _median_lens(rig.cameras)
+    angles = 2.0 * math.pi * np.arange(frames) / frames
+    places = [centre + radius * (math.cos(angle) * first + math.sin(angle) * second) for angle in angles]
+    return [_looking(lens, place, rig.focus, rig.up) for place in places]
+
+
+def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth path through cameras in the order given, from the first to the last.
+
+    Positions follow a cubic spline, orientations one of constant angular acceleration between two cameras; the time
+    between two grows with their distance, so that the speed is about even. Of many cameras every n-th is passed.
+
+    Args:
+        cameras: at least one; the path has the size and lens of the median one.
+        frames: of the clip.
+    """
+    keys = [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, MAX_KEYS).round().astype(int))]
+    lens = _median_lens(cameras)
+    positions = camera_positions(keys)
+    rotations = np.stack([key.world_to_camera[:3, :3].double().numpy().T for key in keys])  # (k, 3, 3) camera to world
+    times = _times(positions, rotations)
+    kept = np.concatenate([[True], np.diff(times) > 0])  # two photos from one tripod
+    times, positions, rotations = times[kept], positions[kept], rotations[kept]
+    if len(times) == 1:
+        return [_posed(lens, rotations[0], positions[0])] * frames
+    when = np.linspace(0.0, times[-1], frames)
+    places = CubicSpline(times, positions)(when)
+    turned = RotationSpline(times, Rotation.from_matrix(rotations))(when).as_matrix()
+    return [_posed(lens, rotation, place) for rotation, place in zip(turned, places, strict=True)]
+
+
+def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
+    """Cameras in an order in which somebody could have walked.
+
+    The order given, which for a video and for most people with a camera is how they walked; where that jumps to and
+    fro, a short way from the first camera past all others.
+    """
+    positions = camera_positions(cameras)
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)  # (n, n)
+    tour = _short_tour(distances)
+    as_given = float(np.diagonal(distances, 1).sum())
+    jumps = as_given > JUMPING * float(distances[tour[:-1], tour[1:]].sum())
+    return [cameras[i] for i in tour] if jumps else list(cameras)
+
+
+def read_trajectory(path: Path) -> list[Camera]:
+    """The cameras of a file, in its order: the layout of a Blender-style transforms.json, without images.
+
+    {"w": 1280, "h": 720, "fl_x": 1100, "frames": [{"transform_matrix": [[...], [...], [...], [...]]}, ...]}
+
+    Each matrix is camera to world with OpenGL's axes (x right, y up, z back). "fl_y" is "fl_x" unless given, "cx" and
+    "cy" the middle, and "camera_angle_x" in radians may replace "fl_x". A frame may have its own of all these but the
+    size.
+
+    Raises:
+        UserInputError: the file or one of its cameras is not usable; names the frame.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserInputError(
+            f"--trajectory {path}: cannot be read ({error.strerror}); expected orbit, spline or a JSON file of cameras"
+        ) from error
+    except ValueError as error:
+        raise UserInputError(
+            f"--trajectory {path}: not JSON ({error}); expected cameras as in transforms.json"
+        ) from error
+    frames = values.get("frames") if isinstance(values, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UserInputError(f'--trajectory {path}: no cameras in it, expected a list "frames" as in transforms.json')
+    cameras = []
+    for index, frame in enumerate(frames):
+        try:
+            cameras.append(_read_camera({**values, **frame}))
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+            raise UserInputError(
+                f"--trajectory {path}: the camera of frame {index} is not usable: {reason}; expected a rigid 4x4 "
+                "transform_matrix, w, h and fl_x or camera_angle_x"
+            ) from error
+    return cameras
+
+
+def trajectory_json(cameras: Sequence[Camera], fps: float) -> dict[str, Any]:
+    """Cameras as `read_trajectory` reads them; "fps" is for other programs."""
+    first = cameras[0]
+    frames = [
+        {
+            "transform_matrix": (np.linalg.inv(camera.world_to_camera.double().numpy()) @ OPENGL_AXES).tolist(),
+            **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        }
+        for camera in cameras
+    ]
+    return {"w": first.width, "h": first.height, "fps": fps, "frames": frames}
+
+
+def with_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera with another size and shape: the same vertical field of view, more or less to see at the sides."""
+    width, height = size
+    scale = height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=width / 2 + (camera.cx - camera.width / 2) * scale,
+        cy=camera.cy * scale,
+    )
+
+
+def _short_tour(distances: NDArray[np.float64]) -> list[int]:
+    """Indices of all points in an order from the first on that is short: to the nearest each time, then 2-opt."""
+    tour, left = [0], set(range(1, len(distances)))
+    while left:
+        tour.append(min(left, key=lambda i: (distances[tour[-1], i], i)))
+        left.remove(tour[-1])
+    improved = True
+    while improved:
+        improved = False
+        for i in range(len(tour) - 2):
+            here, after = distances[tour[i]], distances[tour[i + 1]]
+            ends = np.array(tour[i + 2 :])
+            beyond = np.array([*tour[i + 3 :], -1])  # nothing follows the last
+            gain = here[tour[i + 1]] - here[ends]
+            gain[:-1] += distances[ends[:-1], beyond[:-1]] - after[beyond[:-1]]
+            best = int(gain.argmax())
+            if gain[best] > 1e-9 * distances.max():
+                tour[i + 1 : i + 3 + best] = tour[i + 1 : i + 3 + best][::-1]
+                improved = True
+    return tour
+
+
+def _read_camera(values: dict[str, Any]) -> Camera:
+    width, height = int(values["w"]), int(values["h"])
+    if "camera_angle_x" in values and "fl_x" not in values:
+        focal = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
+    else:
+        focal = float(values["fl_x"])
+    focal_y = float(values.get("fl_y", focal))
+    cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    matrix = np.array(values["transform_matrix"], dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"transform_matrix has shape {matrix.shape}")
+    if not np.isfinite([*matrix.ravel(), focal, focal_y, cx, cy]).all():
+        raise ValueError("NaN or inf in it")
+    rotation = matrix[:3, :3]
+    off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
+    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError("transform_matrix is not a rotation and a translation")
+    if min(width, height, focal, focal_y) <= 0:
+        raise ValueError(f"{width}x{height} pixels with focal lengths {focal:g} and {focal_y:g}")
+    pose = torch.from_numpy(np.linalg.inv(matrix @ OPENGL_AXES)).float()
+    return Camera(width, height, focal, focal_y, cx, cy, pose)
+
+
+def _times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """When each key is passed, (k,): after the way from the first, a turn counting as half the usual way with it."""
+    ways = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    turns = np.linalg.norm(np.diff(rotations[:, :, 2], axis=0), axis=1)
+    usual_way, usual_turn = (float(np.median(steps)) if len(steps) else 0.0 for steps in (ways, turns))
+    way_of_turn = usual_way / usual_turn if min(usual_way, usual_turn) > 0 else 1.0
+    return np.concatenate([[0.0], np.cumsum(ways + 0.5 * way_of_turn * turns)])
+
+
+def _median_lens(cameras: Sequence[Camera]) -> Camera:
+    """The camera in the middle by field of view; its pose means nothing."""
+    return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2]
+
+
+def _looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
+    ahead = _unit(at - place)
+    right = _unit(np.cross(ahead, up))
+    return _posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
+
+
+def _posed(lens: Camera, rotation: NDArray[np.float64], place: Vector) -> Camera:
+    """A lens with a pose: rotation camera to world, (3, 3), and centre, (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ place
+    return replace(lens, world_to_camera=torch.from_numpy(pose).float())
+
+
+def _unit(vector: Vector) -> Vector:
+    return vector / np.linalg.norm(vector)
