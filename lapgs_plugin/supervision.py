@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 from functools import lru_cache
+from importlib import import_module
 
 import torch
 import torch.nn.functional as F
@@ -77,7 +79,8 @@ def supervised_pair(
 def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
     """3DGS's loss, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable with respect to the prediction.
 
-    On the CPU a fused kernel computes it together with its gradient, elsewhere plain PyTorch does.
+    On the CPU a fused kernel computes it together with its gradient. On a GPU SSIM comes from the package `fused_ssim`
+    where that is installed, else from plain PyTorch.
 
     Args:
         prediction, target: (3, h, w), the target without gradient.
@@ -90,7 +93,21 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
         from lapgs_plugin.reference_raster.loss import photometric_loss_cpu
 
         return photometric_loss_cpu(prediction, target, ssim_weight)
-    return photometric_loss_torch(prediction, target, ssim_weight)
+    fused = fused_ssim()
+    if fused is None or prediction.dtype != torch.float32:
+        return photometric_loss_torch(prediction, target, ssim_weight)
+    l1 = (prediction - target).abs().mean()
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(prediction[None], target[None]))
+
+
+@lru_cache(maxsize=1)
+def fused_ssim() -> Callable[[Tensor, Tensor], Tensor] | None:
+    """The function of that name from the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without it."""
+    try:
+        found: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
+    except ImportError:
+        return None
+    return found
 
 
 def photometric_loss_torch(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:

@@ -1,7 +1,10 @@
 """gsplat's CUDA rasterizer behind the one interface `lapgs_plugin.raster.Rasterizer`.
 
 gsplat passes colours through as they are, so signed colour needs nothing from it: SH are evaluated by its own kernel,
-and the colour map is ours.
+and nothing is added or clamped. For ordinary colour it gets the SH, and evaluates them where they are visible.
+
+A call waits for the GPU once, inside of gsplat, which asks how many pairs of Gaussian and tile there are; a packed one
+also asks how many Gaussians are visible.
 """
 
 from __future__ import annotations
@@ -58,16 +61,29 @@ class GsplatRasterizer:
     Args:
         device: where it renders; what takes gsplat's place on a CPU renders there.
         antialiasing: dim Gaussians that are smaller than a pixel, as graphdeco's option of that name does.
+        packed: keep what is computed of visible Gaussians alone: less memory, a little slower.
+        absgrad: offer `RenderResult.absgrad2d`, which costs a little of the backward pass.
+        own_radii: let `RenderResult.radii` be gsplat's, which bound where alpha reaches 1/255, instead of computing
+            those of three sigma; training looks at which are above 0 alone.
 
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
     """
 
-    def __init__(self, device: torch.device | str = "cuda", *, antialiasing: bool = False) -> None:
+    def __init__(
+        self,
+        device: torch.device | str = "cuda",
+        *,
+        antialiasing: bool = False,
+        packed: bool = False,
+        absgrad: bool = True,
+        own_radii: bool = False,
+    ) -> None:
         self._device = torch.device(device)
         if self._device.type == "cuda" and (reason := missing()):
             raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
         self._mode = "antialiased" if antialiasing else "classic"
+        self._packed, self._absgrad, self._own_radii = packed, absgrad, own_radii
 
     @property
     def name(self) -> str:
@@ -96,7 +112,7 @@ class GsplatRasterizer:
         n, width, height = len(field), camera.width, camera.height
         differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
         means2d = means.new_zeros(n, 2).requires_grad_(differentiated)  # (n, 2)
-        absgrad2d = means.new_zeros(n, 2) if differentiated else None
+        absgrad2d = means.new_zeros(n, 2) if differentiated and self._absgrad else None
         if n == 0:
             # Zero, and in the graph: a loss of the image can be differentiated by everything that is not there.
             nothing = torch.cat([value.flatten() for value in (means2d, *field.parameters.values())]).sum()
@@ -105,43 +121,79 @@ class GsplatRasterizer:
                 image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
             )
         degree = field.sh_degree if sh_degree is None else sh_degree
-        colors = spherical_harmonics(degree, means - camera.position.to(means), field.sh)  # (n, 3)
-        intrinsics = means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])  # (3, 3)
+        viewmat, intrinsics, position = _on_device(camera, means)
+        colors = field.sh  # (n, k, 3)
+        if field.signed:
+            colors = spherical_harmonics(degree, means - position, field.sh)  # (n, 3)
         images, alphas, found = rasterization(
             means,
             field.quaternions,
             torch.exp(field.log_scales),
             torch.sigmoid(field.opacity_logits),
-            colors if field.signed else torch.clamp_min(colors + 0.5, 0.0),
-            camera.world_to_camera.to(means)[None],  # (1, 4, 4)
+            colors,
+            viewmat[None],
             intrinsics[None],
             width,
             height,
+            sh_degree=None if field.signed else degree,
             near_plane=NEAR_DEPTH,
             eps2d=PIXEL_VARIANCE,
             radius_clip=0.0,
-            packed=False,
+            packed=self._packed,
             backgrounds=background.to(means)[None],  # (1, 3)
             rasterize_mode=self._mode,
-            absgrad=differentiated,
+            absgrad=absgrad2d is not None,
         )  # (1, h, w, 3), (1, h, w, 1)
-        if absgrad2d is not None:
-            _hand_over_gradients(found["means2d"], means2d, absgrad2d)
+        if differentiated:
+            _hand_over_gradients(found, means2d, absgrad2d)
         with torch.no_grad():
-            shown = (found["radii"][0] > 0).all(-1)  # (n,)
-            # What gsplat leaves for culled Gaussians is memory as it was; its pixels have their centre at 0.5.
-            means2d.copy_(torch.where(shown[:, None], found["means2d"][0] - 0.5, 0.0))
-            radii = torch.where(shown, _three_sigma_radii(found["conics"][0]), 0.0).to(torch.int32)  # (n,)
+            radii = self._describe(found, means2d)
         return RenderResult(images[0].permute(2, 0, 1), 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
 
+    def _describe(self, found: dict[str, Any], means2d: Tensor) -> Tensor:
+        """Fill in `means2d` (n, 2) and return the radii (n,) from what gsplat found."""
+        rows = found["gaussian_ids"] if self._packed else slice(None)
+        centres, theirs, conics = (
+            found[name] if self._packed else found[name][0] for name in ("means2d", "radii", "conics")
+        )  # (v, 2), (v, 2), (v, 3)
+        shown = (theirs > 0).all(-1)  # (v,)
+        # What gsplat leaves for culled Gaussians is memory as it was; its pixels have their centre at 0.5.
+        means2d[rows] = torch.where(shown[:, None], centres - 0.5, 0.0)
+        found_radii = theirs.amax(-1) if self._own_radii else _three_sigma_radii(conics)
+        radii = torch.zeros(len(means2d), dtype=torch.int32, device=means2d.device)  # (n,)
+        radii[rows] = torch.where(shown, found_radii, 0).to(torch.int32)
+        return radii
 
-def _hand_over_gradients(theirs: Tensor, means2d: Tensor, absgrad2d: Tensor) -> None:
-    """Let the backward pass leave what it finds for gsplat's centres (1, n, 2) in our (n, 2) of them."""
-    raw: Any = theirs
+
+def _on_device(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pose (4, 4), intrinsics (3, 3) and centre (3,) as tensors beside `like`, without waiting for its GPU."""
+    intrinsics = torch.tensor([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0], dtype=like.dtype)
+    pose = camera.world_to_camera
+    if pose.device.type != "cpu":
+        return pose.to(like), _sent(intrinsics, like.device).view(3, 3), camera.position.to(like)
+    numbers = _sent(torch.cat([intrinsics, pose.to(like.dtype).flatten(), camera.position.to(like.dtype)]), like.device)
+    return numbers[9:25].view(4, 4), numbers[:9].view(3, 3), numbers[25:]
+
+
+def _sent(numbers: Tensor, device: torch.device) -> Tensor:
+    """Numbers on their way to a GPU: from page-locked memory, since a copy from any other is waited for."""
+    return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers
+
+
+def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tensor | None) -> None:
+    """Let the backward pass leave what it finds for gsplat's centres, (1, n, 2) or packed (v, 2), in our (n, 2)."""
+    theirs: Any = found["means2d"]
+    ids: Tensor | None = found["gaussian_ids"] if theirs.ndim == 2 else None  # (v,)
+
+    def unpacked(values: Tensor) -> Tensor:
+        if ids is None:
+            return values[0]
+        return torch.zeros_like(means2d).index_copy_(0, ids, values)
 
     def hand_over(gradient: Tensor) -> None:
-        means2d.grad = gradient[0].clone()
-        absgrad2d.copy_(raw.absgrad[0])
+        means2d.grad = unpacked(gradient).clone()
+        if absgrad2d is not None:
+            absgrad2d.copy_(unpacked(theirs.absgrad))
 
     theirs.register_hook(hand_over)  # type: ignore[no-untyped-call]  # torch leaves it without types
 

@@ -227,6 +227,7 @@ class WithoutCuda:
 
     def __init__(self) -> None:
         self.asked: dict[str, Any] = {}
+        self.hooks: list[Any] = []
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, directions, coefficients)
@@ -246,9 +247,13 @@ class WithoutCuda:
         near_plane: float,
         eps2d: float,
         backgrounds: Tensor,
+        sh_degree: int | None = None,
         **asked: Any,
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         self.asked = {"near_plane": near_plane, "eps2d": eps2d, **asked}
+        if sh_degree is not None:
+            position = torch.linalg.inv(viewmats[0])[:3, 3]
+            colors = (self.spherical_harmonics(sh_degree, means - position, colors) + 0.5).clamp_min(0.0)
         covariances, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
         radii, means2d, depths, conics, _ = _torch_impl._fully_fused_projection(
             means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
@@ -267,7 +272,28 @@ class WithoutCuda:
             )
         if asked["absgrad"]:
             means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
-        return image, alpha, {"radii": radii, "means2d": means2d, "conics": conics}
+        found = {"radii": radii, "means2d": means2d, "conics": conics}
+        if asked.get("packed"):
+            return image, alpha, self._packed(found, asked["absgrad"])
+        return image, alpha, {**found, "gaussian_ids": None}
+
+    def _packed(self, found: dict[str, Any], absgrad: bool) -> dict[str, Any]:
+        """What was found of the visible Gaussians alone; their centres have the gradients, as gsplat's have."""
+        ids = (found["radii"][0] > 0).all(-1).nonzero()[:, 0]
+        packed: Any = found["means2d"][0, ids]
+        whole = found["means2d"]
+
+        def hand_over(gradient: Tensor) -> None:
+            if absgrad:
+                packed.absgrad = gradient[0, ids].abs()
+            for hook in self.hooks:
+                hook(gradient[0, ids])
+
+        if whole.requires_grad:
+            whole.register_hook(hand_over)
+        packed.register_hook = self.hooks.append
+        radii, conics = found["radii"][0, ids], found["conics"][0, ids]
+        return {"radii": radii, "means2d": packed, "conics": conics, "gaussian_ids": ids}
 
 
 @pytest.fixture
@@ -322,6 +348,32 @@ def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: Without
         **{"rasterize_mode": "antialiased", "absgrad": False},
     }
     assert result.absgrad2d is None
+
+
+@pytest.mark.usefixtures("without_cuda")
+def test_packed_results_and_gsplats_own_radii_say_the_same() -> None:
+    case = faint(True)
+    weights, found = pixel_weights(case), []
+    for options in ({}, {"packed": True, "own_radii": True}):
+        fresh = case.with_leaves()
+        result = fresh.render(GsplatRasterizer("cpu", **options))
+        (result.image * weights).sum().backward()
+        found.append(result)
+    whole, packed = found
+    assert 0 < (whole.radii > 0).sum() < len(whole.radii)
+    assert torch.equal(whole.means2d, packed.means2d)
+    assert torch.equal(whole.means2d.grad.nan_to_num(), packed.means2d.grad)
+    assert torch.equal(whole.absgrad2d.nan_to_num(), packed.absgrad2d)
+    assert torch.equal(whole.radii > 0, packed.radii > 0)
+
+
+@pytest.mark.usefixtures("without_cuda")
+def test_absolute_gradients_are_left_out_where_nobody_asks() -> None:
+    case = faint(False).with_leaves()
+    result = case.render(GsplatRasterizer("cpu", absgrad=False))
+    result.image.sum().backward()
+    assert result.absgrad2d is None
+    assert result.means2d.grad is not None
 
 
 def test_gsplat_without_gaussians_shows_the_background(without_cuda: WithoutCuda) -> None:

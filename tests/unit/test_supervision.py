@@ -116,3 +116,30 @@ def test_supervisions_by_name() -> None:
     assert parse_supervision("gt_laplacian") is Supervision.GT_LAPLACIAN
     with pytest.raises(UserInputError, match="--supervision laplace: expected reconstructed, online_residual, gt_lap"):
         parse_supervision("laplace")
+
+
+def test_a_gpu_takes_the_fused_ssim_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The choice alone: the stand-in of the package renders its SSIM on the CPU."""
+    from lapgs_plugin import supervision
+    from lapgs_plugin.reference_raster.standins.fused_ssim import fused_ssim
+
+    prediction = torch.rand(3, 20, 30, requires_grad=True)
+    target = torch.rand(3, 20, 30)
+    expected = photometric_loss_torch(prediction, target)
+
+    class Elsewhere:
+        type = "cuda"
+
+    class OnGpu(torch.Tensor):
+        device = Elsewhere()
+
+    calls = []
+
+    def counted(*images: torch.Tensor) -> torch.Tensor:
+        calls.append([image.shape for image in images])
+        return fused_ssim(*(image.as_subclass(torch.Tensor) for image in images))
+
+    monkeypatch.setattr(supervision, "fused_ssim", lambda: counted)
+    found = photometric_loss(prediction.as_subclass(OnGpu), target)
+    assert calls == [[(1, 3, 20, 30)] * 2]
+    torch.testing.assert_close(found.as_subclass(torch.Tensor), expected)
