@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from lapgs_plugin.adapters.known import KnownCheckout
     from lapgs_plugin.environment import Finding, Probe
 
 IMPORTED = ("OpenImageIO", "pycolmap")
@@ -45,7 +46,6 @@ def examine() -> dict[str, list[Finding]]:
 
     from lapgs_plugin import environment
     from lapgs_plugin.adapters.known import KNOWN_EXTENSIONS, recognise_checkout
-    from lapgs_plugin.environment import Finding
 
     requirements = environment.own_requirements()
     with ThreadPoolExecutor() as pool:
@@ -56,12 +56,6 @@ def examine() -> dict[str, list[Finding]]:
         extensions = [pool.submit(environment.extension_finding, *known) for known in KNOWN_EXTENSIONS.items()]
     torch = torch_probe.result()
     compilers = environment.compiler_findings(torch.facts.get("cuda"))
-    checkout = recognise_checkout(Path.cwd())
-    here = (
-        Finding("Current folder", "ok", f"a checkout of {checkout.name}")
-        if checkout
-        else Finding("Current folder", "absent", "not a 3DGS checkout that is known")
-    )
     sections = {
         "System": environment.system_findings(),
         "PyTorch": environment.torch_findings(torch, driver.result()),
@@ -74,10 +68,23 @@ def examine() -> dict[str, list[Finding]]:
         "Backbones": [
             environment.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
             *(extension.result() for extension in extensions),
-            here,
+            _current_folder(recognise_checkout(Path.cwd()), bool(torch.facts.get("gpus"))),
         ],
     }
     return {**{title: found for title, found in sections.items() if found}, "lapgs train": _conclusion(sections, torch)}
+
+
+def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
+    """Whether it is a checkout, and what `lapgs run` would train it on."""
+    from lapgs_plugin.environment import Finding
+
+    if checkout is None:
+        return Finding("Current folder", "absent", "not a 3DGS checkout that is known")
+    detail = f"a checkout of {checkout.name}"
+    if checkout.key is not None:
+        place = "the GPU, with its own extensions" if has_gpu else "the CPU, on stand-ins of its extensions"
+        detail += f"; `lapgs run train.py ...` trains it on {place}"
+    return Finding("Current folder", "ok", detail)
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from lapgs_plugin import environment
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.environment import Probe
+from tests.contract.stub_runs import CHECKOUTS
 
 app = typer.Typer()
 app.command()(doctor)
@@ -37,3 +38,14 @@ def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.Monkey
     assert "[libfoo] is gone" in result.stdout  # not taken for markup
     assert "python -m pip install --force-reinstall torch" in result.stdout
     assert "nothing until this is mended" in result.stdout
+
+
+def test_the_current_folder_is_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+    for folder, message in (
+        ("fastgs", "a checkout of FastGS; `lapgs run train.py ...` trains it on the"),
+        ("", "not a"),
+    ):
+        monkeypatch.chdir(CHECKOUTS / folder)
+        found = json.loads(CliRunner().invoke(app, ["--json"]).stdout)["Backbones"][-1]
+        assert found["name"] == "Current folder"
+        assert found["detail"].startswith(message)
