@@ -16,11 +16,11 @@ from lapgs_plugin.errors import UserInputError
 
 logger = logging.getLogger(__name__)
 
-BASE_SHARE, FINEST_SHARE = 0.4, 0.6
+BASE_SHARE, FINEST_SHARE = 0.5, 1.0
 """Share of the budget that the base and the finest residual end with; stages between lie between.
 
-Both end below the whole budget, so that every iteration is cheaper than the backbone's own at the same progress, and
-each residual has room to grow from what it inherits.
+The base, at a fraction of the pixels, ends with half of it, so that the total work falls; shares of 0.4 and 0.6 cost
+1.4 dB on bonsai.
 """
 
 LOW_LOGIT = -1.0

@@ -98,7 +98,7 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
         stages = [adapter.stage_call(call, window, "run") for window in (BASE, FINEST)]
         count_array = sys.modules["utils.taming_utils"].get_count_array
         found = []
-        for start, stage in zip((1_000, 8_000), stages, strict=True):
+        for start, stage in zip((1_000, 10_000), stages, strict=True):
             given = stage.values["args"]
             counts = count_array(start, given.budget, stage.opt, mode=given.mode)
             # Densification number i looks up entry i + 1.
@@ -107,7 +107,7 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
             assert densifications < len(counts)
             assert sorted(counts) == counts
             found.append((given.budget, counts[-1] > 0.95 * given.budget, given.ho_iteration))
-    assert found == [(8_000, True, 5_000), (12_000, True, 10_000)]
+    assert found == [(10_000, True, 5_000), (20_000, True, 10_000)]
 
 
 def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
