@@ -34,6 +34,10 @@ class TrainingDivergedError(LapgsError):
     """Training produced NaN or inf; the last good archive is kept."""
 
 
+class DeviceMemoryError(LapgsError):
+    """A GPU has no memory left; finished levels and the last checkpoint are kept."""
+
+
 class TrainingStoppedError(LapgsError):
     """The user asked to stop; a checkpoint is in the run folder."""
 

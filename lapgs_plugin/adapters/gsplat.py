@@ -195,7 +195,7 @@ def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tens
         if absgrad2d is not None:
             absgrad2d.copy_(unpacked(theirs.absgrad))
 
-    theirs.register_hook(hand_over)  # type: ignore[no-untyped-call]  # torch leaves it without types
+    theirs.register_hook(hand_over)
 
 
 def _three_sigma_radii(conics: Tensor) -> Tensor:

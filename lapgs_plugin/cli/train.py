@@ -1,4 +1,4 @@
-"""`lapgs train`: a hierarchy without a checkout, on the CPU rasterizer."""
+"""`lapgs train`: a hierarchy without a checkout, on gsplat or on the CPU rasterizer."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 HIERARCHY = "Hierarchy"
 SCHEDULE = "Schedule"
+GSPLAT = "gsplat"
 RUN = "Run"
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -85,19 +86,54 @@ def train(
     opacity_reset_every: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
     ] = None,
+    strategy: Annotated[
+        str,
+        typer.Option(rich_help_panel=SCHEDULE, help="Density control: default (3DGS's heuristics) or mcmc (gsplat)."),
+    ] = "default",
+    cap_max: Annotated[
+        int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Most Gaussians of a level, for --strategy mcmc.")
+    ] = 1_000_000,
+    absgrad: Annotated[
+        bool,
+        typer.Option("--absgrad", rich_help_panel=SCHEDULE, help="Densify by absolute gradients (AbsGS)."),
+    ] = False,
+    antialiased: Annotated[
+        bool,
+        typer.Option("--antialiased", rich_help_panel=GSPLAT, help="Dim Gaussians that are smaller than a pixel."),
+    ] = False,
+    packed: Annotated[
+        bool, typer.Option("--packed", rich_help_panel=GSPLAT, help="Less memory where a view sees little; slower.")
+    ] = False,
+    sparse_adam: Annotated[
+        bool, typer.Option("--sparse-adam", rich_help_panel=GSPLAT, help="Step the Gaussians of the view alone.")
+    ] = False,
     rasterizer: Annotated[
-        str, typer.Option(rich_help_panel=RUN, help="cpu (fast) or oracle (slow, plain PyTorch, for checking).")
-    ] = "cpu",
+        str,
+        typer.Option(
+            rich_help_panel=RUN,
+            help="gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a "
+            "CUDA device, else cpu.",
+        ),
+    ] = "auto",
     threads: Annotated[
         int | None,
         typer.Option(rich_help_panel=RUN, min=1, help="Processor threads. Default: all this process may use."),
     ] = None,
     cache: Annotated[
-        str, typer.Option(rich_help_panel=RUN, help="Where finished levels' predictions are kept: memory or disk.")
-    ] = "memory",
+        str,
+        typer.Option(
+            rich_help_panel=RUN,
+            help="Where finished levels' predictions are kept: gpu, memory or disk. auto: a GPU while they are a small "
+            "part of it, else memory.",
+        ),
+    ] = "auto",
     cache_precision: Annotated[
-        str, typer.Option(rich_help_panel=RUN, help="How they are stored: float32, float16 or uint8.")
-    ] = "float32",
+        str,
+        typer.Option(
+            rich_help_panel=RUN,
+            help="How they are stored: float32, float16 or uint8. auto: float16 on a GPU, else float32.",
+        ),
+    ] = "auto",
     test_every: Annotated[
         int | None,
         typer.Option(
@@ -126,7 +162,8 @@ def train(
 
     from lapgs_plugin.archive import SceneReference
     from lapgs_plugin.inheritance import parse_inheritance
-    from lapgs_plugin.training.settings import Densification, TrainSettings
+    from lapgs_plugin.training.backend import ANTIALIASING, AUTO, choose_rasterizer
+    from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, TrainSettings
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
@@ -143,16 +180,29 @@ def train(
         seed=seed,
         cache=cache,
         cache_precision=cache_precision,
-        densification=Densification(densify_from, densify_until, densify_every, opacity_reset_every),
+        densification=Densification(
+            densify_from,
+            densify_until,
+            densify_every,
+            opacity_reset_every,
+            strategy=strategy,
+            absgrad=absgrad,
+            cap_max=cap_max,
+            **({"grow_grad2d": ABSGRAD_THRESHOLD} if absgrad else {}),
+        ),
+        packed=packed,
+        sparse_adam=sparse_adam,
+        raster={ANTIALIASING: True} if antialiased else {},
     )
     reference = SceneReference(str(scene.absolute()), resolution, hold_out, _color(background), images=images, kind="")
     console = Console(stderr=True)
     if resume:
-        archive = _resume(out, _options(reference, settings, rasterizer), _given(context))
+        given = _given(context) - ({"rasterizer"} if rasterizer == AUTO else set())
+        archive = _resume(out, _options(reference, settings, rasterizer), given)
         reference = replace(archive.manifest.scene, path=reference.path)
         loaded = _load(reference)
     else:
-        archive, loaded = _create(out, reference, settings, rasterizer, overwrite)
+        archive, loaded = _create(out, reference, settings, choose_rasterizer(rasterizer), overwrite)
     with archive:
         _run(
             archive,
@@ -199,9 +249,16 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         "densify_until": densification.until,
         "densify_every": densification.every,
         "opacity_reset_every": densification.reset_every,
+        "strategy": densification.strategy,
+        "cap_max": densification.cap_max,
+        "absgrad": densification.absgrad,
+        "antialiased": bool(settings.raster),
         **{
             name: getattr(settings, name)
-            for name in ("iterations", "levels", "split", "supervision", "grid", "sh_degree", "seed")
+            for name in (
+                *("iterations", "levels", "split", "supervision", "grid", "sh_degree", "seed"),
+                *("packed", "sparse_adam"),
+            )
         },
     }
 
@@ -245,11 +302,11 @@ def _create(
 ) -> tuple[RunArchive, Scene]:
     """Read the scene, check that it can be trained as asked, and only then make the run folder."""
     from lapgs_plugin.archive import Manifest, RunArchive
-    from lapgs_plugin.reference_raster import make_rasterizer
-    from lapgs_plugin.training.trainer import make_plan
+    from lapgs_plugin.training.backend import training_rasterizer
+    from lapgs_plugin.training.trainer import check_cache, make_plan
 
     RunArchive.require_room(out, overwrite)
-    make_rasterizer(rasterizer)
+    check_cache(settings, training_rasterizer(rasterizer, settings).device)
     loaded = _load(reference)
     make_plan(loaded, settings)
     manifest = Manifest(
@@ -273,8 +330,8 @@ def _run(
     """Train with a progress display."""
     import torch
 
-    from lapgs_plugin.reference_raster import make_rasterizer
     from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import ProgressMonitor
     from lapgs_plugin.training.settings import TrainSettings
     from lapgs_plugin.training.trainer import Trainer
@@ -282,12 +339,15 @@ def _run(
     if threads is not None:
         torch.set_num_threads(threads)
     manifest = archive.manifest
+    settings = TrainSettings.from_manifest(manifest)
+    placed = training_rasterizer(manifest.rasterizer, settings)
     with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
         trainer = Trainer(
             scene=scene,
-            settings=TrainSettings.from_manifest(manifest),
+            settings=settings,
             archive=archive,
-            rasterizer=make_rasterizer(manifest.rasterizer),
+            rasterizer=placed.rasterizer,
+            device=placed.device,
             monitor=monitor,
             checkpoint_every=checkpoint_every,
             test_every=test_every,

@@ -1,1 +1,1 @@
-"""The built-in trainer: a hierarchy without a checkout, on the CPU rasterizer."""
+"""The built-in trainer: a hierarchy without a checkout, on gsplat or on the CPU rasterizer."""

@@ -1,15 +1,58 @@
-"""Cloning, splitting, pruning and opacity reset, by gsplat's implementation of the 3DGS heuristics."""
+"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Protocol
 
-from gsplat.strategy import DefaultStrategy
+import torch
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy.ops import reset_opa
+from torch import Tensor
 
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
 from lapgs_plugin.raster import RenderResult
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
+
+MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
+"""Of a base field that starts from points: a tenth of the size and half opaque, as MCMC's authors start it."""
+MCMC_REGULARIZATION = 0.01
+"""Weight of the mean opacity and of the mean standard deviation in the loss."""
+
+
+class DensityControl(Protocol):
+    """What edits a field in training.
+
+    Attributes:
+        state: what it remembers between iterations, for checkpoints.
+    """
+
+    state: dict[str, Any]
+
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+        """Accumulate the statistics of one render and edit the field when the schedule says so.
+
+        Args:
+            model: edited in place; its parameters are new tensors afterwards when something changed.
+            iteration: counts from 1 within the stage.
+            result: the render, after `backward()`.
+            camera: it was rendered from.
+
+        Returns:
+            Whether Gaussians were added, removed or reset.
+        """
+        ...
+
+    def regularization(self, field: GaussianField) -> Tensor | None:
+        """A term of the loss, or None."""
+        ...
+
+
+def density_control(schedule: StageSchedule, settings: Densification, extent: float) -> DensityControl:
+    """The strategy that the settings name; arguments as `Densifier` takes them."""
+    return (McmcDensifier if settings.strategy == "mcmc" else Densifier)(schedule, settings, extent)
 
 
 class Densifier:
@@ -29,31 +72,25 @@ class Densifier:
             refine_stop_iter=schedule.densify_until,
             refine_every=schedule.densify_every,
             reset_every=schedule.reset_every,
+            absgrad=settings.absgrad,
         )
         self.state: dict[str, Any] = self._strategy.initialize_state(scene_scale=extent)
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, size: tuple[int, int]) -> bool:
-        """Accumulate the statistics of one render and edit the field when the schedule says so.
-
-        Args:
-            model: edited in place; its parameters are new tensors afterwards when something changed.
-            iteration: counts from 1 within the stage.
-            result: the render, after `backward()`.
-            size: (width, height) it was rendered at.
-
-        Returns:
-            Whether Gaussians were added, removed or reset.
-        """
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+        """See `DensityControl`."""
         if iteration >= self._schedule.densify_until:
             return False
-        means2d = result.means2d.detach()[None]  # (1, n, 2)
+        means2d: Any = result.means2d.detach()[None]  # (1, n, 2)
         assert result.means2d.grad is not None
         means2d.grad = result.means2d.grad[None]
+        if self._strategy.absgrad:
+            assert result.absgrad2d is not None, "the rasterizer offers no absolute gradients"
+            means2d.absgrad = result.absgrad2d[None]
         info = {
             "means2d": means2d,
             "radii": result.radii[None, :, None].expand(1, -1, 2),  # (1, n, 2)
-            "width": size[0],
-            "height": size[1],
+            "width": camera.width,
+            "height": camera.height,
             "n_cameras": 1,
             "gaussian_ids": None,
         }
@@ -62,5 +99,56 @@ class Densifier:
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
             reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
-        refined = iteration > self._schedule.densify_start and iteration % self._schedule.densify_every == 0
-        return refined or reset
+        return reset or _refines(self._schedule, iteration)
+
+    def regularization(self, field: GaussianField) -> Tensor | None:
+        """None: nothing is added to the loss."""
+        return None
+
+
+class McmcDensifier:
+    """Density control of one stage by gsplat's `MCMCStrategy` (Kheradmand et al. 2024), which runs on a GPU only.
+
+    Gaussians that have become transparent are moved to opaque ones, 5 % are added at a time up to `cap_max`, and
+    positions get noise in every iteration. Opacities are never reset.
+
+    Args:
+        schedule: when the stage adds and moves.
+        settings: the limit.
+        extent: not looked at.
+    """
+
+    def __init__(self, schedule: StageSchedule, settings: Densification, extent: float) -> None:
+        self._schedule = schedule
+        self._strategy = MCMCStrategy(
+            cap_max=settings.cap_max,
+            refine_start_iter=schedule.densify_start,
+            refine_stop_iter=schedule.densify_until,
+            refine_every=schedule.densify_every,
+        )
+        self.state: dict[str, Any] = self._strategy.initialize_state()
+
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+        """See `DensityControl`."""
+        rate = model.optimizers["means"].param_groups[0]["lr"]
+        self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
+        return iteration < self._schedule.densify_until and _refines(self._schedule, iteration)
+
+    def regularization(self, field: GaussianField) -> Tensor | None:
+        """What drives Gaussians that are not needed towards transparent and small."""
+        opacity, deviation = torch.sigmoid(field.opacity_logits).mean(), torch.exp(field.log_scales).mean()
+        return MCMC_REGULARIZATION * (opacity + deviation)
+
+
+def mcmc_start(field: GaussianField) -> GaussianField:
+    """A field from points as MCMC's authors start it."""
+    return field.with_parameters(
+        {
+            "log_scales": field.log_scales + math.log(MCMC_SCALE),
+            "opacity_logits": torch.full_like(field.opacity_logits, math.log(MCMC_OPACITY / (1 - MCMC_OPACITY))),
+        }
+    )
+
+
+def _refines(schedule: StageSchedule, iteration: int) -> bool:
+    return iteration > schedule.densify_start and iteration % schedule.densify_every == 0

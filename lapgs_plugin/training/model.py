@@ -10,16 +10,8 @@ from torch import Tensor
 
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.adam import FieldAdam
+from lapgs_plugin.splats import SPLAT_NAMES, field_from_splats, splats_from_field
 from lapgs_plugin.training.settings import LearningRates
-
-STRATEGY_NAMES = {
-    "means": "means",
-    "quats": "quaternions",
-    "scales": "log_scales",
-    "opacities": "opacity_logits",
-    "sh": "sh",
-}
-"""gsplat's densification strategies know parameters by these names; right of each, ours."""
 
 ADAM_EPS = 1e-15
 SH_REST_SCALE = 1 / 20
@@ -31,36 +23,58 @@ class TrainableField:
     """A field being optimized. `params` and `optimizers` are edited in place by densification.
 
     Attributes:
-        params: by strategy name, each (n, ...) with gradients.
+        params: by the name that gsplat's strategies know it by, each (n, ...) with gradients. The coefficients of a
+            field on a GPU are two, "sh0" and "shN", because PyTorch's Adam has one learning rate for a tensor; our own
+            knows one a column, and they are "sh".
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
+        sparse: whether a step moves visible Gaussians alone.
     """
 
     params: dict[str, torch.nn.Parameter]
-    optimizers: dict[str, FieldAdam]
+    optimizers: dict[str, Any]
     signed: bool
+    sparse: bool = False
 
     @classmethod
-    def create(cls, field: GaussianField, rates: LearningRates, extent: float) -> TrainableField:
-        """Start optimizing `field` with empty Adam moments; position steps are scaled by the scene's `extent`."""
+    def create(
+        cls, field: GaussianField, rates: LearningRates, extent: float, *, sparse: bool = False
+    ) -> TrainableField:
+        """Start optimizing `field`, where it is, with empty Adam moments.
+
+        Args:
+            field: what to start from; copied.
+            rates: step sizes.
+            extent: of the scene, in world units; scales the steps of positions.
+            sparse: with gsplat's `SelectiveAdam`, on a GPU.
+        """
+        if field.means.device.type != "cpu":
+            return cls._on_gpu(field, rates, extent, sparse)
+        names = {**SPLAT_NAMES, "sh": "sh"}
         params = {
             name: torch.nn.Parameter(getattr(field, attribute).detach().clone().contiguous())
-            for name, attribute in STRATEGY_NAMES.items()
+            for name, attribute in names.items()
         }
         sh_scale = torch.full(params["sh"].shape[1:], SH_REST_SCALE)
         sh_scale[0] = 1.0
-        rate = {
-            "means": rates.means_first * extent,
-            "quats": rates.quats,
-            "scales": rates.scales,
-            "opacities": rates.opacities,
-            "sh": rates.residual_sh if field.signed else rates.sh,
-        }
+        rate = _rates(field, rates, extent)
         optimizers = {
             name: FieldAdam([param], lr=rate[name], eps=ADAM_EPS, column_scale=sh_scale if name == "sh" else None)
             for name, param in params.items()
         }
         return cls(params, optimizers, field.signed)
+
+    @classmethod
+    def _on_gpu(cls, field: GaussianField, rates: LearningRates, extent: float, sparse: bool) -> TrainableField:
+        splats = splats_from_field(field)
+        if field.sh_degree == 0:
+            del splats["shN"]  # no coefficients, nothing to optimize
+            splats["sh"] = splats.pop("sh0")
+        params = {name: torch.nn.Parameter(value.detach().clone().contiguous()) for name, value in splats.items()}
+        rate = _rates(field, rates, extent)
+        rate |= {"sh0": rate["sh"], "shN": rate["sh"] * SH_REST_SCALE}
+        optimizers = {name: gpu_adam(param, rate[name], sparse) for name, param in params.items()}
+        return cls(params, optimizers, field.signed, sparse)
 
     def __len__(self) -> int:
         return int(self.params["means"].shape[0])
@@ -68,21 +82,24 @@ class TrainableField:
     @property
     def field(self) -> GaussianField:
         """The current parameters, sharing their memory and gradients."""
-        return GaussianField(
-            **{attribute: self.params[name] for name, attribute in STRATEGY_NAMES.items()}, signed=self.signed
-        )
+        return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int) -> None:
+    def step(self, means_rate: float, active_coefficients: int, visible: Tensor | None = None) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
             means_rate: step size of the positions, already scaled by the extent.
             active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped.
+            visible: (n,) bool, the Gaussians that were rendered; looked at by sparse steps alone.
         """
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
-        self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients
+        if isinstance(self.optimizers.get("sh"), FieldAdam):
+            self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients
         for optimizer in self.optimizers.values():
-            optimizer.step()
+            if self.sparse:
+                optimizer.step(visible)
+            else:
+                optimizer.step()
             optimizer.zero_grad(set_to_none=True)
 
     def optimizer_moments(self) -> dict[str, dict[str, Tensor]]:
@@ -92,8 +109,10 @@ class TrainableField:
     def adopt_moments(self, moments: dict[str, dict[str, Tensor]], kept: Tensor) -> None:
         """Continue with the Adam moments of rows `kept` (m,) of an earlier field: full inheritance."""
         for name, optimizer in self.optimizers.items():
+            device = self.params[name].device
             optimizer.state[self.params[name]] = {
-                key: value.clone() if key == "step" else value[kept].clone() for key, value in moments[name].items()
+                key: (value if key == "step" else value[kept]).to(device, copy=True)
+                for key, value in moments[name].items()
             }
 
     def state(self) -> dict[str, Any]:
@@ -105,10 +124,39 @@ class TrainableField:
         }
 
     @classmethod
-    def from_state(cls, state: dict[str, Any], rates: LearningRates, extent: float) -> TrainableField:
-        field = GaussianField(
-            **{attribute: state["params"][name] for name, attribute in STRATEGY_NAMES.items()}, signed=state["signed"]
-        )
-        model = cls.create(field, rates, extent)
+    def from_state(
+        cls,
+        state: dict[str, Any],
+        rates: LearningRates,
+        extent: float,
+        *,
+        device: torch.device | str = "cpu",
+        sparse: bool = False,
+    ) -> TrainableField:
+        """Go on from what `state` gave; `rates`, `extent` and `sparse` as `create` takes them."""
+        field = field_from_splats(state["params"], state["signed"]).to(device)
+        model = cls.create(field, rates, extent, sparse=sparse)
         model.adopt_moments(state["moments"], torch.arange(len(field)))
         return model
+
+
+def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[str, float]:
+    """Step sizes by the name of the parameter."""
+    return {
+        "means": rates.means_first * extent,
+        "quats": rates.quats,
+        "scales": rates.scales,
+        "opacities": rates.opacities,
+        "sh": rates.residual_sh if field.signed else rates.sh,
+    }
+
+
+def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
+    """An Adam that updates a tensor on a GPU in one kernel."""
+    if not sparse:
+        return torch.optim.Adam([param], lr=rate, eps=ADAM_EPS, fused=True)
+    from gsplat.optimizers import SelectiveAdam
+
+    optimizer: torch.optim.Optimizer = SelectiveAdam([param], eps=ADAM_EPS, betas=(0.9, 0.999))
+    optimizer.param_groups[0]["lr"] = rate  # its constructor takes none
+    return optimizer

@@ -8,13 +8,19 @@ from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import parse_supervision
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
+
+STRATEGIES = ("default", "mcmc")
+ABSGRAD_THRESHOLD = 8e-4
+"""What `grow_grad2d` becomes for absolute gradients, which do not cancel and are larger: gsplat's recommendation."""
+
+AUTO = "auto"
+"""Where predictions are kept and how precisely, left to the device."""
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that the manifest has fields of its own for."""
@@ -37,8 +43,8 @@ class LearningRates:
 class Densification:
     """When Gaussians are cloned, split, pruned and reset, in iterations of a whole run (see `StageSchedule`).
 
-    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000), shrunk in proportion for shorter runs.
-    `every` never shrinks: its statistics need about that many views.
+    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000), shrunk in proportion for shorter runs; for
+    "mcmc" the second is 25,000. `every` never shrinks: its statistics need about that many views.
     """
 
     start: int | None = None
@@ -46,6 +52,9 @@ class Densification:
     every: int = 100
     reset_every: int | None = None
     grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
+    strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
+    absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
+    cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
 
 
 @dataclass(frozen=True)
@@ -63,15 +72,19 @@ class TrainSettings:
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
     seed: int = 0
-    cache: str = "memory"
-    cache_precision: str = "float32"
+    cache: str = AUTO
+    cache_precision: str = AUTO
     learning_rates: LearningRates = field(default_factory=LearningRates)
     densification: Densification = field(default_factory=Densification)
+    packed: bool = False  # gsplat: keep what is computed of visible Gaussians alone
+    sparse_adam: bool = False  # gsplat: step visible Gaussians alone
+    raster: dict[str, Any] = field(default_factory=dict)  # what images depend on, as {"antialiasing": True}
 
     def __post_init__(self) -> None:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
-        ImageStore.check(self.cache, self.cache_precision)
+        if self.densification.strategy not in STRATEGIES:
+            raise UserInputError(f"--strategy {self.densification.strategy}: expected {' or '.join(STRATEGIES)}")
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
         if not 0.0 < self.inherit_ratio <= 1.0:
@@ -93,7 +106,9 @@ class TrainSettings:
         Raises:
             RunFolderError: they hold a key this version does not know or lack one.
         """
-        values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
+        # Runs of the first weeks do not know what came with gsplat.
+        later = {f.name: f.default for f in fields(cls) if f.name in ("packed", "sparse_adam")}
+        values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
                 f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
@@ -131,7 +146,7 @@ class StageSchedule:
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
-        until = constant(given.until, REFERENCE_ITERATIONS // 2, 1)
+        until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         return cls(
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),

@@ -16,13 +16,15 @@ from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.raster import Rasterizer, RenderResult
-from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import StageSchedule, TrainSettings
-from lapgs_plugin.training.views import LevelView, view_index
+from lapgs_plugin.training.views import LevelImages, LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
 """Iterations between two looks at all parameters for NaN; the loss is looked at in every iteration."""
+LOSSES_READ_EVERY = 50
+"""The same for the loss on a GPU: every look waits until the GPU has caught up with the processor."""
 LOSS_SMOOTHING = 0.95
 """Weight of the past in the loss that is shown and logged: single views differ too much to read a trend."""
 
@@ -51,25 +53,30 @@ class StageRun:
     Attributes:
         stage, schedule, settings: what is to be done.
         views: the training views at the stage's level.
+        images: what they are compared with.
         accumulated: Up of the previous level's prediction by view name; None for the base.
         background: (3,) behind the base; residuals are rendered over zero.
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
+
+    The field, the images and the background are on one device, where the stage is trained.
     """
 
     stage: Stage
     schedule: StageSchedule
     settings: TrainSettings
     views: Sequence[LevelView]
+    images: LevelImages
     accumulated: ImageStore | None
     background: Tensor
     extent: float
     rasterizer: Rasterizer
     hooks: HookDispatcher
     model: TrainableField
-    densifier: Densifier
+    densifier: DensityControl
     progress: StageProgress = field(default_factory=StageProgress)
+    _unread: list[Tensor] = field(default_factory=list)
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
         """Train from where `progress` stands to the end of the stage.
@@ -85,27 +92,58 @@ class StageRun:
             self._iterate(self.progress.iteration + 1)
             self.progress.seconds += time.perf_counter() - start
             self.progress.iteration += 1
+            if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
+                self.settle()
             after_iteration(self)
+
+    def settle(self) -> None:
+        """Wait for a GPU to finish the iterations so far, on the stage's clock, and read their losses.
+
+        Raises:
+            TrainingDivergedError: one is NaN or infinite.
+        """
+        if not self._unread:
+            return
+        start = time.perf_counter()
+        losses, self._unread = torch.stack(self._unread).tolist(), []
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        self.progress.seconds += time.perf_counter() - start
+        for back, loss in zip(range(len(losses) - 1, -1, -1), losses, strict=True):
+            self._note_loss(loss, self.progress.iteration - back)
+
+    @property
+    def _device(self) -> torch.device:
+        return self.background.device
+
+    @property
+    def _losses_at_once(self) -> int:
+        """How many losses wait to be read."""
+        return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
     def _iterate(self, iteration: int) -> None:
         view = self._view(iteration)
+        target, coarse_target = self.images.get(view.name)
         context = StageContext(
             stage=self.stage,
             iteration=iteration,
             view=view.name,
-            target=view.target,
-            accumulated=self._prediction(view, iteration),
-            coarse_target=view.coarse_target,
+            target=target,
+            accumulated=self._prediction(view),
+            coarse_target=coarse_target,
         )
+        self._announce_next(iteration)
         degree = self.schedule.active_sh_degree(iteration)
         self.hooks.before_render(context)
         result = self.rasterizer(self.model.field, view.camera, background=self.background, sh_degree=degree)
         image = self.hooks.compose(context, result.image)
         loss = self.hooks.loss(context, image)
-        self._note_loss(loss.item(), iteration)
-        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it without annotations
+        self._keep_loss(loss.detach(), iteration)
+        regularization = self.densifier.regularization(self.model.field)
+        (loss if regularization is None else loss + regularization).backward()  # type: ignore[no-untyped-call]  # torch's
         self.hooks.after_backward(context)
-        self.model.step(self.schedule.means_learning_rate(iteration) * self.extent, (degree + 1) ** 2)
+        visible = result.radii > 0 if self.model.sparse else None
+        self.model.step(self.schedule.means_learning_rate(iteration) * self.extent, (degree + 1) ** 2, visible)
         self._densify(context, result, view)
         if iteration % FINITE_CHECK_EVERY == 0 or iteration == self.stage.iterations:
             self._require_finite(iteration)
@@ -113,20 +151,30 @@ class StageRun:
     def _view(self, iteration: int) -> LevelView:
         return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
 
-    def _prediction(self, view: LevelView, iteration: int) -> Tensor | None:
-        """What the finished levels predict for this iteration's view, while the next one's is on its way."""
-        if self.accumulated is None:
-            return None
-        prediction = self.accumulated.get(view.name)
-        if iteration < self.stage.iterations:
-            self.accumulated.announce(self._view(iteration + 1).name)
-        return prediction
+    def _prediction(self, view: LevelView) -> Tensor | None:
+        """What the finished levels predict for a view."""
+        return None if self.accumulated is None else self.accumulated.get(view.name)
+
+    def _announce_next(self, iteration: int) -> None:
+        """Let the next iteration's images come while this one renders."""
+        if iteration == self.stage.iterations:
+            return
+        name = self._view(iteration + 1).name
+        self.images.announce(name)
+        if self.accumulated is not None:
+            self.accumulated.announce(name)
 
     def _densify(self, context: StageContext, result: RenderResult, view: LevelView) -> None:
-        size = (view.camera.width, view.camera.height)
-        if self.densifier.after_step(self.model, context.iteration, result, size):
+        if self.densifier.after_step(self.model, context.iteration, result, view.camera):
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, len(self.model))
+
+    def _keep_loss(self, loss: Tensor, iteration: int) -> None:
+        """On a CPU read it at once, before a loss that is not finite does harm."""
+        if self._losses_at_once == 1:
+            self._note_loss(loss.item(), iteration)
+        else:
+            self._unread.append(loss)
 
     def _note_loss(self, loss: float, iteration: int) -> None:
         if not math.isfinite(loss):
@@ -148,16 +196,24 @@ class StageRun:
 
     def state(self) -> dict[str, Any]:
         """Everything needed to continue this stage bit for bit, as plain tensors and numbers."""
+        self.settle()
+        on_gpu = self._device.type == "cuda"
         return {
             "level": self.stage.level,
             "progress": vars(self.progress),
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "random": torch.get_rng_state(),
+            **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from what `state` returned; the model must have been made from it already."""
         self.progress = StageProgress(**state["progress"])
-        self.densifier.state = state["densifier"]
+        self.densifier.state = {
+            name: value.to(self._device) if isinstance(value, Tensor) else value
+            for name, value in state["densifier"].items()
+        }
         torch.set_rng_state(state["random"])
+        if "random_gpu" in state:
+            torch.cuda.set_rng_state(state["random_gpu"], self._device)

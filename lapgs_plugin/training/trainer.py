@@ -14,10 +14,10 @@ import torch
 
 from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.errors import TrainingStoppedError
+from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import HookDispatcher, StageHook
-from lapgs_plugin.imagestore import ImageStore
+from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
@@ -25,13 +25,13 @@ from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
-from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.densification import density_control, mcmc_start
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import StageSchedule, TrainSettings
+from lapgs_plugin.training.settings import AUTO, StageSchedule, TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.views import level_views
+from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
 
 LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
@@ -47,15 +47,27 @@ def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
     return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split)
 
 
-def warm_up(rasterizer: Rasterizer) -> None:
+def check_cache(settings: TrainSettings, device: torch.device) -> None:
+    """Refuse a place for predictions that the device of a run does not have.
+
+    Raises:
+        UserInputError: as `ImageStore.check`.
+    """
+    where = "memory" if settings.cache == AUTO else settings.cache
+    precision = "float32" if settings.cache_precision == AUTO else settings.cache_precision
+    ImageStore.check(where, precision, device)
+
+
+def warm_up(rasterizer: Rasterizer, device: torch.device | str = "cpu", sparse: bool = False) -> None:
     """Run every kernel of an iteration once, so that compiling them is not taken for training."""
     settings = TrainSettings(sh_degree=0)
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
-    model = TrainableField.create(field_from_points(ahead, ahead, 0), settings.learning_rates, extent=1.0)
+    first = field_from_points(ahead, ahead, 0).to(device)
+    model = TrainableField.create(first, settings.learning_rates, extent=1.0, sparse=sparse)
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
-    image = rasterizer(model.field, camera, background=torch.zeros(3)).image
-    photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
-    model.step(means_rate=0.0, active_coefficients=1)
+    result = rasterizer(model.field, camera, background=torch.zeros(3, device=device))
+    photometric_loss(result.image, torch.zeros_like(result.image)).backward()  # type: ignore[no-untyped-call]  # torch's
+    model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
 
 
 @dataclass
@@ -67,6 +79,7 @@ class Trainer:
         settings: what decides the result.
         archive: the run folder; its manifest already says the same settings.
         rasterizer: renders every field.
+        device: where the rasterizer wants them, and everything is trained.
         user_hooks: run after the stock ones.
         monitor: told about progress.
         checkpoint_every: iterations between two checkpoints; one is also written when a run is asked to stop.
@@ -77,6 +90,7 @@ class Trainer:
     settings: TrainSettings
     archive: RunArchive
     rasterizer: Rasterizer
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     user_hooks: Sequence[StageHook] = ()
     monitor: Monitor = field(default_factory=Monitor)
     checkpoint_every: int = 1000
@@ -86,7 +100,9 @@ class Trainer:
         self.plan = make_plan(self.scene, self.settings)
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = parse_supervision(self.settings.supervision)
+        check_cache(self.settings, self.device)
         self._overhead: dict[str, float] = {}
+        self._images: LevelImages | None = None
         self._train_cache: ImageStore | None = None
         self._test_cache: ImageStore | None = None
         self._last_tick = (0.0, 0)
@@ -100,22 +116,29 @@ class Trainer:
         Raises:
             TrainingStoppedError: the user asked to stop; everything needed to resume is on disk.
             TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
+            DeviceMemoryError: the GPU is full; the same stays.
         """
         checkpoint = self.archive.load_checkpoint() if resume else None
         with stop_request() as stop:
             try:
-                warm_up(self.rasterizer)
+                warm_up(self.rasterizer, self.device, self.settings.sparse_adam)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
                         continue
                     here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
                     self._run_stage(stage, here, stop)
+            except torch.cuda.OutOfMemoryError as error:
+                raise self._out_of_memory() from error
             finally:
                 self._close_caches()
+                if self._images is not None:
+                    self._images.close()
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
         self._overhead = {} if checkpoint is None else dict(checkpoint["overhead"])
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint))
         if checkpoint is not None:
             run.restore(checkpoint)
@@ -135,44 +158,51 @@ class Trainer:
         """The field a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
         torch.manual_seed(self.settings.seed * 1000 + stage.level)  # split positions; the same however we got here
         rates, extent = self.settings.learning_rates, self.scene.extent
+        sparse = self.settings.sparse_adam
         if checkpoint is not None:
-            return TrainableField.from_state(checkpoint["model"], rates, extent)
+            return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
         with self._timed("inheritance"):
             if not stage.signed:
                 points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
-                return TrainableField.create(points, rates, extent)
+                if self.settings.densification.strategy == "mcmc":
+                    points = mcmc_start(points)
+                return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
             field, kept = inherit(
                 self.archive.field(stage.level + 1), self.settings.inherit, self.settings.inherit_ratio, generator
             )
-            model = TrainableField.create(field, rates, extent)
+            model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
             if self.settings.inherit == "full":
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
         schedule = StageSchedule.create(self.settings, stage)
+        if self._images is not None:
+            self._images.close()
         with self._timed("pyramid"):
-            views = level_views(
+            self._images = LevelImages(
                 self.scene.train,
                 stage.level,
                 self.plan.levels,
                 self._pyramid,
                 with_coarse=self._supervision is Supervision.GT_LAPLACIAN,
+                device=self.device,
             )
         self._fill_caches(stage)
         return StageRun(
             stage=stage,
             schedule=schedule,
             settings=self.settings,
-            views=views,
+            views=level_views(self.scene.train, stage.level),
+            images=self._images,
             accumulated=self._train_cache,
-            background=torch.zeros(3) if stage.signed else torch.tensor(self.scene.background),
+            background=(torch.zeros(3) if stage.signed else torch.tensor(self.scene.background)).to(self.device),
             extent=self.scene.extent,
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=Densifier(schedule, self.settings.densification, self.scene.extent),
+            densifier=density_control(schedule, self.settings.densification, self.scene.extent),
         )
 
     def _fill_caches(self, stage: Stage) -> None:
@@ -187,15 +217,32 @@ class Trainer:
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> ImageStore:
         """Up(I_hat^(l+1)) of each view, for the stage of level l."""
-        settings, coarser = self.settings, stage.level + 1
-        cache = ImageStore(settings.cache, settings.cache_precision, folder=self.archive.path(CACHE, name))
+        coarser = stage.level + 1
+        cache = self._empty_cache(stage.level, views, name)
         if views:
-            renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer)
+            renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
                 camera = level_camera(view.camera, stage.level)
                 composed = renderer.render(view.camera, level=coarser).composed[coarser]
                 cache.put(view.name, self._pyramid.up(composed, (camera.height, camera.width)))
         return cache
+
+    def _empty_cache(self, level: int, views: Sequence[View], name: str) -> ImageStore:
+        """A store for the predictions that a level builds on; what is left to it is decided by the device."""
+        where, precision = self.settings.cache, self.settings.cache_precision
+        if precision == AUTO:
+            precision = "float16" if self.device.type == "cuda" else "float32"
+        if where == AUTO:
+            where = place(stored_bytes(views, level, precision), self.device)
+        return ImageStore(where, precision, device=self.device, folder=self.archive.path(CACHE, name))
+
+    def _out_of_memory(self) -> DeviceMemoryError:
+        next_level = self.archive.manifest.next_level
+        return DeviceMemoryError(
+            f"the GPU has no memory left at level {next_level}; finished levels and the last checkpoint are kept: "
+            "continue with --resume on a larger one, or start again with --packed, --cache memory, a smaller "
+            "--resolution or a smaller --cap-max"
+        )
 
     def _close_caches(self) -> None:
         for cache in (self._train_cache, self._test_cache):
@@ -209,8 +256,11 @@ class Trainer:
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else (last or iteration % self.test_every == 0)
+        due_tick = last or iteration % max(1, self.plan.iterations // LOG_TICKS) == 0
+        if due_test or due_tick or stop.requested:
+            run.settle()  # what follows is not to be charged for iterations that are still under way
         psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
-        if psnr is not None or last or iteration % max(1, self.plan.iterations // LOG_TICKS) == 0:
+        if psnr is not None or due_tick:
             self._tick(run, psnr)
         if stop.requested or iteration % self.checkpoint_every == 0:
             self._save_checkpoint(run)
@@ -247,7 +297,8 @@ class Trainer:
                 image = self.rasterizer(run.model.field, camera, background=run.background).image
                 if self._test_cache is not None:
                     image = image + self._test_cache.get(view.name)
-                values.append(psnr(to_full_size(image, view.camera, run.stage.level, self._pyramid), view.image))
+                whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
+                values.append(psnr(whole, view.image.to(self.device)))
             return math.fsum(values) / len(values)
 
     def _save_checkpoint(self, run: StageRun) -> None:
@@ -265,9 +316,17 @@ class Trainer:
             train_seconds=run.progress.seconds,
             overhead_seconds=dict(self._overhead),
             image_size=run.stage.image_size,
+            memory_bytes=self._memory(run),
         )
         heir_wants_it = self.settings.inherit == "full" and run.stage.level > 0
         self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)
+
+    def _memory(self, run: StageRun) -> dict[str, int]:
+        """What the stage took of a GPU, in bytes."""
+        if self.device.type != "cuda":
+            return {}
+        kept = run.images.bytes_on_device + (0 if run.accumulated is None else run.accumulated.bytes_on_device)
+        return {"peak": torch.cuda.max_memory_allocated(self.device), "images": kept}
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.camera import Camera
+from lapgs_plugin.imagestore import EIGHT_BIT_TOLERANCE, ImageStore, place
+from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.compose import level_camera
 from lapgs_plugin.scenes.scene import View
@@ -21,35 +24,105 @@ class LevelView:
     Attributes:
         name: of the image, unique in the scene.
         camera: the view's camera at the level's size.
-        target: (3, h, w) the image's Gaussian pyramid at this level, float32.
-        coarse_target: (3, h, w) Up of the next coarser level of the same pyramid; None at the coarsest level.
     """
 
     name: str
     camera: Camera
-    target: Tensor
-    coarse_target: Tensor | None
 
 
-def level_views(
-    views: Sequence[View], level: int, levels: int, pyramid: Pyramid, with_coarse: bool
-) -> tuple[LevelView, ...]:
-    """Every view's camera and target at `level`.
+class LevelImages:
+    """The targets of a level's views, and of the next coarser one where a supervision looks at those.
+
+    On a CPU they are the views' own tensors. On a GPU an `ImageStore` brings them: 8-bit photographs as bytes, without
+    loss, everything else in float16.
 
     Args:
+        views: at full resolution, their images on the CPU.
+        level, levels: which one, of how many.
+        pyramid: makes the targets, on `device`.
         with_coarse: also keep Up of the coarser target, which only the `gt_laplacian` supervision looks at.
+        device: where they are wanted.
     """
-    made = []
-    for view in views:
-        camera = level_camera(view.camera, level)
-        coarse = None
-        if with_coarse and level < levels - 1:
-            images = pyramid.gaussian(view.image, level + 2)
-            target, coarse = images[level], pyramid.up(images[level + 1], (camera.height, camera.width))
-        else:
-            target = pyramid.gaussian(view.image, level + 1)[level]
-        made.append(LevelView(view.name, camera, target.contiguous(), coarse))
-    return tuple(made)
+
+    def __init__(
+        self, views: Sequence[View], level: int, levels: int, pyramid: Pyramid, with_coarse: bool, device: torch.device
+    ) -> None:
+        self._coarse_wanted = with_coarse and level < levels - 1
+        self._held: dict[str, tuple[Tensor, Tensor | None]] = {}
+        self._targets: ImageStore | None = None
+        self._coarse: ImageStore | None = None
+        if _wants_store(device):
+            self._targets = _empty_store(views, level, device)
+            self._coarse = _empty_store(views, level, device, precision="float16") if self._coarse_wanted else None
+        for view in views:
+            target, coarse = self._make(view, level, pyramid, device)
+            if self._targets is None:
+                self._held[view.name] = target.contiguous(), coarse
+                continue
+            self._targets.put(view.name, target)
+            if self._coarse is not None:
+                assert coarse is not None
+                self._coarse.put(view.name, coarse)
+
+    def _make(self, view: View, level: int, pyramid: Pyramid, device: torch.device) -> tuple[Tensor, Tensor | None]:
+        image = view.image.to(device)
+        if not self._coarse_wanted:
+            return pyramid.gaussian(image, level + 1)[level], None
+        images = pyramid.gaussian(image, level + 2)
+        target = images[level]
+        return target, pyramid.up(images[level + 1], (target.shape[1], target.shape[2]))
+
+    def announce(self, name: str) -> None:
+        """Start bringing a view's images, which the next iteration will ask for."""
+        for store in (self._targets, self._coarse):
+            if store is not None:
+                store.announce(name)
+
+    def get(self, name: str) -> tuple[Tensor, Tensor | None]:
+        """A view's target (3, h, w), and Up of the coarser one or None."""
+        if self._targets is None:
+            return self._held[name]
+        return self._targets.get(name), None if self._coarse is None else self._coarse.get(name)
+
+    @property
+    def bytes_on_device(self) -> int:
+        """Bytes of them on a GPU."""
+        return sum(store.bytes_on_device for store in (self._targets, self._coarse) if store is not None)
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._held.clear()
+        for store in (self._targets, self._coarse):
+            if store is not None:
+                store.close()
+
+
+def _empty_store(views: Sequence[View], level: int, device: torch.device, precision: str | None = None) -> ImageStore:
+    """A store for one image a view, in the place where it costs least."""
+    if precision is None:
+        precision = "uint8" if level == 0 and all(_is_eight_bit(view.image) for view in views) else "float16"
+    return ImageStore(place(stored_bytes(views, level, precision), device), precision, device=device)
+
+
+def stored_bytes(views: Sequence[View], level: int, precision: str) -> int:
+    """What one image a view at a level takes."""
+    sizes = (level_size((view.camera.width, view.camera.height), level) for view in views)
+    return sum(3 * width * height for width, height in sizes) * {"uint8": 1, "float16": 2, "float32": 4}[precision]
+
+
+def _wants_store(device: torch.device) -> bool:
+    """Whether images are brought to the device one by one; on a CPU they are there."""
+    return device.type == "cuda"
+
+
+def _is_eight_bit(image: Tensor) -> bool:
+    levels = (image * 255).round_()
+    return bool(((levels / 255).sub_(image).abs_() <= EIGHT_BIT_TOLERANCE).all())
+
+
+def level_views(views: Sequence[View], level: int) -> tuple[LevelView, ...]:
+    """Every view's camera at `level`."""
+    return tuple(LevelView(view.name, level_camera(view.camera, level)) for view in views)
 
 
 def view_index(iteration: int, count: int, seed: int, level: int) -> int:
@@ -58,5 +131,11 @@ def view_index(iteration: int, count: int, seed: int, level: int) -> int:
     A pure function of its arguments, so that a resumed run sees the views an uninterrupted one would have seen.
     """
     epoch, position = divmod(iteration - 1, count)
-    generator = torch.Generator().manual_seed((seed * 1_000_003 + level) * 1_000_003 + epoch)
-    return int(torch.randperm(count, generator=generator)[position])
+    return _order(count, (seed * 1_000_003 + level) * 1_000_003 + epoch)[position]
+
+
+@lru_cache(maxsize=4)
+def _order(count: int, seed: int) -> list[int]:
+    """The views of an epoch."""
+    order: list[int] = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    return order

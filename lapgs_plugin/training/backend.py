@@ -1,0 +1,67 @@
+"""Which rasterizer trains, and where: gsplat on a GPU, ours on a CPU."""
+
+from __future__ import annotations
+
+import torch
+
+from lapgs_plugin.adapters import gsplat
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
+from lapgs_plugin.rendering.rasterizers import PlacedRasterizer
+from lapgs_plugin.training.settings import TrainSettings
+
+AUTO = "auto"
+ANTIALIASING = "antialiasing"
+"""Key of `TrainSettings.raster`, as rasterizers and manifests call it."""
+
+
+def choose_rasterizer(name: str) -> str:
+    """What `--rasterizer auto` is on this machine; any other name as it is.
+
+    With a CUDA device it is gsplat or an error: nobody is to find out hours later that a GPU stood idle.
+
+    Raises:
+        MissingExtraError: there is a CUDA device, and gsplat cannot use it.
+        UserInputError: an unknown name.
+    """
+    known = (AUTO, gsplat.NAME, *CPU_RASTERIZERS)
+    if name not in known:
+        raise UserInputError(f"--rasterizer {name}: expected {', '.join(known[:-1])} or {known[-1]}")
+    if name != AUTO:
+        return name
+    if not torch.cuda.is_available():
+        return "cpu"
+    if reason := gsplat.missing():
+        raise MissingExtraError(
+            f"there is a CUDA device, and {reason}; `lapgs doctor` says what to install, --rasterizer cpu does without"
+        )
+    return gsplat.NAME
+
+
+def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
+    """The rasterizer of that name for a run with these settings, and the device that it trains on.
+
+    Raises:
+        UserInputError: an unknown name, or settings that it does not honour.
+        MissingExtraError: gsplat cannot render on this machine.
+    """
+    if name == gsplat.NAME:
+        rasterizer = gsplat.GsplatRasterizer(
+            antialiasing=bool(settings.raster.get(ANTIALIASING, False)),
+            packed=settings.packed,
+            absgrad=settings.densification.absgrad,
+            own_radii=True,
+        )
+        return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
+    made = make_rasterizer(name)
+    asked = {
+        "--strategy mcmc": settings.densification.strategy == "mcmc",
+        "--antialiased": settings.raster.get(ANTIALIASING, False),
+        "--packed": settings.packed,
+        "--sparse-adam": settings.sparse_adam,
+    }
+    if needs_gsplat := [option for option, given in asked.items() if given]:
+        raise UserInputError(
+            f"{', '.join(needs_gsplat)} with --rasterizer {name}: only gsplat on a CUDA device does that; leave it out"
+        )
+    return PlacedRasterizer(made, torch.device("cpu"), {})

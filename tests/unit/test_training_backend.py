@@ -1,0 +1,277 @@
+"""What trains and where, and the parts of training on a GPU that do not need one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gsplat
+import pytest
+import torch
+from gsplat.cuda import _torch_impl
+from gsplat.strategy import ops
+from torch import Tensor
+
+from lapgs_plugin.adapters import gsplat as gsplat_adapter
+from lapgs_plugin.adapters.gsplat import GsplatRasterizer
+from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import views as training_views
+from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
+from lapgs_plugin.training.densification import mcmc_start
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.trainer import Trainer, check_cache
+from lapgs_plugin.training.views import LevelImages
+from tests.training_scene import blob_field, ring_scene
+
+SETTINGS = TrainSettings(
+    iterations=60,
+    sh_degree=1,
+    sh_every=10,
+    densification=Densification(start=3, until=45, every=5, reset_every=12),
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ring_scene()
+
+
+def train(path: Path, scene: Scene, settings: TrainSettings, rasterizer: Rasterizer, **options: Any) -> RunArchive:
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer=rasterizer.name, **settings.for_manifest())
+    with RunArchive.create(path, manifest) as archive:
+        Trainer(scene, settings, archive, rasterizer, **options).run()
+    return RunArchive.open(path)
+
+
+def losses(archive: RunArchive) -> list[tuple[int, int, float]]:
+    return [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
+
+
+# ------------------------------------------------------------------------------------------------------- the choice
+
+
+def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_rasterizer("auto") == "cpu"
+    with pytest.raises(MissingExtraError, match="PyTorch sees no CUDA device"):
+        training_rasterizer("gsplat", SETTINGS)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "there is no nvcc")
+    with pytest.raises(MissingExtraError, match=r"there is no nvcc.*--rasterizer cpu does without"):
+        choose_rasterizer("auto")
+    assert choose_rasterizer("cpu") == "cpu"
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    assert choose_rasterizer("auto") == "gsplat"
+    placed = training_rasterizer("gsplat", SETTINGS)
+    assert (placed.rasterizer.name, placed.device.type) == ("gsplat", "cuda")
+
+
+def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
+    settings = replace(SETTINGS, packed=True, raster={"antialiasing": True})
+    with pytest.raises(UserInputError, match="--antialiased, --packed with --rasterizer cpu: only gsplat"):
+        training_rasterizer("cpu", settings)
+    with pytest.raises(UserInputError, match="gpu: expected memory or disk"):
+        check_cache(replace(SETTINGS, cache="gpu"), torch.device("cpu"))
+    check_cache(replace(SETTINGS, cache="gpu"), torch.device("cuda"))
+
+
+def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
+    strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500)
+    settings = replace(SETTINGS, densification=strategy, packed=True, raster={"antialiasing": True})
+    reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
+    assert TrainSettings.from_manifest(manifest) == settings
+    older = {
+        k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in ("packed", "sparse_adam", "raster")
+    }
+    older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
+    assert TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older})) == SETTINGS
+
+
+# --------------------------------------------------------------------------------------- gsplat's functions on a CPU
+
+
+def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gsplat, "spherical_harmonics", gsplat_on_cpu.spherical_harmonics)
+
+    def rasterization(*args: Any, near_plane: float, **kwargs: Any) -> Any:
+        image, alpha, info = gsplat_on_cpu.rasterization(*args, **kwargs)
+        centres = info["means2d"]
+        # gsplat's centres are inside of the graph and have hooks; the stand-in's are a leaf that is written to.
+        centres.register_hook = lambda hook: hooks.append(lambda: hook(centres.grad))
+        return image, alpha, {**info, "conics": torch.ones(1, len(args[0]), 3)}
+
+    hooks: list[Any] = []
+    monkeypatch.setattr(gsplat, "rasterization", rasterization)
+
+    class Deliver(StageHook):
+        """Calls the hooks of gsplat's centres once the backward pass has left their gradient."""
+
+        def before_render(self, context: StageContext) -> None:
+            hooks.clear()  # of renders that were not trained on
+
+        def after_backward(self, context: StageContext) -> None:
+            hooks.pop()()
+
+    settings = replace(SETTINGS, iterations=20, densification=replace(SETTINGS.densification, until=4))
+    theirs = train(
+        tmp_path / "theirs", scene, settings, GsplatRasterizer("cpu", own_radii=True), user_hooks=[Deliver()]
+    )
+    ours = train(tmp_path / "ours", scene, settings, CpuRasterizer())
+    assert theirs.manifest.records[0].num_gaussians == ours.manifest.records[0].num_gaussians
+    for (*place, loss), (*expected_place, expected) in zip(losses(theirs), losses(ours), strict=True):
+        assert place == expected_place
+        assert loss == pytest.approx(expected, rel=2e-4)  # worst seen 1.3e-5
+
+
+def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
+    """They do not cancel: at the same threshold more Gaussians are above it."""
+    counts = []
+    for absgrad in (False, True):
+        density = replace(SETTINGS.densification, absgrad=absgrad, reset_every=1000)
+        archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
+        counts.append(archive.manifest.records[0].num_gaussians)
+    assert counts[1] > counts[0]
+
+
+def test_losses_that_are_read_later_are_the_same_losses(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once = train(tmp_path / "a", scene, SETTINGS, CpuRasterizer())
+    monkeypatch.setattr(StageRun, "_losses_at_once", 7)
+    later = train(tmp_path / "b", scene, SETTINGS, CpuRasterizer())
+    assert losses(later) == losses(at_once)
+    assert all(later.field_path(level).read_bytes() == at_once.field_path(level).read_bytes() for level in (1, 0))
+
+    class Poison(StageHook):
+        def loss(self, context: StageContext, image: Tensor) -> Tensor | None:
+            return image.sum() * math.nan if (context.stage.level, context.iteration) == (0, 23) else None
+
+    with pytest.raises(TrainingDivergedError, match="level 0, iteration 23: the loss is nan"):
+        train(tmp_path / "c", scene, SETTINGS, CpuRasterizer(), user_hooks=[Poison()])
+
+
+def test_a_full_gpu_is_one_line(scene: Scene, tmp_path: Path) -> None:
+    class Full(CpuRasterizer):
+        def __call__(self, *args: Any, **kwargs: Any) -> Any:
+            if args[0].signed:
+                raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+            return super().__call__(*args, **kwargs)
+
+    with pytest.raises(DeviceMemoryError, match=r"no memory left at level 0; finished levels .* are kept"):
+        train(tmp_path / "run", scene, SETTINGS, Full())
+    assert RunArchive.open(tmp_path / "run").available_levels == (1,)
+
+
+# ---------------------------------------------------------------------------------------------------- the optimizers
+
+
+def stepped(model: TrainableField, steps: int = 5) -> TrainableField:
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(steps):
+        for value in model.field.parameters.values():
+            weights = torch.randn(value.shape, generator=generator)
+            (value * weights).sum().backward()
+        model.step(1e-3, (model.field.sh_degree + 1) ** 2)
+    return model
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("signed", [False, True])
+def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
+    """PyTorch's fused Adam, which exists for CPUs too."""
+    field = replace(blob_field(20), sh=torch.randn(20, (degree + 1) ** 2, 3), signed=signed)
+    ours = stepped(TrainableField.create(field, LearningRates(), 4.0))
+    theirs = stepped(TrainableField._on_gpu(field, LearningRates(), 4.0, sparse=False))
+    for name, value in theirs.field.parameters.items():
+        # Rounding of five steps; worst seen 6e-7.
+        torch.testing.assert_close(value, ours.field.parameters[name], rtol=0, atol=1e-5)
+        assert not torch.equal(value, field.parameters[name])
+
+
+def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
+
+    def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
+        return TrainableField._on_gpu(field, rates, extent, sparse)
+
+    monkeypatch.setattr(TrainableField, "create", create)
+    whole = stepped(create(field, LearningRates(), 4.0, sparse=False))
+    copy = TrainableField.from_state(whole.state(), LearningRates(), 4.0)
+    for model in (whole, copy):
+        stepped(model, 3)
+    for name, value in whole.field.parameters.items():
+        assert torch.equal(value, copy.field.parameters[name])
+
+
+# ------------------------------------------------------------------------------------------------------- the images
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    eight_bit = tuple(replace(view, image=(view.image * 255).round() / 255) for view in scene.train)
+    held = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
+    monkeypatch.setattr(training_views, "_wants_store", lambda device: True)
+    stored = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
+    for view in eight_bit:
+        stored.announce(view.name)
+        (target, coarse), (expected, expected_coarse) = stored.get(view.name), held.get(view.name)
+        assert (expected_coarse is None) == (coarse is None) == (level == 1)
+        if level == 0:
+            assert torch.equal(target, expected)
+            torch.testing.assert_close(coarse, expected_coarse, rtol=0, atol=2.5e-4)  # float16 below 1
+        else:
+            torch.testing.assert_close(target, expected, rtol=0, atol=2.5e-4)
+    stored.close()
+
+
+# ------------------------------------------------------------------------------------------------------------- MCMC
+
+
+def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    """Kheradmand et al. 2024, equation 9, term by term: what gsplat's CUDA kernel computes."""
+    new_opacities = 1 - (1 - opacities) ** (1 / ratios)
+    denominators = torch.zeros_like(opacities)
+    for row, count in enumerate(ratios.tolist()):
+        for i in range(1, count + 1):
+            for k in range(i):
+                sign = (-1) ** k / math.sqrt(k + 1)
+                denominators[row] += math.comb(i - 1, k) * sign * new_opacities[row] ** (k + 1)
+    return new_opacities, scales * (opacities / denominators)[:, None]
+
+
+def test_mcmc_moves_adds_and_stays_under_its_limit(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ops, "compute_relocation", relocated)
+
+    def covariances(quats: Tensor, scales: Tensor, **options: Any) -> tuple[Tensor, None]:
+        return _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], None
+
+    monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
+    density = Densification(start=3, until=55, every=5, strategy="mcmc", cap_max=120)
+    archive = train(tmp_path / "run", scene, replace(SETTINGS, densification=density), CpuRasterizer())
+    assert [record.num_gaussians for record in archive.manifest.records] == [120, 120]
+    first, last = (archive.history()[i]["loss"] for i in (0, -1))
+    assert last < first
+
+
+def test_mcmc_starts_small_and_half_opaque() -> None:
+    field = blob_field(5)
+    started = mcmc_start(field)
+    torch.testing.assert_close(started.log_scales.exp(), 0.1 * field.log_scales.exp())
+    torch.testing.assert_close(started.opacity_logits.sigmoid(), torch.full((5,), 0.5))
