@@ -1,0 +1,128 @@
+"""The real checkouts, run in processes of their own on the CPU stand-ins, at a tiny size.
+
+Paths of the checkouts are in LAPGS_FASTGS, LAPGS_TAMING and LAPGS_GRAPHDECO; what is not named is skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BARE = """
+import runpy, sys
+from pathlib import Path
+from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+
+variant, *sys.argv = sys.argv[1:]
+sys.path[0] = str(Path(sys.argv[0]).parent)
+with cuda_on_cpu(variant):
+    runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""The script as Python runs it."""
+
+COUNTING = """
+import json, sys
+from dataclasses import replace
+from pathlib import Path
+from lapgs_plugin.adapters import driver
+from lapgs_plugin.cli import main
+
+calls = []
+
+def counted(replacement):
+    entry = [replacement.label, 0]
+    calls.append(entry)
+    def make(original):
+        made = replacement.make(original)
+        def call(*args, **kwargs):
+            entry[1] += 1
+            return made(*args, **kwargs)
+        return call
+    return replace(replacement, make=make)
+
+class Counting(driver.Attachment):
+    def __init__(self, replacements):
+        super().__init__([counted(replacement) for replacement in replacements])
+
+driver.Attachment = Counting
+file, *words = sys.argv[1:]
+sys.argv = ["lapgs", "run", *words]
+try:
+    main()
+finally:
+    Path(file).write_text(json.dumps(calls))
+"""
+"""`lapgs run`, counting the calls of whatever takes a symbol's place."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a run left.
+
+    Attributes:
+        folder: its -m.
+        progress: what it printed on stderr: progress bars, and lines of lapgs.
+        calls: (symbol, how often its replacement was called), one for each replacement.
+    """
+
+    folder: Path
+    progress: str
+    calls: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def losses(self) -> list[float]:
+        """The running mean of the loss that the progress bar shows every ten iterations."""
+        return _losses(self.progress)
+
+    @property
+    def losses_by_stage(self) -> list[list[float]]:
+        return [_losses(text) for text in re.split(r"level [0-9]+: [0-9]+ iterations at", self.progress)[1:]]
+
+
+def checkout(variable: str) -> Path:
+    """The folder that an environment variable names; skips the test where it names none."""
+    named = os.environ.get(variable)
+    if not named:
+        pytest.skip(f"needs a checkout of the backbone: set {variable} to its folder")
+    return Path(named).resolve()
+
+
+def knows_antialiasing(folder: Path) -> bool:
+    """Whether a graphdeco checkout is one for the rasterizers since October 2024."""
+    return "antialiasing" in (folder / "gaussian_renderer" / "__init__.py").read_text(encoding="utf-8")
+
+
+def run_bare(script: Path, variant: str, arguments: list[str], folder: Path) -> Done:
+    """The script by itself, on a stand-in of that variant, writing to `folder`."""
+    return Done(folder, _python(BARE, variant, script, *arguments, "-m", folder))
+
+
+def run_lapgs(script: Path, options: list[str], arguments: list[str], folder: Path) -> Done:
+    """`lapgs run --device cpu OPTIONS SCRIPT ARGUMENTS`, writing to `folder`."""
+    calls = folder.with_name(f"{folder.name}-calls.json")
+    progress = _python(COUNTING, calls, "--device", "cpu", *options, script, *arguments, "-m", folder)
+    return Done(folder, progress, tuple((label, count) for label, count in json.loads(calls.read_text())))
+
+
+def _python(code: str, *arguments: Any) -> str:
+    """What a program writes to stderr; it has to succeed."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stderr
+
+
+def _losses(text: str) -> list[float]:
+    shown = re.findall(r"(?<!Depth )\bLoss=([0-9.]+)", text)
+    return [float(value) for i, value in enumerate(shown) if i == 0 or value != shown[i - 1]]
