@@ -63,7 +63,7 @@ def render(
             "path through those.",
         ),
     ] = None,
-    fps: Annotated[
+    frame_rate: Annotated[
         float | None, typer.Option(min=1.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
     ] = None,
     size: Annotated[
@@ -71,6 +71,10 @@ def render(
     ] = None,
     panels: Annotated[
         bool, typer.Option("--panels", help="Base, residuals and composition side by side; with --trajectory.")
+    ] = False,
+    fps: Annotated[
+        bool,
+        typer.Option("--fps", help="Write nothing; print frames a second over the views, level by level, instead."),
     ] = False,
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
@@ -92,10 +96,15 @@ def render(
 
         lapgs render runs/garden --trajectory orbit --size 1280x720 --out garden.mp4
 
+        lapgs render runs/garden --fps
+
         lapgs render runs/garden --trajectory spline --panels --format exr --out frames/
     """
     if trajectory is None:
-        _refuse({"--frames": frames, "--fps": fps, "--size": size, "--panels": panels or None}, "needs --trajectory")
+        _refuse(
+            {"--frames": frames, "--frame-rate": frame_rate, "--size": size, "--panels": panels or None},
+            "needs --trajectory",
+        )
     else:
         _refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
     from lapgs_plugin.archive import RENDERS, RunArchive
@@ -109,11 +118,18 @@ def render(
     renderer = run_renderer(archive, device, rasterizer)
     level = renderer.finest if level is None else level
     renderer.require_level(level)
+    if fps:
+        _refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
+        with one_pool():
+            _print_speeds(renderer, list(_choose(run_scene(archive, scene), views).values()), level)
+        return
     if trajectory is not None:
         clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
         with one_pool():
             cameras = _path_cameras(archive, trajectory, frames, scene)
-            _write_clip(renderer, cameras, clip, level, size, fps=fps, panels=panels, image_format=image_format)
+            _write_clip(
+                renderer, cameras, clip, level, size, frame_rate=frame_rate, panels=panels, image_format=image_format
+            )
         print(f"{clip} holds the clip, {len(cameras)} frames")
         return
     folder = archive.path(RENDERS) if out is None else out
@@ -152,7 +168,7 @@ def _write_clip(
     level: int,
     size: str | None,
     *,
-    fps: float | None,
+    frame_rate: float | None,
     panels: bool,
     image_format: str,
 ) -> None:
@@ -163,7 +179,7 @@ def _write_clip(
     if out.suffix == VIDEO and image_format != "png":
         raise UserInputError(f"--format {image_format}: a video has 8 bits; give --out a folder")
     if out.suffix != VIDEO:
-        _refuse({"--fps": fps}, f"needs an {VIDEO} file as --out")
+        _refuse({"--frame-rate": frame_rate}, f"needs an {VIDEO} file as --out")
     wanted = None if size is None else parse_size(size)
     render_clip(
         renderer,
@@ -171,7 +187,7 @@ def _write_clip(
         out,
         level=level,
         size=clip_size(cameras[0], wanted, out),
-        fps=DEFAULT_FPS if fps is None else fps,
+        fps=DEFAULT_FPS if frame_rate is None else frame_rate,
         panels=panels,
         image_format=image_format,
     )
@@ -194,6 +210,21 @@ def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
         for split, chosen in (("test", scene.test), ("train", scene.train))
         if wanted in (split, "all") and chosen
     }
+
+
+def _print_speeds(renderer: HierarchyRenderer, splits: Sequence[Sequence[View]], level: int) -> None:
+    """A table of frames a second over the cameras of the chosen views."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from lapgs_plugin.rendering.speed import measure_speed
+
+    cameras = [view.camera for views in splits for view in views]
+    table = Table("", "size", "Gaussians", "ms", "FPS", title=f"median over {len(cameras)} cameras")
+    for speed in measure_speed(renderer, cameras, level):
+        size = f"{speed.size[0]}x{speed.size[1]}"
+        table.add_row(speed.what, size, f"{speed.gaussians:,}", f"{speed.milliseconds:.2f}", f"{speed.fps:.1f}")
+    Console().print(table)
 
 
 def _write_views(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -59,6 +61,10 @@ def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) ->
 class HierarchyRenderer:
     """Renders the finished levels of a hierarchy and adds them up.
 
+    On a GPU every field is rendered in a stream of its own, and so is Up of what it gives: a coarse level, which leaves
+    most of a GPU idle, costs little beside a fine one. Nothing here waits for the GPU; images are for the stream that
+    is current when `render` is called.
+
     Attributes:
         fields: by level; contiguous from `levels - 1` down to the finest that is finished.
         levels: number of levels of the whole hierarchy, L.
@@ -67,6 +73,7 @@ class HierarchyRenderer:
         background: RGB behind the base. Residuals are always rendered over zero.
         clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
             paper authors' release does in training and rendering.
+        concurrent: on a GPU, let fields be rendered beside each other instead of one after the other.
 
     Raises:
         UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
@@ -79,6 +86,7 @@ class HierarchyRenderer:
     rasterizer: Rasterizer
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clamped: bool = False
+    concurrent: bool = True
 
     def __post_init__(self) -> None:
         given = sorted(self.fields, reverse=True)
@@ -142,6 +150,22 @@ class HierarchyRenderer:
                 "levels count from 0, the finest, and this run has no others"
             )
 
+    def level_for_size(self, camera: Camera, size: tuple[int, int]) -> int:
+        """The level of detail for an image of (width, height) pixels: the coarsest whose image is not smaller.
+
+        Args:
+            camera: of the full-resolution view.
+            size: what the image is shown at.
+
+        Returns:
+            One that can be rendered; the finest of them where even that is smaller.
+        """
+        for level in range(self.levels - 1, self.finest, -1):
+            width, height = level_size((camera.width, camera.height), level)
+            if width >= size[0] and height >= size[1]:
+                return level
+        return self.finest
+
     @torch.no_grad()
     def render(self, camera: Camera, level: int = 0, gains: Mapping[int, float] | None = None) -> Composition:
         """Render a view from the coarsest level down to `level`.
@@ -161,10 +185,15 @@ class HierarchyRenderer:
             self.require_level(each)
         rendered: dict[int, Tensor] = {}
         composed: dict[int, Tensor] = {}
+        raised: Tensor | None = None  # Up of what is composed so far
         for each in range(self.levels - 1, level - 1, -1):
-            rendered[each], composed[each] = self.render_level(
-                camera, each, composed.get(each + 1), gains.get(each, 1.0)
-            )
+            with self._beside(each):
+                rendered[each] = self._render_band(each, level_camera(camera, each), gains.get(each, 1.0))
+                composed[each] = rendered[each] if raised is None else self._after(each + 1, raised) + rendered[each]
+                if each > level:
+                    finer = level_camera(camera, each - 1)
+                    raised = self.pyramid.up(composed[each], (finer.height, finer.width))
+        self._gather([*rendered.values(), *composed.values()])
         base = rendered.pop(self.levels - 1)
         return Composition(base, residuals=rendered, composed=composed)
 
@@ -188,14 +217,58 @@ class HierarchyRenderer:
             return image, image
         return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image
 
+    @cached_property
+    def _streams(self) -> dict[int, torch.cuda.Stream]:
+        """By level; none where fields are rendered one after the other."""
+        if not self.concurrent or self.device.type != "cuda" or len(self.fields) == 1:
+            return {}
+        torch.cuda.synchronize(self.device)  # the fields are complete: no stream has to wait for them later
+        return {level: torch.cuda.Stream(self.device) for level in self.fields}  # type: ignore[no-untyped-call]  # torch's
+
+    @contextmanager
+    def _beside(self, level: int) -> Iterator[None]:
+        """Let what is inside go to the level's stream, where there are any."""
+        if level not in self._streams:
+            yield
+            return
+        with torch.cuda.stream(self._streams[level]):
+            yield
+
+    def _after(self, level: int, image: Tensor) -> Tensor:
+        """An image that a level's stream makes, for use in the current one."""
+        if level in self._streams:
+            current = torch.cuda.current_stream(self.device)
+            current.wait_stream(self._streams[level])
+            image.record_stream(current)
+        return image
+
+    def _gather(self, images: Iterable[Tensor]) -> None:
+        """Let the current stream go on when the levels' streams are done, and use their images."""
+        if not self._streams:
+            return
+        current = torch.cuda.current_stream(self.device)
+        for stream in self._streams.values():
+            current.wait_stream(stream)
+        for image in images:
+            image.record_stream(current)
+
+    @cached_property
+    def _black(self) -> Tensor:
+        return torch.zeros_like(self._behind)
+
+    @cached_property
+    def _behind(self) -> Tensor:
+        """(3,) `background` beside the fields, sent there once: sending waits for a GPU."""
+        return torch.tensor(self.background).to(self.fields[self.levels - 1].means)
+
     def _render_band(self, level: int, at_level: Camera, gain: float) -> Tensor:
         """A field's own render times its gain, (3, h, w) at the size of `at_level`."""
         field = self.fields[level]
         if gain == 0.0:
-            return torch.zeros(3, at_level.height, at_level.width).to(field.means)
+            return field.means.new_zeros(3, at_level.height, at_level.width)
         # A residual adds to the image; a background behind it would be added twice.
-        color = torch.zeros(3) if field.signed else torch.tensor(self.background)
-        image = self.rasterizer(field, at_level, background=color.to(field.means)).image
+        color = self._black if field.signed else self._behind
+        image = self.rasterizer(field, at_level, background=color).image
         if self.clamped:
             image = image.clamp(-1.0 if field.signed else 0.0, 1.0)
         return image if gain == 1.0 else gain * image

@@ -65,7 +65,7 @@ def video_frames(path: Path) -> list[np.ndarray]:
 
 @needs_video
 def test_a_video_plays_and_shows_the_path(run: Path, path_file: Path, tmp_path: Path) -> None:
-    output = lapgs_render(run, "--trajectory", path_file, "--out", tmp_path / "clip.mp4", "--fps", 12)
+    output = lapgs_render(run, "--trajectory", path_file, "--out", tmp_path / "clip.mp4", "--frame-rate", 12)
     assert "3 frames" in output
     lapgs_render(run, "--trajectory", path_file, "--out", tmp_path / "frames")
     frames = video_frames(tmp_path / "clip.mp4")
@@ -122,7 +122,7 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
         (("--trajectory", "orbit", "--size", "81x40", "--out", "clip.mp4"), "a video's sides are even; use 82x40"),
         (("--trajectory", "orbit", "--out", "clip.avi"), r"expected an \.mp4 file or a folder"),
         (("--trajectory", "orbit", "--out", "clip.mp4", "--format", "exr"), "a video has 8 bits"),
-        (("--trajectory", "orbit", "--out", "frames", "--fps", 10), r"--fps needs an \.mp4"),
+        (("--trajectory", "orbit", "--out", "frames", "--frame-rate", 10), r"--frame-rate needs an \.mp4"),
         (("--trajectory", "helix"), "expected orbit, spline or a JSON file"),
         (("--trajectory", "orbit", "--level", 3), "level 3 cannot be rendered"),
     ],

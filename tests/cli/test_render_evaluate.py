@@ -216,3 +216,12 @@ def test_an_interruption_leaves_only_whole_images(run: Path, monkeypatch: pytest
     assert len(written) == 4
     for name in written:
         assert cv2.imread(str(run / "renders" / name)) is not None
+
+
+def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:
+    before = files_in(run)
+    printed = lapgs("render", run, "--fps")
+    assert "median over 2 cameras" in printed
+    for words in (("levels 1 to 0, one after the other", "450"), ("base", "250"), ("residual 0 alone", "200")):
+        assert any(all(word in line for word in words) for line in printed.splitlines()), words
+    assert files_in(run) == before

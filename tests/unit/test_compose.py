@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -167,3 +169,72 @@ def test_a_gain_of_a_level_that_is_not_there_is_refused() -> None:
     renderer = HierarchyRenderer({1: blobs(1, False)}, 2, Pyramid("camera"), OracleRasterizer())
     with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
         renderer.render(CAMERA, level=1, gains={0: 2.0})
+
+
+@pytest.mark.parametrize(
+    ("size", "level"),
+    [((1, 1), 2), ((12, 8), 2), ((13, 8), 1), ((23, 15), 1), ((24, 15), 0), ((45, 30), 0), ((90, 60), 0)],
+)
+def test_the_level_of_detail_is_the_coarsest_that_is_not_smaller(size: tuple[int, int], level: int) -> None:
+    fields = {2: blobs(2, False), 1: blobs(1, True), 0: blobs(0, True)}
+    renderer = HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer())
+    assert renderer.level_for_size(CAMERA, size) == level  # 45x30, 23x15, 12x8
+    del fields[0]
+    assert HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer()).level_for_size(CAMERA, size) == max(level, 1)
+
+
+class Streams:
+    """What `torch.cuda` offers for streams, writing down who waits for whom and who uses what."""
+
+    def __init__(self) -> None:
+        self.log: list[tuple[str, ...]] = []
+        self.stack = [Stream("current", self.log)]
+
+    def make(self, device: object) -> Stream:
+        return Stream(f"stream {len({entry[1] for entry in self.log if entry[0] == 'made'})}", self.log, made=True)
+
+    @contextmanager
+    def inside(self, stream: Stream) -> Iterator[None]:
+        self.stack.append(stream)
+        yield
+        self.stack.pop()
+
+
+class Stream:
+    def __init__(self, name: str, log: list[tuple[str, ...]], made: bool = False) -> None:
+        self.name, self.log = name, log
+        if made:
+            log.append(("made", name))
+
+    def wait_stream(self, other: Stream) -> None:
+        self.log.append((self.name, "waits for", other.name))
+
+
+def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    fields = {2: constant_field(0.4, False), 1: constant_field(-0.25, True), 0: constant_field(0.125, True)}
+    rasterizer, streams = Constant(), Streams()
+    renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
+    expected = renderer.render(CAMERA)
+    monkeypatch.setattr(HierarchyRenderer, "device", torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: streams.log.append(("synchronize",)))
+    monkeypatch.setattr(torch.cuda, "Stream", streams.make)
+    monkeypatch.setattr(torch.cuda, "stream", streams.inside)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: streams.stack[-1])
+    monkeypatch.setattr(Tensor, "record_stream", lambda tensor, stream: None)
+    renderer = replace(renderer)
+    found = renderer.render(CAMERA)
+    assert torch.equal(found.composed[0], expected.composed[0])
+    first = streams.log.copy()
+    assert first == [
+        ("synchronize",),
+        *[("made", f"stream {i}") for i in range(3)],  # of levels 2, 1 and 0
+        ("stream 1", "waits for", "stream 0"),
+        ("stream 2", "waits for", "stream 1"),
+        *[("current", "waits for", f"stream {i}") for i in range(3)],
+    ]
+    streams.log.clear()
+    renderer.render(CAMERA)
+    assert streams.log == first[4:]  # not one wait of the processor
+    streams.log.clear()
+    replace(renderer, concurrent=False).render(CAMERA)
+    assert streams.log == []

@@ -1,0 +1,110 @@
+"""How fast a run renders: frames a second over real cameras, level by level, with and without streams."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import median
+
+import torch
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
+
+ROUNDS = 5
+
+Frame = Callable[[Camera], object]
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How long frames of one kind take.
+
+    Attributes:
+        what: the kind.
+        size: (width, height) of a frame of the first camera.
+        gaussians: of all fields that are rendered for it.
+        milliseconds: median, over cameras and rounds, from the end of one frame to the end of the next.
+    """
+
+    what: str
+    size: tuple[int, int]
+    gaussians: int
+    milliseconds: float
+
+    @property
+    def fps(self) -> float:
+        return 1000.0 / self.milliseconds
+
+
+def measure_speed(
+    renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, rounds: int = ROUNDS
+) -> list[Speed]:
+    """The speeds of a hierarchy: composed down to `level`, to each coarser one, and each residual field alone.
+
+    Images are composed and clamped, and stay where they are. Every kind is run over all cameras once before.
+
+    Args:
+        renderer: of the run.
+        cameras: of full-resolution views, at least one.
+        level: the finest to add.
+        rounds: over all cameras.
+    """
+    found = []
+    for what, frame, fields in _kinds(renderer, level):
+        shown = level_camera(cameras[0], fields[0])
+        milliseconds = _median_milliseconds(frame, [*cameras] * (rounds + 1), len(cameras), renderer.device)
+        gaussians = sum(len(renderer.fields[each]) for each in fields)
+        found.append(Speed(what, (shown.width, shown.height), gaussians, milliseconds))
+    return found
+
+
+def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[tuple[str, Frame, Sequence[int]]]:
+    """What is measured: its name, what makes a frame, and the levels whose fields are rendered, finest first."""
+    in_turn = replace(renderer, concurrent=False)
+    coarsest = renderer.levels - 1
+    for finest in range(level, coarsest):
+        fields = range(finest, renderer.levels)
+        yield f"levels {coarsest} to {finest}, one after the other", _composing(in_turn, finest), fields
+        if renderer.device.type == "cuda":
+            together = replace(renderer, concurrent=True)
+            yield f"levels {coarsest} to {finest}, beside each other", _composing(together, finest), fields
+    yield "base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest]
+    for residual in range(coarsest - 1, level - 1, -1):
+        yield f"residual {residual} alone", _alone(in_turn, residual), [residual]
+
+
+def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
+    return lambda camera: renderer.render(camera, level).composed[level].clamp(0.0, 1.0)
+
+
+def _alone(renderer: HierarchyRenderer, level: int) -> Frame:
+    return lambda camera: renderer.render_level(camera, level, None)
+
+
+@torch.no_grad()
+def _median_milliseconds(frame: Frame, cameras: Sequence[Camera], warm: int, device: torch.device) -> float:
+    """Median time of a frame; the first `warm` ones only compile kernels and fill PyTorch's caches."""
+    for camera in cameras[:warm]:
+        frame(camera)
+    if device.type != "cuda":
+        ends = [time.perf_counter()]
+        for camera in cameras[warm:]:
+            frame(camera)
+            ends.append(time.perf_counter())
+        return 1000.0 * median(after - before for before, after in pairwise(ends))
+    torch.cuda.synchronize(device)
+    events = [_recorded(device)]
+    for camera in cameras[warm:]:
+        frame(camera)
+        events.append(_recorded(device))
+    events[-1].synchronize()
+    return median(float(before.elapsed_time(after)) for before, after in pairwise(events))
+
+
+def _recorded(device: torch.device) -> torch.cuda.Event:
+    event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch leaves these without types
+    event.record(torch.cuda.current_stream(device))
+    return event
