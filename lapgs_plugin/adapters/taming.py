@@ -99,7 +99,6 @@ class TamingAdapter(BackboneAdapter):
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
         args, opt = copy.copy(call.values["args"]), changed.opt
-        args.ho_iteration = window.scaled(args.ho_iteration)
         # Its table of counts has one entry an interval, and is looked up beyond its end unless densification starts and
         # stops at whole intervals.
         opt.densify_from_iter = -(-opt.densify_from_iter // opt.densification_interval) * opt.densification_interval

@@ -107,7 +107,7 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
             assert densifications < len(counts)
             assert sorted(counts) == counts
             found.append((given.budget, counts[-1] > 0.95 * given.budget, given.ho_iteration))
-    assert found == [(10_000, True, 5_000), (20_000, True, 10_000)]
+    assert found == [(10_000, True, 15_000), (20_000, True, 15_000)]
 
 
 def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
@@ -117,10 +117,10 @@ def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: 
     assert archive.manifest.complete
 
 
-def test_taming_releases_opacities_at_the_share_of_each_stage(scene: Path, tmp_path: Path) -> None:
+def test_taming_releases_opacities_at_the_iteration_of_each_stage(scene: Path, tmp_path: Path) -> None:
     released: list[int] = []
     now = [0]
-    with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", "--ho_iteration", 45) as adapter:
+    with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", "--ho_iteration", 25) as adapter:
         model = adapter.train.GaussianModel
         update, modify = model.update_learning_rate, model.modify_functions
 
@@ -134,7 +134,7 @@ def test_taming_releases_opacities_at_the_share_of_each_stage(scene: Path, tmp_p
 
         model.update_learning_rate, model.modify_functions = spy_update, spy_modify
         drive(adapter)
-    assert released == [15, 30]
+    assert released == [25, 25]
 
 
 def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict[str, list[tuple[int, int]]]:
