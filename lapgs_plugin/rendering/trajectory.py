@@ -138,8 +138,8 @@ def read_trajectory(path: Path) -> list[Camera]:
     return cameras
 
 
-def trajectory_json(cameras: Sequence[Camera], fps: float) -> dict[str, Any]:
-    """Cameras as `read_trajectory` reads them; "fps" is for other programs."""
+def trajectory_json(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Cameras as `read_trajectory` reads them, all of the first one's size."""
     first = cameras[0]
     frames = [
         {
@@ -148,7 +148,7 @@ def trajectory_json(cameras: Sequence[Camera], fps: float) -> dict[str, Any]:
         }
         for camera in cameras
     ]
-    return {"w": first.width, "h": first.height, "fps": fps, "frames": frames}
+    return {"w": first.width, "h": first.height, "frames": frames}
 
 
 def with_size(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -25,6 +25,8 @@ class Controls:
         changed: called when another picture is wanted.
         go_to: called with the index of a camera.
         show_cameras: called with whether their frustums are wanted.
+        keep: called to remember the view; says how many there are.
+        save: called to hand out the views that were kept.
     """
 
     def __init__(
@@ -37,6 +39,8 @@ class Controls:
         changed: Callable[[], None],
         go_to: Callable[[int], None],
         show_cameras: Callable[[bool], None],
+        keep: Callable[[], int],
+        save: Callable[[], None],
     ) -> None:
         self._gui = client.gui
         self._run = run
@@ -51,6 +55,8 @@ class Controls:
         if views:
             with self._gui.add_folder("Cameras"):
                 self._add_cameras(views, go_to, show_cameras)
+        with self._gui.add_folder("Path"):
+            self._add_path(keep, save)
         with self._gui.add_folder("Figures"):
             self._figures = self._gui.add_markdown("")
 
@@ -131,6 +137,17 @@ class Controls:
                 chosen.value = views[index]  # tells `on_update`, which goes there
 
         chosen.on_update(lambda _: go_to(views.index(chosen.value)))
+
+    def _add_path(self, keep: Callable[[], int], save: Callable[[], None]) -> None:
+        count = self._gui.add_markdown("Keep views to render a clip through them.")
+        press = self._gui.add_button_group("views", ("keep", "save"))
+
+        @press.on_click
+        def _(_: object) -> None:
+            if press.value == "keep":
+                count.content = f"{keep()} views kept"
+            else:
+                save()
 
     def _band_name(self, level: int) -> str:
         if self._run.renderer.levels == 1:

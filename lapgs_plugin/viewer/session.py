@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.trajectory import trajectory_json, with_size
 from lapgs_plugin.viewer.controls import Controls
 from lapgs_plugin.viewer.navigation import Pose, turning_distance
 from lapgs_plugin.viewer.pacing import Pacing
@@ -22,6 +25,11 @@ from lapgs_plugin.viewer.pictures import Picture, ShownRun, draw
 
 MAX_SIDE = 2048
 """Longest side of a picture in pixels; the browser stretches it to larger windows."""
+
+PATH_FILE = "path.json"
+
+HANDLE_DEPTH, HANDLE_HEIGHT, HANDLE_RADIUS = 10.0, 0.5, 0.03
+"""Of the ball on the divider: its depth in nearest visible depths, then shares of half the window's height."""
 
 JPEG_MOVING, JPEG_STILL = 75, 92
 REPORT_SECONDS = 0.3
@@ -62,7 +70,7 @@ class Session:
         self._lock = threading.Lock()
         self._last_report = 0.0
         self._frustums: list[viser.CameraFrustumHandle] = []
-        self.pictures = 0
+        self._kept: list[Camera] = []
         self._controls = Controls(
             client,
             exhibit.run,
@@ -71,7 +79,10 @@ class Session:
             changed=self._change,
             go_to=self._go_to,
             show_cameras=self._show_cameras,
+            keep=self._keep,
+            save=self._save,
         )
+        self._handle = None if exhibit.other is None else self._add_handle()
         client.camera.on_update(lambda _: self._change())
         self._change()
 
@@ -90,15 +101,17 @@ class Session:
         seconds = time.perf_counter() - begin
         with self._lock:
             self._pacing.end(scale, seconds)
-            self.pictures += 1
         now = time.perf_counter()
         if scale >= 1.0 or now - self._last_report > REPORT_SECONDS:
             self._last_report = now
             self._controls.report(picture, seconds)
 
-    def _draw(self, scale: float) -> Picture:
+    def _pose(self) -> Pose:
         camera = self._client.camera
-        pose = Pose(np.asarray(camera.wxyz), np.asarray(camera.position), float(camera.fov))
+        return Pose(np.asarray(camera.wxyz), np.asarray(camera.position), float(camera.fov))
+
+    def _draw(self, scale: float) -> Picture:
+        camera, pose = self._client.camera, self._pose()
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         share = scale * min(1.0, MAX_SIDE / max(width, height))
         size = max(round(share * width), 1), max(round(share * height), 1)
@@ -112,7 +125,34 @@ class Session:
     def _change(self) -> None:
         with self._lock:
             self._pacing.change(time.perf_counter())
+        self._place_handle()
         self._wake()
+
+    def _add_handle(self) -> viser.IcosphereHandle:
+        """A ball on the divider, to drag it by: a drag that begins on a thing of the scene does not turn the camera."""
+        handle = self._client.scene.add_icosphere("/divider", color=(255, 255, 255), cast_shadow=False)
+
+        @handle.on_drag("left")
+        async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            self._controls.divider = float(event.end_screen_pos[0])
+
+        return handle
+
+    def _place_handle(self) -> None:
+        """Keep the ball on the divider, at the same size, wherever the camera goes."""
+        if self._handle is None:
+            return
+        split = self._controls.settings.divider
+        self._handle.visible = split is not None
+        if split is None:
+            return
+        camera, pose = self._client.camera, self._pose()
+        depth = HANDLE_DEPTH * camera.near
+        half_height = depth * math.tan(0.5 * pose.fov)
+        half_width = half_height * camera.image_width / max(camera.image_height, 1)
+        in_camera = np.array([(2.0 * split - 1.0) * half_width, HANDLE_HEIGHT * half_height, depth])
+        self._handle.position = pose.position + viser.transforms.SO3(pose.wxyz).as_matrix() @ in_camera
+        self._handle.scale = HANDLE_RADIUS * half_height
 
     def _go_to(self, index: int) -> None:
         """Stand where a camera of the scene stands."""
@@ -125,6 +165,19 @@ class Session:
             camera.wxyz = pose.wxyz
             ahead = viser.transforms.SO3(pose.wxyz).as_matrix()[:, 2]
             camera.look_at = pose.position + turning_distance(pose.position, self._exhibit.rig) * ahead
+
+    def _keep(self) -> int:
+        """Remember the view for a path."""
+        camera = self._client.camera
+        self._kept.append(self._pose().camera(camera.image_width, camera.image_height))
+        return len(self._kept)
+
+    def _save(self) -> None:
+        """Hand out the views that were kept as a file for `lapgs render --trajectory`."""
+        if self._kept:
+            size = self._kept[0].width, self._kept[0].height  # windows change
+            text = json.dumps(trajectory_json([with_size(camera, size) for camera in self._kept]), indent=1)
+            self._client.send_file_download(PATH_FILE, text.encode())
 
     def _clicked(self, index: int, _: object) -> None:
         self._go_to(index)

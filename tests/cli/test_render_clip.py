@@ -49,7 +49,7 @@ def path_file(run: Path, tmp_path: Path) -> Path:
     """A file with the first three training cameras."""
     train, _ = run_cameras(RunArchive.open(run))
     path = tmp_path / "path.json"
-    path.write_text(json.dumps(trajectory_json(list(train.values())[:3], fps=30)))
+    path.write_text(json.dumps(trajectory_json(list(train.values())[:3])))
     return path
 
 

@@ -121,7 +121,7 @@ def test_an_order_has_every_camera_once(count: int, seed: int) -> None:
 def test_files_come_back_as_written(tmp_path: Path) -> None:
     cameras = ring(5)
     path = tmp_path / "path.json"
-    path.write_text(json.dumps(trajectory_json(cameras, fps=30)))
+    path.write_text(json.dumps(trajectory_json(cameras)))
     for read, camera in zip(read_trajectory(path), cameras, strict=True):
         torch.testing.assert_close(read.world_to_camera, camera.world_to_camera, atol=1e-5, rtol=0)
         assert (read.width, read.height, read.fx, read.cy) == (camera.width, camera.height, camera.fx, camera.cy)
