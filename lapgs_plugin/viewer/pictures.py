@@ -161,7 +161,8 @@ def draw(
     """
     window = camera.resized(round(camera.width * zoom), round(camera.height * zoom))
     stopwatch = Stopwatch(run.renderer.rasterizer)
-    shown = replace(run, renderer=replace(run.renderer, rasterizer=stopwatch))
+    # One field after the other, or their times would not be theirs.
+    shown = replace(run, renderer=replace(run.renderer, rasterizer=stopwatch, concurrent=False))
     image, level = _shown(shown, camera, settings, shown.level_for(settings, window, distance))
     if settings.divider is not None and other is not None:
         as_trained = PictureSettings(level=settings.level)

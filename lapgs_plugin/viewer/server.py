@@ -109,7 +109,9 @@ class Viewer:
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
         with self._awake:
-            self._sessions.pop(client.client_id, None)
+            session = self._sessions.pop(client.client_id, None)
+        if session is not None:
+            session.leave()
 
     def _wake(self) -> None:
         with self._awake:

@@ -71,6 +71,7 @@ class Session:
         self._last_report = 0.0
         self._frustums: list[viser.CameraFrustumHandle] = []
         self._kept: list[Camera] = []
+        self._left = False
         self._controls = Controls(
             client,
             exhibit.run,
@@ -91,12 +92,18 @@ class Session:
         with self._lock:
             return self._pacing.due()
 
+    def leave(self) -> None:
+        """The client has disconnected: nothing is sent any more, and what is being drawn is dropped."""
+        self._left = True
+
     def draw(self) -> None:
         """Draw the next picture and send it."""
         begin = time.perf_counter()
         with self._lock:
             scale = self._pacing.begin()
         picture = self._draw(scale)
+        if self._left:
+            return
         self._send(picture, JPEG_STILL if scale >= 1.0 else JPEG_MOVING)
         seconds = time.perf_counter() - begin
         with self._lock:
@@ -177,7 +184,7 @@ class Session:
         if self._kept:
             size = self._kept[0].width, self._kept[0].height  # windows change
             text = json.dumps(trajectory_json([with_size(camera, size) for camera in self._kept]), indent=1)
-            self._client.send_file_download(PATH_FILE, text.encode())
+            self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
     def _clicked(self, index: int, _: object) -> None:
         self._go_to(index)
