@@ -251,7 +251,7 @@ def test_unknown_places_and_precisions_are_named(tmp_path: Path) -> None:
     for where in ("tape", "gpu"):
         with pytest.raises(UserInputError, match=f"cannot be kept on {where}: expected memory or disk$"):
             ImageStore(where, "float32")
-    with pytest.raises(UserInputError, match="cannot be kept on tape: expected gpu or memory or disk$"):
+    with pytest.raises(UserInputError, match=r"cannot be kept on tape: expected gpu or memory or disk$"):
         ImageStore.check("tape", "float32", "cuda")
     ImageStore.check("gpu", "float32", "cuda:1")
     with pytest.raises(UserInputError, match="cannot be stored as int4: expected float32, float16, uint8"):
