@@ -199,9 +199,7 @@ def _count(value: float) -> str:
     return f"{value:g}"
 
 
-def _strips(
-    runs: Sequence[MeasuredRun], renderers: Sequence[HierarchyRenderer], moved_to: Path | None
-) -> list[Strip]:
+def _strips(runs: Sequence[MeasuredRun], renderers: Sequence[HierarchyRenderer], moved_to: Path | None) -> list[Strip]:
     """The worst, the median and the best view of the run, in pictures."""
     shown = _shown_views(runs[0].metrics)
     with one_pool():
