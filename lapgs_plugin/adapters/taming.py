@@ -19,8 +19,8 @@ logger = logging.getLogger(__name__)
 BASE_SHARE, FINEST_SHARE = 0.5, 1.0
 """Share of the budget that the base and the finest residual end with; stages between lie between.
 
-The base, at a fraction of the pixels, ends with half of it, so that the total work falls; shares of 0.4 and 0.6 cost
-1.4 dB on bonsai.
+The base, at a fraction of the pixels, ends with half of it, so that the total work falls. With shares of 0.4 and 0.6
+and opacities frozen half way through each stage, bonsai lost 1.4 dB.
 """
 
 LOW_LOGIT = -1.0
