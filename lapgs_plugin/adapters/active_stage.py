@@ -27,6 +27,7 @@ from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.inheritance import inherit
+from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.signed_color import ColorPath
 
@@ -64,7 +65,7 @@ class ActiveStage:
         self._options, self._adapter, self._device = context.options, context.adapter, context.device
         self._hooks, self._pyramid = context.hooks, Pyramid(context.options.grid)
         self.stage = window.stage
-        self.overhead: dict[str, float] = {}
+        self.overhead = Overhead(settle=self._synchronize)
         self._began: float | None = None
         self._excluded = 0.0  # seconds since `_began` that are not optimization
         self._iteration = self._peak = 0
@@ -89,7 +90,7 @@ class ActiveStage:
 
     def load_images(self) -> None:
         """Make the level's images; from here on whatever the checkout renders is this stage's."""
-        with self.timed("pyramid"):
+        with self.overhead.timed("pyramid"):
             self._images.load()
         self._context.shim.stage = self._rendering
 
@@ -105,7 +106,7 @@ class ActiveStage:
             train_cameras={1.0: self._announcing([self._view(camera) for camera in self._images.train])},
             test_cameras={1.0: [self._view(camera) for camera in self._images.test]},
         )
-        with self.timed("inheritance"):
+        with self.overhead.timed("inheritance"):
             self._initialise(gaussians)
         self._adapter.stage_scene(scene)
         return scene
@@ -155,7 +156,7 @@ class ActiveStage:
         """Time that is not optimization though it passes inside the training loop."""
         self._synchronize()
         start = time.perf_counter()
-        with self.timed(what):
+        with self.overhead.timed(what):
             yield
         self._excluded += time.perf_counter() - start
 
@@ -237,22 +238,21 @@ class ActiveStage:
     def _archive_level(self, finished: Finished, seconds: float, memory: dict[str, int]) -> None:
         stage, field = self.stage, finished.field
         left = {"carried": dict(finished.carried), "moments": dict(finished.moments)}
-        with self.timed("archive"):
-            self._archive.finish_level(
-                LevelRecord(
-                    level=stage.level,
-                    signed=stage.signed,
-                    iterations=stage.iterations,
-                    num_gaussians=len(field),
-                    peak_gaussians=max(self._peak, len(field)),
-                    train_seconds=seconds,
-                    overhead_seconds=dict(self.overhead),
-                    image_size=stage.image_size,
-                    memory_bytes=memory,
-                ),
-                field,
-                left if stage.level > 0 and any(left.values()) else None,
-            )
+        self._archive.finish_level(
+            LevelRecord(
+                level=stage.level,
+                signed=stage.signed,
+                iterations=stage.iterations,
+                num_gaussians=len(field),
+                peak_gaussians=max(self._peak, len(field)),
+                train_seconds=seconds,
+                overhead_seconds=dict(self.overhead),
+                image_size=stage.image_size,
+                memory_bytes=memory,
+            ),
+            field,
+            left if stage.level > 0 and any(left.values()) else None,
+        )
 
     def _finish(
         self,
@@ -263,10 +263,10 @@ class ActiveStage:
     ) -> Finished:
         predictions = None
         if self.stage.level > 0:
-            with self.timed("cache"):
+            with self.overhead.timed("cache"):
                 predictions = self._predict(gaussians)
         elif self._images.test:
-            with self.timed("evaluation"):
+            with self.overhead.timed("evaluation"):
                 self._report_held_out(gaussians)
         return Finished(field, predictions, carried, moments)
 
@@ -363,16 +363,6 @@ class ActiveStage:
     def _synchronize(self) -> None:
         if self._device.type == "cuda":
             torch.cuda.synchronize()
-
-    @contextmanager
-    def timed(self, what: str) -> Iterator[None]:
-        """Add the time spent inside to the stage's overhead under `what`."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._synchronize()
-            self.overhead[what] = self.overhead.get(what, 0.0) + time.perf_counter() - start
 
 
 def with_attributes(value: Any, **changes: Any) -> Any:

@@ -34,15 +34,15 @@ LARGEST_OPACITY = 1 - 1e-6
 SPARSE_ADAM = "SparseGaussianAdam"
 """What the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
 
-PARAMETERS = {
-    "_xyz": "means",
-    "_rotation": "quaternions",
-    "_scaling": "log_scales",
-    "_opacity": "opacity_logits",
-    "_features_dc": "sh",
-    "_features_rest": "sh",
+PARAMETERS: dict[str, Callable[[GaussianField], Tensor]] = {
+    "_xyz": lambda field: field.means,
+    "_rotation": lambda field: field.quaternions,
+    "_scaling": lambda field: field.log_scales,
+    "_opacity": lambda field: field.opacity_logits[:, None],
+    "_features_dc": lambda field: field.sh[:, :1],
+    "_features_rest": lambda field: field.sh[:, 1:],
 }
-"""Attributes of the family's GaussianModel that hold parameters, and the tensor of a GaussianField they come from."""
+"""Attributes of the family's GaussianModel that hold parameters, and what they are of a GaussianField."""
 
 
 @dataclass(frozen=True)
@@ -289,16 +289,12 @@ class BackboneAdapter(ABC):
             gaussians: its optimizer is not set up yet.
             attributes: which, of `PARAMETERS`.
         """
-        values = {
-            "_xyz": field.means,
-            "_rotation": field.quaternions,
-            "_scaling": field.log_scales,
-            "_opacity": field.opacity_logits[:, None],
-            "_features_dc": field.sh[:, :1],
-            "_features_rest": field.sh[:, 1:],
-        }
         for name in attributes:
-            setattr(gaussians, name, nn.Parameter(values[name].detach().clone().contiguous().requires_grad_(True)))
+            setattr(
+                gaussians,
+                name,
+                nn.Parameter(PARAMETERS[name](field).detach().clone().contiguous().requires_grad_(True)),
+            )
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +17,7 @@ from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
+from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
@@ -101,7 +100,7 @@ class Trainer:
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = parse_supervision(self.settings.supervision)
         check_cache(self.settings, self.device)
-        self._overhead: dict[str, float] = {}
+        self._overhead = Overhead()
         self._images: LevelImages | None = None
         self._train_cache: ImageStore | None = None
         self._test_cache: ImageStore | None = None
@@ -136,7 +135,7 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
-        self._overhead = {} if checkpoint is None else dict(checkpoint["overhead"])
+        self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint))
@@ -161,7 +160,7 @@ class Trainer:
         sparse = self.settings.sparse_adam
         if checkpoint is not None:
             return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
-        with self._timed("inheritance"):
+        with self._overhead.timed("inheritance"):
             if not stage.signed:
                 points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
                 if self.settings.densification.strategy == "mcmc":
@@ -180,7 +179,7 @@ class Trainer:
         schedule = StageSchedule.create(self.settings, stage)
         if self._images is not None:
             self._images.close()
-        with self._timed("pyramid"):
+        with self._overhead.timed("pyramid"):
             self._images = LevelImages(
                 self.scene.train,
                 stage.level,
@@ -210,9 +209,9 @@ class Trainer:
         self._close_caches()
         if not stage.signed:
             return
-        with self._timed("cache"):
+        with self._overhead.timed("cache"):
             self._train_cache = self._predictions(stage, self.scene.train, "train")
-        with self._timed("evaluation"):
+        with self._overhead.timed("evaluation"):
             self._test_cache = self._predictions(stage, self.scene.test, "test")
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> ImageStore:
@@ -290,7 +289,7 @@ class Trainer:
     @torch.no_grad()
     def _held_out_psnr(self, run: StageRun) -> float:
         """Mean PSNR in dB of the held-out views, composed so far and brought to full resolution."""
-        with self._timed("evaluation"):
+        with self._overhead.timed("evaluation"):
             values = []
             for view in self.scene.test:
                 camera = level_camera(view.camera, run.stage.level)
@@ -302,7 +301,7 @@ class Trainer:
             return math.fsum(values) / len(values)
 
     def _save_checkpoint(self, run: StageRun) -> None:
-        with self._timed("checkpoints"):
+        with self._overhead.timed("checkpoints"):
             self.archive.save_checkpoint({**run.state(), "overhead": dict(self._overhead)})
 
     def _finish(self, run: StageRun) -> None:
@@ -327,12 +326,3 @@ class Trainer:
             return {}
         kept = run.images.bytes_on_device + (0 if run.accumulated is None else run.accumulated.bytes_on_device)
         return {"peak": torch.cuda.max_memory_allocated(self.device), "images": kept}
-
-    @contextmanager
-    def _timed(self, what: str) -> Iterator[None]:
-        """Add the time spent inside to the stage's overhead under `what`."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._overhead[what] = self._overhead.get(what, 0.0) + time.perf_counter() - start
