@@ -26,12 +26,21 @@ import torch
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField, count_gaussians
-from lapgs_plugin.files import LOCK, TEMPORARY_PATTERN, FolderLock, atomic_write, one_line_errors
+from lapgs_plugin.files import (
+    LOCK,
+    MANIFEST,
+    TEMPORARY_PATTERN,
+    FolderLock,
+    atomic_write,
+    one_line_errors,
+    require_manifest,
+)
+from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.plan import Stage
 
 FORMAT_VERSION = 1
 
-MANIFEST, HISTORY, METRICS, CHECKPOINT = "manifest.json", "history.jsonl", "metrics.json", "checkpoint.pt"
+HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, CACHE = "renders", "report.html", "cache"
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 
@@ -68,9 +77,12 @@ class LevelRecord:
         num_gaussians: Gaussians in its PLY.
         peak_gaussians: most Gaussians at any moment of its training.
         train_seconds: iterative optimization alone.
-        overhead_seconds: everything else by name, such as "pyramid", "cache", "inheritance", "archive".
+        overhead_seconds: everything else by name, such as "pyramid", "cache", "inheritance"; "archive" is added when
+            its files have been written.
         image_size: (width, height) in pixels it was trained at.
         memory_bytes: on a GPU, "peak" of its memory during training and how much of that were "images".
+        mean_gaussians: Gaussians being optimized, mean over the iterations; None when that was not recorded.
+        breakdown_seconds: of the optimization by part of an iteration (`breakdown.PARTS`); empty when not measured.
     """
 
     level: int
@@ -82,6 +94,8 @@ class LevelRecord:
     overhead_seconds: dict[str, float]
     image_size: tuple[int, int]
     memory_bytes: dict[str, int] = field(default_factory=dict)
+    mean_gaussians: float | None = None
+    breakdown_seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:
@@ -184,8 +198,9 @@ class Manifest:
         values = _only_fields(cls, values)
         scene = _only_fields(SceneReference, values["scene"])
         scene["background"] = tuple(scene["background"])
-        # Runs of the first weeks do not know their memory.
-        records = [_only_fields(LevelRecord, {"memory_bytes": {}, **record}) for record in values["records"]]
+        # Runs of the first weeks know neither their memory nor what else was recorded later.
+        later: dict[str, Any] = {"memory_bytes": {}, "mean_gaussians": None, "breakdown_seconds": {}}
+        records = [_only_fields(LevelRecord, {**later, **record}) for record in values["records"]]
         values["scene"] = SceneReference(**scene)
         values["records"] = tuple(LevelRecord(**{**r, "image_size": tuple(r["image_size"])}) for r in records)
         return cls(**values)
@@ -273,12 +288,13 @@ class RunArchive:
             )
 
     @classmethod
-    def open(cls, path: Path | str, *, resume: bool = False) -> RunArchive:
+    def open(cls, path: Path | str, *, resume: bool = False, check: bool = True) -> RunArchive:
         """Open a run, checking that the fields of its finished levels are there and whole.
 
         Args:
             path: the folder.
             resume: hold it for writing.
+            check: False leaves fields unlooked at until `field` reads them, for whoever can do with some of them.
 
         Raises:
             RunFolderError: there is no run, it was written by another version, a level's PLY is missing or cut short,
@@ -293,7 +309,8 @@ class RunArchive:
                 with one_line_errors(folder):
                     _remove_scratch(folder)
             archive = cls(folder, manifest, lock)
-            archive._check_fields()
+            if check:
+                archive._check_fields()
         except BaseException:
             if lock is not None:
                 lock.release()
@@ -341,6 +358,7 @@ class RunArchive:
             loaded = GaussianField.load_ply(self.field_path(level))
         except FieldError as error:
             raise RunFolderError(f"level {level} of {self._folder} is damaged: {error}") from error
+        self._require_count(record, len(loaded))
         return replace(loaded, signed=record.signed)
 
     def finish_level(
@@ -349,7 +367,8 @@ class RunArchive:
         """Keep the field of a trained level: its PLY first, then the manifest that lists it, and no checkpoint of it.
 
         Args:
-            record: of the level `manifest.next_level`.
+            record: of the level `manifest.next_level`; the seconds that writing takes are added to its overhead as
+                "archive".
             field: as trained.
             optimizer_state: for full inheritance, what `optimizer_state` gives to the next level; kept until that one
                 is finished.
@@ -360,13 +379,16 @@ class RunArchive:
         self._require_lock()
         assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
         field.require_finite()
-        manifest = replace(self._manifest, records=(*self._manifest.records, record))
         path = self.field_path(record.level)
-        with one_line_errors(path):
-            path.parent.mkdir(exist_ok=True)
-            field.save_ply(path)
-        if optimizer_state is not None:
-            self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
+        overhead = Overhead(record.overhead_seconds)
+        with overhead.timed("archive"):
+            with one_line_errors(path):
+                path.parent.mkdir(exist_ok=True)
+                field.save_ply(path)
+            if optimizer_state is not None:
+                self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
+        record = replace(record, overhead_seconds=dict(overhead))
+        manifest = replace(self._manifest, records=(*self._manifest.records, record))
         self._write_json(MANIFEST, asdict(manifest))
         self._manifest = manifest
         with one_line_errors(self._folder):
@@ -466,11 +488,14 @@ class RunArchive:
                 count = count_gaussians(path)
             except FieldError as error:
                 raise RunFolderError(f"level {record.level} of {self._folder} is damaged: {error}; {again}") from error
-            if count != record.num_gaussians:
-                raise RunFolderError(
-                    f"level {record.level} of {self._folder} holds {count} Gaussians, the manifest says "
-                    f"{record.num_gaussians}; {again}"
-                )
+            self._require_count(record, count)
+
+    def _require_count(self, record: LevelRecord, count: int) -> None:
+        if count != record.num_gaussians:
+            raise RunFolderError(
+                f"level {record.level} of {self._folder} holds {count} Gaussians, the manifest says "
+                f"{record.num_gaussians}; train it again with --overwrite"
+            )
 
     def _write_json(self, name: str, values: dict[str, Any]) -> None:
         text = json.dumps(values, indent=2, allow_nan=False) + "\n"
@@ -518,10 +543,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _read_manifest(folder: Path) -> Manifest:
+    require_manifest(folder)
     path = folder / MANIFEST
-    if not path.is_file():
-        what = "has no manifest.json" if folder.is_dir() else "does not exist"
-        raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
     values = _read_json(path)
     version = values.get("format_version")
     if version != FORMAT_VERSION:

@@ -140,6 +140,14 @@ def train(
             rich_help_panel=RUN, min=1, help="Measure held-out PSNR this often. Default: at the end of each stage."
         ),
     ] = None,
+    breakdown: Annotated[
+        bool,
+        typer.Option(
+            "--breakdown",
+            rich_help_panel=RUN,
+            help="Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
+        ),
+    ] = False,
     checkpoint_every: Annotated[
         int, typer.Option(rich_help_panel=RUN, min=1, help="Iterations between checkpoints; Ctrl-C writes one too.")
     ] = 1000,
@@ -210,6 +218,7 @@ def train(
             console,
             threads=threads,
             test_every=test_every,
+            breakdown=breakdown,
             checkpoint_every=checkpoint_every,
             resume=resume,
         )
@@ -324,6 +333,7 @@ def _run(
     *,
     threads: int | None,
     test_every: int | None,
+    breakdown: bool,
     checkpoint_every: int,
     resume: bool,
 ) -> None:
@@ -351,5 +361,6 @@ def _run(
             monitor=monitor,
             checkpoint_every=checkpoint_every,
             test_every=test_every,
+            breakdown=breakdown,
         )
         trainer.run(resume)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.imagestore import ImageStore
@@ -38,12 +39,14 @@ class StageProgress:
         seconds: optimization time of this stage so far.
         loss: smoothed loss, NaN before the first iteration.
         peak_gaussians: most Gaussians optimized at once in this stage.
+        gaussian_steps: Gaussians optimized, summed over the iterations.
     """
 
     iteration: int = 0
     seconds: float = 0.0
     loss: float = math.nan
     peak_gaussians: int = 0
+    gaussian_steps: int = 0
 
 
 @dataclass
@@ -59,6 +62,7 @@ class StageRun:
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
+        breakdown: told which part of an iteration begins.
 
     The field, the images and the background are on one device, where the stage is trained.
     """
@@ -75,6 +79,7 @@ class StageRun:
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
+    breakdown: Breakdown = field(default_factory=Breakdown)
     progress: StageProgress = field(default_factory=StageProgress)
     _unread: list[Tensor] = field(default_factory=list)
 
@@ -89,7 +94,9 @@ class StageRun:
         """
         while self.progress.iteration < self.stage.iterations:
             start = time.perf_counter()
+            self.breakdown.mark("other")
             self._iterate(self.progress.iteration + 1)
+            self.breakdown.pause()
             self.progress.seconds += time.perf_counter() - start
             self.progress.iteration += 1
             if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
@@ -134,17 +141,25 @@ class StageRun:
         )
         self._announce_next(iteration)
         degree = self.schedule.active_sh_degree(iteration)
+        self.progress.gaussian_steps += len(self.model)
         self.hooks.before_render(context)
+        self.breakdown.mark("forward")
         result = self.rasterizer(self.model.field, view.camera, background=self.background, sh_degree=degree)
+        self.breakdown.mark("loss")
         image = self.hooks.compose(context, result.image)
         loss = self.hooks.loss(context, image)
         self._keep_loss(loss.detach(), iteration)
         regularization = self.densifier.regularization(self.model.field)
+        self.breakdown.mark("backward")
         (loss if regularization is None else loss + regularization).backward()  # type: ignore[no-untyped-call]  # torch's
+        self.breakdown.mark("other")
         self.hooks.after_backward(context)
+        self.breakdown.mark("optimizer")
         visible = result.radii > 0 if self.model.sparse else None
         self.model.step(self.schedule.means_learning_rate(iteration) * self.extent, (degree + 1) ** 2, visible)
+        self.breakdown.mark("densification")
         self._densify(context, result, view)
+        self.breakdown.mark("other")
         if iteration % FINITE_CHECK_EVERY == 0 or iteration == self.stage.iterations:
             self._require_finite(iteration)
 
@@ -201,6 +216,7 @@ class StageRun:
         return {
             "level": self.stage.level,
             "progress": vars(self.progress),
+            "breakdown": self.breakdown.seconds(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "random": torch.get_rng_state(),
@@ -210,6 +226,10 @@ class StageRun:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from what `state` returned; the model must have been made from it already."""
         self.progress = StageProgress(**state["progress"])
+        if self.breakdown.measures:
+            # What was not measured from its first iteration on would be parts of another whole.
+            spent = state.get("breakdown")
+            self.breakdown = breakdown_on(self._device, spent) if spent else Breakdown()
         self.densifier.state = {
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
+from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
@@ -83,6 +84,7 @@ class Trainer:
         monitor: told about progress.
         checkpoint_every: iterations between two checkpoints; one is also written when a run is asked to stop.
         test_every: iterations between two measurements of held-out PSNR; None measures it once at the end of a stage.
+        breakdown: measure the parts of iterations.
     """
 
     scene: Scene
@@ -94,6 +96,7 @@ class Trainer:
     monitor: Monitor = field(default_factory=Monitor)
     checkpoint_every: int = 1000
     test_every: int | None = None
+    breakdown: bool = False
 
     def __post_init__(self) -> None:
         self.plan = make_plan(self.scene, self.settings)
@@ -141,6 +144,8 @@ class Trainer:
         run = self._prepare(stage, self._first_model(stage, checkpoint))
         if checkpoint is not None:
             run.restore(checkpoint)
+            if self.breakdown and not run.breakdown.measures:
+                self.monitor.say(f"level {stage.level} was begun without --breakdown: its parts are not told")
         self.archive.rewind_history(stage.level, run.progress.iteration)
         self.monitor.stage_started(stage, run.progress.iteration + 1)
         self._last_tick = (run.progress.seconds, run.progress.iteration)
@@ -202,6 +207,7 @@ class Trainer:
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
             densifier=density_control(schedule, self.settings.densification, self.scene.extent),
+            breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
         )
 
     def _fill_caches(self, stage: Stage) -> None:
@@ -316,6 +322,8 @@ class Trainer:
             overhead_seconds=dict(self._overhead),
             image_size=run.stage.image_size,
             memory_bytes=self._memory(run),
+            mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
+            breakdown_seconds=run.breakdown.seconds(),
         )
         heir_wants_it = self.settings.inherit == "full" and run.stage.level > 0
         self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)

@@ -1,0 +1,154 @@
+"""The runtime breakdown: parts are what was spent in them, add up to the whole, and cost nothing when not measured."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lapgs_plugin.breakdown import (
+    PARTS,
+    UNREAD_EVENTS,
+    Breakdown,
+    Clock,
+    ProcessorClock,
+    TimedBreakdown,
+    breakdown_on,
+)
+
+
+@dataclass
+class LaggingClock(Clock[int]):
+    """A GPU's: stamps are tickets, whose moments come only after the work before them, in whole seconds.
+
+    Attributes:
+        now: when the work given so far will be done.
+        done: up to when it is.
+        times: moment of each ticket.
+        waits: how often somebody waited.
+        held: tickets neither released nor never given.
+    """
+
+    now: int = 0
+    done: int = 0
+    times: list[int] = field(default_factory=list)
+    waits: int = 0
+    held: set[int] = field(default_factory=set)
+
+    def stamp(self) -> int:
+        self.times.append(self.now)
+        self.held.add(len(self.times) - 1)
+        return len(self.times) - 1
+
+    def passed(self, stamp: int) -> bool:
+        return self.times[stamp] <= self.done
+
+    def between(self, begin: int, end: int) -> float:
+        assert self.passed(end), "read before the work was done"
+        return self.times[end] - self.times[begin]
+
+    def wait(self) -> None:
+        self.waits += 1
+        self.done = self.now
+
+    def release(self, stamp: int) -> None:
+        self.held.remove(stamp)
+
+
+steps = st.lists(
+    st.tuples(st.sampled_from((*PARTS, None, "begin", "end")), st.integers(0, 50), st.integers(0, 60)), max_size=600
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(steps=steps)
+def test_every_second_belongs_to_the_part_that_was_marked_last(steps: list[tuple[str | None, int, int]]) -> None:
+    clock = LaggingClock()
+    breakdown = TimedBreakdown(clock)
+    breakdown.mark("other")
+    expected = dict.fromkeys(PARTS, 0)
+    current: str | None = "other"  # what a plain reading of the marks says
+    outer: str | None = None
+    regions: list[AbstractContextManager[None]] = []
+    for part, work, done in steps:
+        if part == "begin":
+            regions.append(breakdown.within("densification"))
+            regions[-1].__enter__()
+            if len(regions) == 1:
+                outer, current = current, "densification"
+        elif part == "end":
+            if regions:
+                regions.pop().__exit__(None, None, None)
+                current = current if regions else outer
+        else:
+            breakdown.pause() if part is None else breakdown.mark(part)
+            current = current if regions else part
+        if current is not None:
+            expected[current] += work
+        clock.now += work
+        clock.done = min(clock.now, clock.done + done)
+    assert clock.waits == 0
+    while regions:
+        regions.pop().__exit__(None, None, None)
+    breakdown.pause()
+    assert breakdown.seconds() == expected
+    assert len(clock.held) == 1  # the last mark; all others were released
+
+
+def test_marks_are_read_without_waiting_once_the_work_has_passed() -> None:
+    clock = LaggingClock()
+    breakdown = TimedBreakdown(clock)
+    for _ in range(10 * UNREAD_EVENTS):
+        breakdown.mark("forward")
+        clock.now += 1
+        clock.done = clock.now - 20  # the GPU is always a little behind
+    assert clock.waits == 0
+    assert len(clock.held) <= UNREAD_EVENTS
+
+
+def test_parts_of_known_sleeps() -> None:
+    breakdown = TimedBreakdown(ProcessorClock())
+    start = time.perf_counter()
+    for part, seconds in (("forward", 0.03), ("loss", 0.01), ("backward", 0.06), ("forward", 0.02)):
+        breakdown.mark(part)
+        time.sleep(seconds)
+    with breakdown.within("densification"):
+        breakdown.mark("forward")  # scores are rendered
+        time.sleep(0.04)
+    breakdown.pause()
+    total = time.perf_counter() - start
+    time.sleep(0.05)
+    found = breakdown.seconds()
+    expected = {"forward": 0.05, "loss": 0.01, "backward": 0.06, "densification": 0.04, "optimizer": 0.0, "other": 0.0}
+    assert sum(found.values()) == pytest.approx(total, abs=2e-3)  # 0.1 ms seen
+    for part, seconds in expected.items():
+        assert seconds <= found[part] < seconds + 0.03, part  # sleeps last at least as long as asked for; 1 ms seen
+
+
+def test_what_was_measured_before_is_continued() -> None:
+    clock = LaggingClock()
+    breakdown = TimedBreakdown(clock, {"forward": 2.5, "other": 1.0})
+    breakdown.mark("forward")
+    clock.now = 4
+    breakdown.pause()
+    assert breakdown.seconds() == {**dict.fromkeys(PARTS, 0.0), "forward": 6.5, "other": 1.0}
+
+
+def test_measuring_nothing() -> None:
+    breakdown = Breakdown()
+    breakdown.mark("forward")
+    with breakdown.within("densification"):
+        breakdown.pause()
+    assert breakdown.seconds() == {}
+    assert not breakdown.measures
+    assert breakdown_on(torch.device("cpu")).measures
+
+
+def test_an_unknown_part_is_our_own_mistake() -> None:
+    with pytest.raises(AssertionError, match="rendering"):
+        breakdown_on(torch.device("cpu")).mark("rendering")
