@@ -67,7 +67,8 @@ def render(
         float | None, typer.Option(min=1.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(help="Size of a path's views, such as 1280x720. Default: the cameras' own.")
+        str | None,
+        typer.Option(help="Size of a path's views or of --fps, such as 1280x720. Default: the cameras' own."),
     ] = None,
     panels: Annotated[
         bool, typer.Option("--panels", help="Base, residuals and composition side by side; with --trajectory.")
@@ -96,15 +97,13 @@ def render(
 
         lapgs render runs/garden --trajectory orbit --size 1280x720 --out garden.mp4
 
-        lapgs render runs/garden --fps
+        lapgs render runs/garden --fps --size 3840x2160
 
         lapgs render runs/garden --trajectory spline --panels --format exr --out frames/
     """
     if trajectory is None:
-        _refuse(
-            {"--frames": frames, "--frame-rate": frame_rate, "--size": size, "--panels": panels or None},
-            "needs --trajectory",
-        )
+        _refuse({"--frames": frames, "--frame-rate": frame_rate, "--panels": panels or None}, "needs --trajectory")
+        _refuse({"--size": None if fps else size}, "needs --trajectory or --fps")
     else:
         _refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
     from lapgs_plugin.archive import RENDERS, RunArchive
@@ -121,7 +120,8 @@ def render(
     if fps:
         _refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
         with one_pool():
-            _print_speeds(renderer, list(_choose(run_scene(archive, scene), views).values()), level)
+            chosen = _choose(run_scene(archive, scene), views)
+            _print_speeds(renderer, [view.camera for split in chosen.values() for view in split], level, size)
         return
     if trajectory is not None:
         clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
@@ -212,18 +212,25 @@ def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
     }
 
 
-def _print_speeds(renderer: HierarchyRenderer, splits: Sequence[Sequence[View]], level: int) -> None:
-    """A table of frames a second over the cameras of the chosen views."""
+def _print_speeds(renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, size: str | None) -> None:
+    """A table of frames a second over the cameras of the chosen views, at another size than theirs if so asked."""
     from rich.console import Console
     from rich.table import Table
 
+    from lapgs_plugin.rendering.clip import parse_size
     from lapgs_plugin.rendering.speed import measure_speed
 
-    cameras = [view.camera for views in splits for view in views]
+    if size is not None:
+        cameras = [camera.resized(*parse_size(size)) for camera in cameras]
     table = Table("", "size", "Gaussians", "ms", "FPS", title=f"median over {len(cameras)} cameras")
     for speed in measure_speed(renderer, cameras, level):
-        size = f"{speed.size[0]}x{speed.size[1]}"
-        table.add_row(speed.what, size, f"{speed.gaussians:,}", f"{speed.milliseconds:.2f}", f"{speed.fps:.1f}")
+        table.add_row(
+            speed.what,
+            f"{speed.size[0]}x{speed.size[1]}",
+            f"{speed.gaussians:,}",
+            f"{speed.milliseconds:.2f}",
+            f"{speed.fps:.1f}",
+        )
     Console().print(table)
 
 

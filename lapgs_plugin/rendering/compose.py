@@ -252,12 +252,16 @@ class HierarchyRenderer:
         for image in images:
             image.record_stream(current)
 
-    @cached_property
-    def _black(self) -> Tensor:
-        return torch.zeros_like(self._behind)
+    def behind(self, level: int) -> Tensor:
+        """(3,) what a level's field is rendered over: a residual adds to the image, it would add a background again."""
+        return self._black if self.fields[level].signed else self._colored
 
     @cached_property
-    def _behind(self) -> Tensor:
+    def _black(self) -> Tensor:
+        return torch.zeros_like(self._colored)
+
+    @cached_property
+    def _colored(self) -> Tensor:
         """(3,) `background` beside the fields, sent there once: sending waits for a GPU."""
         return torch.tensor(self.background).to(self.fields[self.levels - 1].means)
 
@@ -266,9 +270,7 @@ class HierarchyRenderer:
         field = self.fields[level]
         if gain == 0.0:
             return field.means.new_zeros(3, at_level.height, at_level.width)
-        # A residual adds to the image; a background behind it would be added twice.
-        color = self._black if field.signed else self._behind
-        image = self.rasterizer(field, at_level, background=color).image
+        image = self.rasterizer(field, at_level, background=self.behind(level)).image
         if self.clamped:
             image = image.clamp(-1.0 if field.signed else 0.0, 1.0)
         return image if gain == 1.0 else gain * image

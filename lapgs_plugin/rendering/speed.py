@@ -42,7 +42,7 @@ class Speed:
 def measure_speed(
     renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, rounds: int = ROUNDS
 ) -> list[Speed]:
-    """The speeds of a hierarchy: composed down to `level`, to each coarser one, and each residual field alone.
+    """The speeds of a hierarchy: composed down to `level`, to each coarser one, and each field alone.
 
     Images are composed and clamped, and stay where they are. Every kind is run over all cameras once before.
 
@@ -53,35 +53,48 @@ def measure_speed(
         rounds: over all cameras.
     """
     found = []
-    for what, frame, fields in _kinds(renderer, level):
-        shown = level_camera(cameras[0], fields[0])
-        milliseconds = _median_milliseconds(frame, [*cameras] * (rounds + 1), len(cameras), renderer.device)
-        gaussians = sum(len(renderer.fields[each]) for each in fields)
-        found.append(Speed(what, (shown.width, shown.height), gaussians, milliseconds))
+    for kind in _kinds(renderer, level):
+        shown = level_camera(cameras[0], kind.size_level)
+        milliseconds = _median_milliseconds(kind.frame, [*cameras] * (rounds + 1), len(cameras), renderer.device)
+        gaussians = sum(len(renderer.fields[each]) for each in kind.fields)
+        found.append(Speed(kind.what, (shown.width, shown.height), gaussians, milliseconds))
     return found
 
 
-def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[tuple[str, Frame, Sequence[int]]]:
-    """What is measured: its name, what makes a frame, and the levels whose fields are rendered, finest first."""
+@dataclass(frozen=True)
+class _Kind:
+    """What is measured: its name, what makes a frame, the levels whose fields are rendered, and that of the size."""
+
+    what: str
+    frame: Frame
+    fields: Sequence[int]
+    size_level: int
+
+
+def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[_Kind]:
     in_turn = replace(renderer, concurrent=False)
     coarsest = renderer.levels - 1
     for finest in range(level, coarsest):
-        fields = range(finest, renderer.levels)
-        yield f"levels {coarsest} to {finest}, one after the other", _composing(in_turn, finest), fields
+        fields, what = range(finest, renderer.levels), f"levels {coarsest} to {finest}"
+        yield _Kind(f"{what}, one after the other", _composing(in_turn, finest), fields, finest)
         if renderer.device.type == "cuda":
             together = replace(renderer, concurrent=True)
-            yield f"levels {coarsest} to {finest}, beside each other", _composing(together, finest), fields
-    yield "base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest]
+            yield _Kind(f"{what}, beside each other", _composing(together, finest), fields, finest)
+    yield _Kind("base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest)
+    if coarsest > level:
+        # What it would cost to render it as large as it is shown, instead of bringing it up.
+        yield _Kind(f"base as large as level {level}", _alone(in_turn, coarsest, level), [coarsest], level)
     for residual in range(coarsest - 1, level - 1, -1):
-        yield f"residual {residual} alone", _alone(in_turn, residual), [residual]
+        yield _Kind(f"residual {residual} alone", _alone(in_turn, residual, residual), [residual], residual)
 
 
 def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
     return lambda camera: renderer.render(camera, level).composed[level].clamp(0.0, 1.0)
 
 
-def _alone(renderer: HierarchyRenderer, level: int) -> Frame:
-    return lambda camera: renderer.render_level(camera, level, None)
+def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
+    field, behind = renderer.fields[level], renderer.behind(level)
+    return lambda camera: renderer.rasterizer(field, level_camera(camera, size_level), background=behind).image
 
 
 @torch.no_grad()

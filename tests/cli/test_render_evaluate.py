@@ -224,4 +224,5 @@ def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:
     assert "median over 2 cameras" in printed
     for words in (("levels 1 to 0, one after the other", "450"), ("base", "250"), ("residual 0 alone", "200")):
         assert any(all(word in line for word in words) for line in printed.splitlines()), words
+    assert "100x60" in lapgs("render", run, "--fps", "--size", "100x60")
     assert files_in(run) == before
