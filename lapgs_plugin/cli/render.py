@@ -120,8 +120,8 @@ def render(
     if fps:
         _refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
         with one_pool():
-            chosen = _choose(run_scene(archive, scene), views)
-            _print_speeds(renderer, [view.camera for split in chosen.values() for view in split], level, size)
+            splits = _choose(run_scene(archive, scene), views).values()
+            _print_speeds(renderer, [view.camera for split in splits for view in split], level, size)
         return
     if trajectory is not None:
         clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
