@@ -354,6 +354,7 @@ class RunArchive:
             RunFolderError: the level is not finished, or its PLY is not what the manifest says.
         """
         record = self._manifest.record(level)
+        self._require_file(record)
         try:
             loaded = GaussianField.load_ply(self.field_path(level))
         except FieldError as error:
@@ -394,6 +395,24 @@ class RunArchive:
         with one_line_errors(self._folder):
             self.path(CHECKPOINT).unlink(missing_ok=True)
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
+
+    def replace_field(self, level: int, field: GaussianField) -> None:
+        """Put a field that was trained on in the place of what it was when its level was finished.
+
+        Args:
+            level: a finished one.
+            field: with as many Gaussians.
+
+        Raises:
+            FieldError: the field holds NaN or inf; nothing is written.
+            RunFolderError: the level is not finished.
+        """
+        self._require_lock()
+        record = self._manifest.record(level)
+        assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
+        field.require_finite()
+        with one_line_errors(self.field_path(level)):
+            field.save_ply(self.field_path(level))
 
     def optimizer_state(self, level: int) -> dict[str, Any]:
         """The optimizer state that a finished level left for the next one, its tensors on the CPU.
@@ -480,15 +499,21 @@ class RunArchive:
 
     def _check_fields(self) -> None:
         for record in self._manifest.records:
-            path = self.field_path(record.level)
-            again = "train it again with --overwrite"
-            if not path.is_file():
-                raise RunFolderError(f"level {record.level} of {self._folder} is missing: no {path.name}; {again}")
+            self._require_file(record)
             try:
-                count = count_gaussians(path)
+                count = count_gaussians(self.field_path(record.level))
             except FieldError as error:
-                raise RunFolderError(f"level {record.level} of {self._folder} is damaged: {error}; {again}") from error
+                raise RunFolderError(
+                    f"level {record.level} of {self._folder} is damaged: {error}; train it again with --overwrite"
+                ) from error
             self._require_count(record, count)
+
+    def _require_file(self, record: LevelRecord) -> None:
+        path = self.field_path(record.level)
+        if not path.is_file():
+            raise RunFolderError(
+                f"level {record.level} of {self._folder} is missing: no {path.name}; train it again with --overwrite"
+            )
 
     def _require_count(self, record: LevelRecord, count: int) -> None:
         if count != record.num_gaussians:

@@ -13,6 +13,9 @@ from typing import BinaryIO
 
 from lapgs_plugin.errors import RunFolderError
 
+MANIFEST = "manifest.json"
+"""Name of the file that makes a folder a run."""
+
 LOCK = ".lock"
 """Name of the file that `FolderLock` locks."""
 
@@ -65,6 +68,17 @@ def one_line_errors(path: Path, action: str = "written") -> Iterator[None]:
         else:
             advice = "expected a folder this user may read and write"
         raise RunFolderError(f"{path} cannot be {action}: {error.strerror or error}; {advice}") from error
+
+
+def require_manifest(folder: Path) -> None:
+    """Check that there is a run in a folder, without reading it: quick enough to ask before anything is imported.
+
+    Raises:
+        RunFolderError: there is none.
+    """
+    if not (folder / MANIFEST).is_file():
+        what = f"has no {MANIFEST}" if folder.is_dir() else "does not exist"
+        raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
 
 
 class FolderLock:

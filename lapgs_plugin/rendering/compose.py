@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.archive import Manifest, RunArchive
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
@@ -119,8 +119,14 @@ class HierarchyRenderer:
         """
         manifest = archive.manifest
         manifest.record(manifest.levels - 1)
+        fields = {level: archive.field(level).to(device) for level in archive.available_levels}
+        return cls.of(manifest, fields, rasterizer)
+
+    @classmethod
+    def of(cls, manifest: Manifest, fields: Mapping[int, GaussianField], rasterizer: Rasterizer) -> HierarchyRenderer:
+        """A renderer of these fields of a run, where they are."""
         return cls(
-            fields={level: archive.field(level).to(device) for level in archive.available_levels},
+            fields=fields,
             levels=manifest.levels,
             pyramid=Pyramid(manifest.grid),
             rasterizer=rasterizer,

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.rendering.compose import Composition
-from lapgs_plugin.scenes.scene import View
+
+if TYPE_CHECKING:
+    from lapgs_plugin.scenes.scene import View
 
 
 def around_grey(signed: Tensor) -> Tensor:

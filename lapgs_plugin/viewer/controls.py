@@ -22,6 +22,7 @@ class Controls:
         run: what is looked at.
         other: what the split view shows to the right, None without.
         views: names of the cameras that can be gone to.
+        before: the panel that this one replaces, since there are more or fewer levels; its choices are kept.
         changed: called when another picture is wanted.
         go_to: called with the index of a camera.
         show_cameras: called with whether their frustums are wanted.
@@ -36,6 +37,7 @@ class Controls:
         other: ShownRun | None,
         views: Sequence[str],
         *,
+        before: Controls | None,
         changed: Callable[[], None],
         go_to: Callable[[int], None],
         show_cameras: Callable[[bool], None],
@@ -45,20 +47,36 @@ class Controls:
         self._gui = client.gui
         self._run = run
         self._changed = changed
-        with self._gui.add_folder("Bands"):
+        self._folders: list[Any] = []
+        if before is not None:
+            before.close()
+        with self._folder("Bands"):
             self._bands = {level: self._add_band(level) for level in run.counts}
-        with self._gui.add_folder("Picture"):
+        with self._folder("Picture"):
             self._show = self._add_choice("Show", [COMPOSITION, *map(self._band_name, run.counts)])
-            levels = [f"level {level}" for level in sorted(run.counts)]
-            self._level = self._add_choice("Detail", [levels[0], *levels[1:], BY_SIZE])
+            self._level = self._add_choice("Detail", [*(f"level {level}" for level in sorted(run.counts)), BY_SIZE])
             self._split, self._divider = self._add_split(other)
         if views:
-            with self._gui.add_folder("Cameras"):
+            with self._folder("Cameras"):
                 self._add_cameras(views, go_to, show_cameras)
-        with self._gui.add_folder("Path"):
+        with self._folder("Path"):
             self._add_path(keep, save)
-        with self._gui.add_folder("Figures"):
+        with self._folder("Figures"):
             self._figures = self._gui.add_markdown("")
+        if before is not None:
+            self._choose_as(before)
+
+    def close(self) -> None:
+        """Take the panel off the page."""
+        for folder in self._folders:
+            folder.remove()
+
+    def fits(self, run: ShownRun, other: ShownRun | None) -> bool:
+        """Whether the panel has everything there is to choose of these runs; if so it is about them from now on."""
+        if run.counts.keys() != self._run.counts.keys() or (other is None) != (self._split is None):
+            return False
+        self._run = run
+        return True
 
     @property
     def settings(self) -> PictureSettings:
@@ -95,6 +113,24 @@ class Controls:
             f"{width} x {height} in {1e3 * seconds:.0f} ms, level {picture.level}, {self._run.renderer.rasterizer.name}"
         )
         self._figures.content = "\n".join([*rows, "", line])
+
+    def _folder(self, name: str) -> Any:
+        folder = self._gui.add_folder(name)
+        self._folders.append(folder)
+        return folder
+
+    def _choose_as(self, before: Controls) -> None:
+        """Choose what was chosen in another panel, as far as this one has it."""
+        for level, handles in self._bands.items():
+            if level in before._bands:
+                for handle, old in zip(handles, before._bands[level], strict=True):
+                    handle.value = old.value
+        was_finest = before._level.value == before._level.options[0]
+        for choice, old in ((self._show, before._show), (self._level, before._level)):
+            if old.value in choice.options and not (choice is self._level and was_finest):
+                choice.value = old.value
+        if self._split is not None and before._split is not None:
+            self._split.value, self.divider = before._split.value, before.divider
 
     def _add_band(self, level: int) -> tuple[Any, Any]:
         drawn = self._gui.add_checkbox(self._band_name(level), initial_value=True)

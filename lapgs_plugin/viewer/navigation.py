@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from viser.transforms import SO3
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
@@ -34,17 +34,15 @@ class Pose:
     @classmethod
     def of(cls, camera: Camera) -> Pose:
         """The pose of a camera; where its principal point lies is lost."""
-        x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3].double().numpy().T).as_quat()
         return cls(
-            np.array([w, x, y, z]),
+            np.asarray(SO3.from_matrix(camera.world_to_camera[:3, :3].double().numpy().T).wxyz, dtype=np.float64),
             np.asarray(camera.position.double().numpy()),
             2.0 * math.atan(camera.tan_half_fov[1]),
         )
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of a picture of that size, with square pixels and a centred principal point."""
-        w, x, y, z = self.wxyz
-        to_camera = Rotation.from_quat([x, y, z, w]).as_matrix().T
+        to_camera = SO3(self.wxyz / np.linalg.norm(self.wxyz)).as_matrix().T
         world_to_camera = np.eye(4)
         world_to_camera[:3, :3], world_to_camera[:3, 3] = to_camera, -to_camera @ self.position
         focal = height / (2.0 * math.tan(0.5 * self.fov))

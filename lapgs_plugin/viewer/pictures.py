@@ -10,14 +10,12 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.raster import Rasterizer, RenderResult
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.rig import Rig
-from lapgs_plugin.rendering.run import run_renderer
 
 DIVIDER_PIXELS = 2
 
@@ -63,21 +61,11 @@ class ShownRun:
     distance: float
 
     @classmethod
-    def load(cls, archive: RunArchive, rig: Rig | None, device: str, rasterizer: str) -> ShownRun:
-        """Read the fields of a run.
-
-        Args:
-            rig: the cameras it was trained on, where they are known.
-            device, rasterizer: as `run_renderer` takes them.
-
-        Raises:
-            RunFolderError: no level is finished, or one is damaged.
-        """
-        focal = None
-        if rig is not None:
-            focal = sorted(camera.fy for camera in rig.cameras)[len(rig.cameras) // 2]
-        renderer = run_renderer(archive, device, rasterizer)
-        return cls(archive.path().name, renderer, focal, rig.distance if rig else 1.0)
+    def of(cls, name: str, renderer: HierarchyRenderer, rig: Rig | None) -> ShownRun:
+        """A run trained on the cameras of `rig`, where they are known."""
+        if rig is None:
+            return cls(name, renderer, None, 1.0)
+        return cls(name, renderer, sorted(camera.fy for camera in rig.cameras)[len(rig.cameras) // 2], rig.distance)
 
     @property
     def counts(self) -> dict[int, int]:

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
-from lapgs_plugin.rendering.trajectory import trajectory_json, with_size
 from lapgs_plugin.viewer.controls import Controls
-from lapgs_plugin.viewer.navigation import Pose, turning_distance
+from lapgs_plugin.viewer.navigation import Pose, Start, turning_distance
 from lapgs_plugin.viewer.pacing import Pacing
-from lapgs_plugin.viewer.pictures import Picture, ShownRun, draw
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw
 
 MAX_SIDE = 2048
 """Longest side of a picture in pixels; the browser stretches it to larger windows."""
@@ -53,44 +52,63 @@ class Exhibit:
     rig: Rig | None
 
 
+@dataclass(frozen=True)
+class PictureSeconds:
+    """What a picture may take.
+
+    Attributes:
+        moving: while something moves.
+        still: when nothing does.
+    """
+
+    moving: float
+    still: float = math.inf
+
+
 class Session:
     """A connected client. Its callbacks come from viser's threads, its pictures are drawn by the viewer's.
 
     Args:
         client: viser's handle.
-        exhibit: what it looks at.
+        seconds: what a picture may take.
         wake: called when there may be something to draw.
     """
 
-    def __init__(self, client: viser.ClientHandle, exhibit: Exhibit, wake: Callable[[], None]) -> None:
+    def __init__(self, client: viser.ClientHandle, seconds: PictureSeconds, wake: Callable[[], None]) -> None:
         self._client = client
-        self._exhibit = exhibit
         self._wake = wake
-        self._pacing = Pacing()
+        self._pacing = Pacing(seconds.moving, seconds.still)
         self._lock = threading.Lock()
+        self._exhibit: Exhibit | None = None
+        self._coming: Exhibit | None = None  # what the next picture shows
+        self._controls: Controls | None = None
+        self._handle: viser.IcosphereHandle | None = None
         self._last_report = 0.0
         self._frustums: list[viser.CameraFrustumHandle] = []
         self._kept: list[Camera] = []
         self._left = False
-        self._controls = Controls(
-            client,
-            exhibit.run,
-            exhibit.other,
-            list(exhibit.cameras),
-            changed=self._change,
-            go_to=self._go_to,
-            show_cameras=self._show_cameras,
-            keep=self._keep,
-            save=self._save,
-        )
-        self._handle = None if exhibit.other is None else self._add_handle()
         client.camera.on_update(lambda _: self._change())
         self._change()
+
+    def show(self, exhibit: Exhibit) -> None:
+        """Look at this from the next picture on."""
+        with self._lock:
+            self._coming = exhibit
+            self._pacing.renew()
+
+    def stand_at(self, start: Start) -> None:
+        """Begin there."""
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.up_direction = start.up
+            camera.fov = start.fov
+            camera.position = start.position
+            camera.look_at = start.look_at
 
     def due(self) -> float | None:
         """When its next picture is to be drawn, by time.perf_counter(); None for not before something changes."""
         with self._lock:
-            return self._pacing.due()
+            return None if self._exhibit is self._coming is None else self._pacing.due()
 
     def leave(self) -> None:
         """The client has disconnected: nothing is sent any more, and what is being drawn is dropped."""
@@ -101,7 +119,10 @@ class Session:
         begin = time.perf_counter()
         with self._lock:
             scale = self._pacing.begin()
-        picture = self._draw(scale)
+            exhibit, self._coming = self._coming or self._exhibit, None
+        assert exhibit is not None, "nothing is due before there is something to look at"
+        controls = self._adopt(exhibit)
+        picture = self._draw(exhibit, controls.settings, scale)
         if self._left:
             return
         self._send(picture, JPEG_STILL if scale >= 1.0 else JPEG_MOVING)
@@ -111,19 +132,39 @@ class Session:
         now = time.perf_counter()
         if scale >= 1.0 or now - self._last_report > REPORT_SECONDS:
             self._last_report = now
-            self._controls.report(picture, seconds)
+            controls.report(picture, seconds)
+
+    def _adopt(self, exhibit: Exhibit) -> Controls:
+        """Make the panel that of the exhibit."""
+        self._exhibit = exhibit
+        if self._controls is None or not self._controls.fits(exhibit.run, exhibit.other):
+            self._controls = Controls(
+                self._client,
+                exhibit.run,
+                exhibit.other,
+                list(exhibit.cameras),
+                before=self._controls,
+                changed=self._change,
+                go_to=self._go_to,
+                show_cameras=self._show_cameras,
+                keep=self._keep,
+                save=self._save,
+            )
+            if exhibit.other is not None and self._handle is None:
+                self._handle = self._add_handle()
+            self._place_handle()
+        return self._controls
 
     def _pose(self) -> Pose:
         camera = self._client.camera
         return Pose(np.asarray(camera.wxyz), np.asarray(camera.position), float(camera.fov))
 
-    def _draw(self, scale: float) -> Picture:
+    def _draw(self, exhibit: Exhibit, settings: PictureSettings, scale: float) -> Picture:
         camera, pose = self._client.camera, self._pose()
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         share = scale * min(1.0, MAX_SIDE / max(width, height))
         size = max(round(share * width), 1), max(round(share * height), 1)
         distance = float(np.linalg.norm(np.asarray(camera.look_at) - pose.position))
-        exhibit, settings = self._exhibit, self._controls.settings
         return draw(exhibit.run, exhibit.other, pose.camera(*size), settings, distance=distance, zoom=1.0 / share)
 
     def _send(self, picture: Picture, quality: int) -> None:
@@ -141,13 +182,14 @@ class Session:
 
         @handle.on_drag("left")
         async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
-            self._controls.divider = float(event.end_screen_pos[0])
+            if self._controls is not None:
+                self._controls.divider = float(event.end_screen_pos[0])
 
         return handle
 
     def _place_handle(self) -> None:
         """Keep the ball on the divider, at the same size, wherever the camera goes."""
-        if self._handle is None:
+        if self._handle is None or self._controls is None:
             return
         split = self._controls.settings.divider
         self._handle.visible = split is not None
@@ -163,15 +205,17 @@ class Session:
 
     def _go_to(self, index: int) -> None:
         """Stand where a camera of the scene stands."""
-        assert self._exhibit.rig is not None, "there are cameras"
-        pose = Pose.of(list(self._exhibit.cameras.values())[index])
+        exhibit = self._exhibit
+        assert exhibit is not None, "the panel came with one"
+        assert exhibit.rig is not None, "there are cameras"
+        pose = Pose.of(list(exhibit.cameras.values())[index])
         camera = self._client.camera
         with self._client.atomic():
             camera.fov = pose.fov
             camera.position = pose.position
             camera.wxyz = pose.wxyz
             ahead = viser.transforms.SO3(pose.wxyz).as_matrix()[:, 2]
-            camera.look_at = pose.position + turning_distance(pose.position, self._exhibit.rig) * ahead
+            camera.look_at = pose.position + turning_distance(pose.position, exhibit.rig) * ahead
 
     def _keep(self) -> int:
         """Remember the view for a path."""
@@ -181,6 +225,8 @@ class Session:
 
     def _save(self) -> None:
         """Hand out the views that were kept as a file for `lapgs render --trajectory`."""
+        from lapgs_plugin.rendering.trajectory import trajectory_json, with_size  # brings scipy.interpolate
+
         if self._kept:
             size = self._kept[0].width, self._kept[0].height  # windows change
             text = json.dumps(trajectory_json([with_size(camera, size) for camera in self._kept]), indent=1)
@@ -190,22 +236,22 @@ class Session:
         self._go_to(index)
 
     def _show_cameras(self, wanted: bool) -> None:
-        if wanted and not self._frustums:
-            self._frustums = self._add_frustums()
+        if wanted and not self._frustums and self._exhibit is not None:
+            self._frustums = self._add_frustums(self._exhibit)
         for frustum in self._frustums:
             frustum.visible = wanted
 
-    def _add_frustums(self) -> list[viser.CameraFrustumHandle]:
-        assert self._exhibit.rig is not None, "there are cameras"
+    def _add_frustums(self, exhibit: Exhibit) -> list[viser.CameraFrustumHandle]:
+        assert exhibit.rig is not None, "there are cameras"
         frustums = []
-        for index, (name, camera) in enumerate(self._exhibit.cameras.items()):
+        for index, (name, camera) in enumerate(exhibit.cameras.items()):
             pose = Pose.of(camera)
             frustum = self._client.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov=pose.fov,
                 aspect=camera.width / camera.height,
-                scale=0.05 * self._exhibit.rig.distance,
-                thickness=0.001 * self._exhibit.rig.distance,
+                scale=0.05 * exhibit.rig.distance,
+                thickness=0.001 * exhibit.rig.distance,
                 color=(240, 150, 40),
                 wxyz=pose.wxyz,
                 position=pose.position,

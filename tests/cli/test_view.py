@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shutil
 import socket
 import threading
@@ -18,7 +19,8 @@ from tests.cli.run_folder import write_run, write_scene
 
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
-from lapgs_plugin.viewer.server import Viewer, free_port  # noqa: E402  # needs viser
+from lapgs_plugin.viewer.page import free_port  # noqa: E402  # needs viser
+from lapgs_plugin.viewer.server import Viewer  # noqa: E402
 
 app = typer.Typer()
 app.command("view")(view)
@@ -60,9 +62,8 @@ def test_it_says_how_to_reach_it_and_takes_the_next_port(scene: Path, tmp_path: 
 
 def test_a_run_still_being_written_shows_what_is_finished(scene: Path, tmp_path: Path) -> None:
     output = lapgs_view(write_run(tmp_path / "run", scene, finished=1))
-    assert "is not complete: showing level 1 of 2" in output
-    with pytest.raises(RunFolderError, match="level 1 is not in this run"):
-        lapgs_view(write_run(tmp_path / "none", scene, finished=0))
+    assert "run is not complete: showing level 1 of 2" in output
+    assert "showing level nothing of 2" in lapgs_view(write_run(tmp_path / "none", scene, finished=0))
 
 
 def test_a_run_without_its_scene_is_shown_without_cameras(tmp_path: Path) -> None:
@@ -74,10 +75,16 @@ def test_a_run_without_its_scene_is_shown_without_cameras(tmp_path: Path) -> Non
         lapgs_view(run, "--scene", tmp_path / "nowhere")
 
 
-def test_a_missing_level_is_one_line(scene: Path, tmp_path: Path) -> None:
+def test_a_missing_or_truncated_level_is_said_and_the_coarser_ones_are_shown(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
-    (run / "level_0" / "point_cloud.ply").unlink()
-    with pytest.raises(RunFolderError, match=r"level 0 of .* is missing"):
+    ply = run / "level_0" / "point_cloud.ply"
+    ply.write_bytes(ply.read_bytes()[:-1000])
+    output = lapgs_view(run)
+    assert re.search(r"level 0 of .* is damaged: .* cut short .*; showing level 1 of 2", output), output
+    ply.unlink()
+    assert re.search(r"level 0 of .* is missing: .*; showing level 1 of 2", lapgs_view(run))
+    (run / "level_1" / "point_cloud.ply").unlink()
+    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
         lapgs_view(run)
 
 
@@ -90,3 +97,8 @@ def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[viewer\]"):
         lapgs_view(tmp_path)
+
+
+def test_a_folder_that_is_no_run_is_refused_before_anything_is_served(tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match=r"nowhere does not exist, so it is not a run"):
+        lapgs_view(tmp_path / "nowhere")

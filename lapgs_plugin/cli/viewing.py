@@ -1,0 +1,61 @@
+"""What the commands that open a viewer have in common: its options, and the line that says how to reach it."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+
+if TYPE_CHECKING:
+    from lapgs_plugin.viewer.page import Page
+
+HOST, PORT = "127.0.0.1", 8080
+
+ViewOption = Annotated[
+    bool, typer.Option("--view", help="Watch training in a web browser; costs at most 2 % of its time.")
+]
+ViewPortOption = Annotated[
+    int | None,
+    typer.Option(min=1, max=65535, help=f"Port of --view; the next free one where it is taken. Default: {PORT}."),
+]
+
+
+def require_viser(what: str) -> None:
+    """Check that pages can be served.
+
+    Args:
+        what: needs them.
+
+    Raises:
+        MissingExtraError: they cannot.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise MissingExtraError(
+            f"{what} needs viser, which is not installed; pip install 'lapgs_plugin[viewer]' brings it"
+        )
+
+
+def check_view_port(view: bool, port: int | None) -> None:
+    """Refuse a port without a viewer.
+
+    Raises:
+        UserInputError: there is one.
+    """
+    if port is not None and not view:
+        raise UserInputError(f"--view-port {port} needs --view; leave it out")
+
+
+def open_page(host: str, port: int, label: str, until: str) -> Page:
+    """Serve the page, and say where.
+
+    Args:
+        until: what ends it.
+    """
+    from lapgs_plugin.viewer.page import Page
+
+    page = Page(host, port, label)
+    print(f"open {page.address} in a browser; {until}", flush=True)
+    return page

@@ -1,0 +1,201 @@
+"""A run folder that may still be written: what of it can be shown now, and what is new since the last look."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
+from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.viewer.navigation import Start, start_at, start_outside
+from lapgs_plugin.viewer.page import Page
+from lapgs_plugin.viewer.pictures import ShownRun
+from lapgs_plugin.viewer.server import Viewer
+from lapgs_plugin.viewer.session import Exhibit
+
+LOOK_SECONDS = 1.0
+"""Time between two looks at whether a run has changed."""
+
+Stamp = tuple[int, int] | None  # nanoseconds of the last change and size of a file; None where there is none
+
+
+class FollowedRun:
+    """The levels of a run that can be shown: finished, there and whole, from the coarsest on without gaps.
+
+    Attributes:
+        archive: as it was when last looked at.
+        shown: None while there is no level to show.
+        problem: one line about the first level that should be there and cannot be shown; None without.
+
+    Args:
+        folder: of the run.
+        device, rasterizer: as `rasterizer_for` takes them.
+
+    Raises:
+        RunFolderError: there is no run, it is of another version, or its coarsest level cannot be shown.
+        UserInputError, MissingExtraError: as `rasterizer_for`.
+    """
+
+    def __init__(self, folder: Path, device: str, rasterizer: str) -> None:
+        self._folder = folder
+        self._device, self._rasterizer = device, rasterizer
+        self._fields: dict[int, tuple[Stamp, GaussianField]] = {}
+        self._placed: PlacedRasterizer | None = None
+        self._created = ""
+        self._stamps: dict[Path, Stamp] = {}
+        self.archive: RunArchive
+        self.shown: ShownRun | None = None
+        self.problem: str | None = None
+        self._read(None)
+        if self.problem is not None and self.shown is None:
+            raise RunFolderError(self.problem)
+
+    def refresh(self, rig: Rig | None) -> bool:
+        """Read what is new; False when nothing is.
+
+        Args:
+            rig: the cameras it was trained on, where they are known.
+
+        Raises:
+            RunFolderError: the run is gone or damaged; what was read before is still there.
+        """
+        if all(_stamp(path) == stamp for path, stamp in self._stamps.items()):
+            return False
+        self._read(rig)
+        return True
+
+    def place(self, rig: Rig) -> None:
+        """Say on which cameras the run was trained."""
+        if self.shown is not None:
+            self.shown = ShownRun.of(self.shown.name, self.shown.renderer, rig)
+
+    def status(self) -> str:
+        """What is shown, and what is not yet, in one line."""
+        manifest = self.archive.manifest
+        levels = ", ".join(str(level) for level in self.shown.counts) if self.shown else "nothing"
+        if self.problem is not None:
+            return f"{self.problem}; showing level {levels} of {manifest.levels}"
+        if manifest.complete:
+            return f"{self._folder.name}: {manifest.levels} levels"
+        return f"{self._folder.name} is not complete: showing level {levels} of {manifest.levels}; others will follow"
+
+    def _read(self, rig: Rig | None) -> None:
+        stamps = {self._folder / MANIFEST: _stamp(self._folder / MANIFEST)}
+        archive = RunArchive.open(self._folder, check=False)
+        manifest = archive.manifest
+        if self._placed is None or manifest.created != self._created:
+            self._placed = rasterizer_for(manifest, self._device, self._rasterizer)
+            self._created = manifest.created
+            self._fields = {}
+        fields: dict[int, GaussianField] = {}
+        self.problem = None
+        for level in archive.available_levels:
+            path = archive.field_path(level)
+            stamp = stamps[path] = _stamp(path)
+            try:
+                if level not in self._fields or self._fields[level][0] != stamp:
+                    self._fields[level] = stamp, archive.field(level).to(self._placed.device)
+            except RunFolderError as error:
+                self.problem = str(error)
+                break
+            fields[level] = self._fields[level][1]
+        self.archive, self._stamps = archive, stamps
+        self.shown = None
+        if fields:
+            renderer = HierarchyRenderer.of(manifest, fields, self._placed.rasterizer)
+            self.shown = ShownRun.of(archive.path().name, renderer, rig)
+
+
+class Following:
+    """Keeps a viewer showing what there is of a run, and of the one beside it.
+
+    Args:
+        viewer: that shows them.
+        page: whose status says what is shown.
+        run: what is looked at.
+        other: what it is compared with, None without.
+        scene: where the scene is now, None where it was trained.
+        say: told each line worth reading, besides the page.
+    """
+
+    def __init__(
+        self,
+        viewer: Viewer,
+        page: Page,
+        run: FollowedRun,
+        other: FollowedRun | None,
+        scene: Path | None,
+        say: Callable[[str], None],
+    ) -> None:
+        self._viewer, self._page, self._say = viewer, page, say
+        self._runs = [run] if other is None else [run, other]
+        self._scene = scene
+        self._cameras: dict[str, Camera] = {}
+        self._rig: Rig | None = None
+        self._said: set[str] = set()
+        self._placed_clients = False
+
+    def begin(self) -> None:
+        """Read the cameras, and show what there is.
+
+        Raises:
+            RunFolderError, SceneError: the scene that was named is not the run's.
+        """
+        try:
+            train, test = run_cameras(self._runs[0].archive, self._scene)
+        except (RunFolderError, SceneError) as error:
+            if self._scene is not None:
+                raise
+            self._say(f"without the scene's cameras: {error}")
+        else:
+            self._cameras, self._rig = {**test, **train}, Rig.of(list(train.values()))
+            for run in self._runs:
+                run.place(self._rig)
+        self._show()
+
+    def watch(self, stop: threading.Event) -> None:
+        """Show what is new whenever there is something, until `stop` is set."""
+        while not stop.wait(LOOK_SECONDS):
+            try:
+                changed = [run.refresh(self._rig) for run in self._runs]
+                if any(changed):
+                    self._show()
+            except LapgsError as error:  # a run that is removed or begun anew is shown as it was
+                self._tell(str(error))
+
+    def _show(self) -> None:
+        self._tell("; ".join(run.status() for run in self._runs))
+        shown, *others = [run.shown for run in self._runs]
+        if shown is None:
+            return
+        if not self._placed_clients:
+            self._placed_clients = True
+            self._viewer.begin_at(self._start(shown))
+        self._viewer.show(Exhibit(shown, others[0] if others else None, self._cameras, self._rig))
+
+    def _start(self, shown: ShownRun) -> Start:
+        if self._rig is None:
+            return start_outside(shown.renderer.fields[shown.renderer.levels - 1])
+        return start_at(next(iter(self._cameras.values())), self._rig)
+
+    def _tell(self, line: str) -> None:
+        self._page.status = line
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)
+
+
+def _stamp(path: Path) -> Stamp:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size

@@ -1,0 +1,162 @@
+"""A run that is looked at while it is written: what is read again, what is not, and what is said of damage."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.field import GaussianField
+from tests.cli.run_folder import write_run, write_scene
+
+pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from lapgs_plugin.viewer import following
+from lapgs_plugin.viewer.following import FollowedRun, Following
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "scene")
+
+
+def finish(run: Path, of: Path) -> None:
+    """Give a run the next level of a complete one."""
+    complete = RunArchive.open(of)
+    with RunArchive.open(run, resume=True) as archive:
+        level = archive.manifest.next_level
+        assert level is not None
+        archive.finish_level(complete.manifest.record(level), complete.field(level))
+
+
+def levels(run: FollowedRun) -> list[int]:
+    return [] if run.shown is None else list(run.shown.counts)
+
+
+def test_new_levels_are_read_and_old_ones_are_not_read_again(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complete = write_run(tmp_path / "complete", scene)
+    folder = write_run(tmp_path / "run", scene, finished=0)
+    read: list[str] = []
+    load: Callable[[Path], GaussianField] = GaussianField.load_ply
+    monkeypatch.setattr(GaussianField, "load_ply", lambda path: read.append(path.parent.name) or load(path))
+    run = FollowedRun(folder, "cpu", "auto")
+    assert levels(run) == []
+    assert not run.refresh(None)
+    finish(folder, complete)
+    assert run.refresh(None)
+    assert levels(run) == [1]
+    finish(folder, complete)
+    assert run.refresh(None)
+    assert levels(run) == [1, 0]
+    assert [name for name in read if name.startswith("level")][-1:] == ["level_0"]
+    assert run.status() == "run: 2 levels"
+    before = len(read)
+    assert not run.refresh(None)
+    assert len(read) == before
+
+
+def test_a_level_that_is_mended_is_shown_again(scene: Path, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", scene)
+    ply = folder / "level_0" / "point_cloud.ply"
+    whole = ply.read_bytes()
+    ply.write_bytes(whole[: len(whole) // 2])
+    run = FollowedRun(folder, "cpu", "auto")
+    assert levels(run) == [1]
+    assert "cut short" in run.status()
+    ply.write_bytes(whole)
+    assert run.refresh(None)
+    assert levels(run) == [1, 0]
+    assert run.problem is None
+
+
+def test_nan_in_a_residual_leaves_the_base(scene: Path, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", scene)
+    ply = folder / "level_0" / "point_cloud.ply"
+    content = bytearray(ply.read_bytes())
+    content[-4:] = np.float32("nan").tobytes()
+    ply.write_bytes(content)
+    run = FollowedRun(folder, "cpu", "auto")
+    assert levels(run) == [1]
+    assert "NaN" in run.status()
+
+
+def test_another_run_in_the_same_folder_is_another_field(scene: Path, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", scene)
+    run = FollowedRun(folder, "cpu", "auto")
+    assert run.shown is not None
+    first = run.shown.renderer.fields[1].means.clone()
+    other = write_run(tmp_path / "other", scene, seed=9)
+    for level in (1, 0):
+        new = (other / f"level_{level}" / "point_cloud.ply").read_bytes()
+        (folder / f"level_{level}" / "point_cloud.ply").write_bytes(new)
+    assert run.refresh(None)
+    assert not torch.equal(run.shown.renderer.fields[1].means, first)
+
+
+class FakeViewer:
+    """Notes what it is told to show."""
+
+    def __init__(self) -> None:
+        self.shown: list[Any] = []
+        self.starts = 0
+
+    def begin_at(self, start: Any) -> None:
+        self.starts += 1
+
+    def show(self, exhibit: Any) -> None:
+        self.shown.append(exhibit)
+
+
+class FakePage:
+    status = ""
+
+
+def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_folder(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(following, "LOOK_SECONDS", 0.02)
+    complete = write_run(tmp_path / "complete", scene)
+    folder = write_run(tmp_path / "run", scene, finished=1)
+    viewer, page, said = FakeViewer(), FakePage(), list[str]()
+    follow = Following(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
+    follow.begin()
+    stop = threading.Event()
+    thread = threading.Thread(target=follow.watch, args=(stop,))
+    thread.start()
+    try:
+        finish(folder, complete)
+        wait_for(lambda: len(viewer.shown) == 2)
+        (folder / "manifest.json").rename(tmp_path / "gone.json")
+        wait_for(lambda: "not a run" in page.status)
+        assert thread.is_alive()
+    finally:
+        stop.set()
+        thread.join()
+    assert [list(exhibit.run.counts) for exhibit in viewer.shown[:2]] == [[1], [1, 0]]
+    assert len(viewer.shown[0].cameras) == 10
+    assert viewer.starts == 1
+    assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in 30 s"
+        time.sleep(0.01)
+
+
+def test_without_a_level_to_show_damage_is_an_error(scene: Path, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", scene, finished=1)
+    (folder / "level_1" / "point_cloud.ply").unlink()
+    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
+        FollowedRun(folder, "cpu", "auto")
