@@ -69,6 +69,7 @@ class ActiveStage:
         self._began: float | None = None
         self._excluded = 0.0  # seconds since `_began` that are not optimization
         self._iteration = self._peak = 0
+        self._gaussian_steps = 0  # Gaussians, summed over the iterations
         self._gaussians: Any = None
         self._kept: Tensor | None = None  # which Gaussians of the level before are inherited
         self._views: dict[str, Any] = {}
@@ -124,9 +125,11 @@ class ActiveStage:
         if self._began is None:
             self._synchronize()
             self._began = time.perf_counter()
+        self._context.parts.breakdown.mark("other")
         self._iteration = iteration
         count = len(gaussians._xyz)
         self._peak = max(self._peak, count)
+        self._gaussian_steps += count
         if self._hooks:
             self._hooks.iteration_begins(iteration)
         if iteration % max(1, self.window.total // HISTORY_ENTRIES) == 0:
@@ -156,9 +159,11 @@ class ActiveStage:
         """Time that is not optimization though it passes inside the training loop."""
         self._synchronize()
         start = time.perf_counter()
+        self._context.parts.breakdown.pause()
         with self.overhead.timed(what):
             yield
         self._excluded += time.perf_counter() - start
+        self._context.parts.breakdown.mark("other")
 
     # Start, middle and end of the stage.
 
@@ -177,7 +182,9 @@ class ActiveStage:
         self._hooks.stage_begins(stage, self._rendering)
         if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()
+        self._context.parts.stage_begins()
         self._call.run()
+        self._context.parts.breakdown.pause()
         self._synchronize()
         seconds, memory = self._seconds(), self._memory()
         self._hooks.stage_ends(stage)
@@ -249,6 +256,8 @@ class ActiveStage:
                 overhead_seconds=dict(self.overhead),
                 image_size=stage.image_size,
                 memory_bytes=memory,
+                mean_gaussians=self._gaussian_steps / stage.iterations,
+                breakdown_seconds=self._context.parts.breakdown.seconds(),
             ),
             field,
             left if stage.level > 0 and any(left.values()) else None,

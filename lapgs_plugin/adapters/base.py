@@ -55,6 +55,7 @@ class BackboneInfo:
         rasterizer: the CUDA module it renders with.
         stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU.
         density_control: methods of its GaussianModel that add, remove or reset Gaussians.
+        density_scores: functions of its script or utilities by whose scores density control decides.
         color_rates: its options that are learning rates of SH coefficients.
         raster_defaults: what its options set in the rasterizer unless a user says otherwise, where that changes the
             image and is not in `extensions.CONSTANTS`.
@@ -67,6 +68,7 @@ class BackboneInfo:
     stand_in: str
     density_control: tuple[str, ...]
     color_rates: tuple[str, ...]
+    density_scores: tuple[str, ...] = ()
     raster_defaults: Mapping[str, Any] = field(default_factory=dict)
     telling_options: tuple[str, ...] = ()
 

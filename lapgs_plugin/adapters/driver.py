@@ -30,6 +30,7 @@ from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCal
 from lapgs_plugin.adapters.extensions import CudaExtension
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.installed_rasterizer import require_matching_rasterizer
+from lapgs_plugin.adapters.iteration_parts import IterationParts
 from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.run_state import Finished, HierarchyOptions, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import RasterizerShim
@@ -52,6 +53,7 @@ class HierarchyDriver:
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
         resume, overwrite: what to do with a run that is in the output folder already.
         hooks: run after those registered by entry point.
+        breakdown: measure the parts of iterations.
     """
 
     def __init__(
@@ -63,11 +65,14 @@ class HierarchyDriver:
         resume: bool = False,
         overwrite: bool = False,
         hooks: Sequence[StageHook] = (),
+        breakdown: bool = False,
     ) -> None:
         self._adapter, self._options = adapter, options
         self._resume, self._overwrite = resume, overwrite
         self._shim, self._album = RasterizerShim(), PhotoAlbum()
-        self._context = RunContext(adapter, options, torch.device(device), self._album, self._shim, HookCaller(hooks))
+        place = torch.device(device)
+        self._parts = IterationParts(place, breakdown)
+        self._context = RunContext(adapter, options, place, self._album, self._shim, HookCaller(hooks), self._parts)
         self._active: ActiveStage | None = None
 
     def run(self) -> None:
@@ -76,7 +81,12 @@ class HierarchyDriver:
         Raises:
             LapgsError: the checkout, its options, the scene and the hierarchy do not go together.
         """
-        with Attachment([*self._replacements(), *self._adapter.replacements(self._window)]):
+        replacements = [
+            *self._replacements(),
+            *self._adapter.replacements(self._window),
+            *self._parts.outer_replacements(self._adapter.train, self._adapter.info),
+        ]
+        with Attachment(replacements), self._parts.watching_optimizers():
             self._adapter.script.run_main()
 
     def _window(self) -> StageWindow | None:
@@ -103,6 +113,7 @@ class HierarchyDriver:
             Replacement(train, "training", self._make_training, ("dataset", "opt", "pipe"), "the main block"),
             Replacement(train, "Scene", self._make_scene, ("args", "gaussians"), "training()"),
             Replacement(loader, "Camera", self._album.adopting, None, "the scene's loader, for every image"),
+            *self._parts.inner_replacements(renderer),
             Replacement(renderer, "GaussianRasterizationSettings", self._shim.settings, None, whoever),
             Replacement(renderer, "GaussianRasterizer", self._shim.rasterizer, None, whoever),
             Replacement(

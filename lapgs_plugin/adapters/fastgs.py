@@ -34,6 +34,7 @@ class FastGSAdapter(BackboneAdapter):
         rasterizer="diff_gaussian_rasterization_fastgs",
         stand_in="fastgs",
         density_control=("densify_and_prune_fastgs", "reset_opacity", "final_prune_fastgs"),
+        density_scores=("compute_gaussian_score_fastgs",),
         color_rates=("lowfeature_lr", "highfeature_lr"),
         raster_defaults={"mult": 0.5},
     )

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.hooking import HookCaller
+from lapgs_plugin.adapters.iteration_parts import IterationParts
 from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
@@ -88,6 +89,7 @@ class RunContext:
         album: the images of its scene.
         shim: between its render and its rasterizer.
         hooks: of the user.
+        parts: told which part of an iteration begins.
     """
 
     adapter: BackboneAdapter
@@ -96,6 +98,7 @@ class RunContext:
     album: PhotoAlbum
     shim: RasterizerShim
     hooks: HookCaller
+    parts: IterationParts
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ class TamingAdapter(BackboneAdapter):
         rasterizer="diff_gaussian_rasterization",
         stand_in="taming",
         density_control=("densify_with_score", "reset_opacity"),
+        density_scores=("compute_gaussian_score",),
         color_rates=("feature_lr", "shfeature_lr"),
     )
 

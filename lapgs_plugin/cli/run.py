@@ -99,6 +99,13 @@ def run(
             help="Step the backbone's plain Adam optimizers in one kernel a tensor.",
         ),
     ] = True,
+    breakdown: Annotated[
+        bool,
+        typer.Option(
+            "--breakdown",
+            help="Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
+        ),
+    ] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Say which symbols are replaced, and who uses them.")
     ] = False,
@@ -157,7 +164,10 @@ def run(
             if off:
                 loaded.run_main()
                 return
-            HierarchyDriver(kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite).run()
+            driver = HierarchyDriver(
+                kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite, breakdown=breakdown
+            )
+            driver.run()
     except ImportError as error:
         line = None if off else explained(error, str(script))
         if line is None:

@@ -144,8 +144,18 @@ def loaded(
         yield adapter_class(script.parent)(definitions)
 
 
-def drive(adapter: BackboneAdapter, *, hooks: Sequence[StageHook] = (), resume: bool = False, **options: Any) -> None:
-    HierarchyDriver(adapter, HierarchyOptions(**options), device="cpu", resume=resume, hooks=hooks).run()
+def drive(
+    adapter: BackboneAdapter,
+    *,
+    hooks: Sequence[StageHook] = (),
+    resume: bool = False,
+    breakdown: bool = False,
+    **options: Any,
+) -> None:
+    driver = HierarchyDriver(
+        adapter, HierarchyOptions(**options), device="cpu", resume=resume, hooks=hooks, breakdown=breakdown
+    )
+    driver.run()
 
 
 def run_hierarchy(
@@ -155,12 +165,13 @@ def run_hierarchy(
     *more: Any,
     hooks: Sequence[StageHook] = (),
     resume: bool = False,
+    breakdown: bool = False,
     **options: Any,
 ) -> tuple[RunArchive, Result]:
     """Train a stub as a hierarchy with `HierarchyOptions(**options)`."""
     results: list[Result] = []
     with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
-        drive(adapter, hooks=hooks, resume=resume, **options)
+        drive(adapter, hooks=hooks, resume=resume, breakdown=breakdown, **options)
     return RunArchive.open(folder), results[0]
 
 

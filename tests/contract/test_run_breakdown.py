@@ -1,0 +1,100 @@
+"""`lapgs run --breakdown`: known delays in a checkout's loop land in their parts, which add up to the optimization."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from lapgs_plugin.breakdown import PARTS
+from lapgs_plugin.hooks import StageContext, StageHook
+from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
+
+TINY = ("--iterations", 18, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 18)
+LOSS, BACKWARD, DENSIFY, STEP = 0.05, 0.03, 0.06, 0.02
+"""Seconds slept each time, many times what anything takes at 64x48 pixels."""
+
+
+class Slow(StageHook):
+    """Sleeps where it is called, and counts how often."""
+
+    def __init__(self) -> None:
+        self.densified = {1: 0, 0: 0}
+
+    def compose(self, context: StageContext, image: Tensor) -> Tensor:
+        time.sleep(LOSS)
+        image.register_hook(lambda _: time.sleep(BACKWARD))
+        return image
+
+    def on_densify(self, context: StageContext) -> None:
+        self.densified[context.stage.level] += 1
+        time.sleep(DENSIFY)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_delays_land_in_their_parts(scene: Path, tmp_path: Path, name: str) -> None:
+    hook = Slow()
+    backward = torch.Tensor.backward
+    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", *TINY, hooks=(hook,), breakdown=True)
+    assert torch.Tensor.backward is backward
+    assert hook.densified[0] > 0 or name == "taming"  # in so few iterations no Gaussian qualifies there
+    for record in archive.manifest.records:
+        parts = record.breakdown_seconds
+        assert tuple(parts) == PARTS
+        assert math.fsum(parts.values()) == pytest.approx(record.train_seconds, rel=0.03)  # 0.2 % seen
+        slept = {
+            "loss": record.iterations * LOSS,
+            "backward": record.iterations * BACKWARD,
+            "densification": hook.densified[record.level] * DENSIFY,
+        }
+        for part in PARTS:
+            own = parts[part] - slept.get(part, 0.0)
+            assert own > 0 or (part, slept.get(part)) == ("densification", 0.0), part
+            # Densification renders every view for scores. The others' own work: 15 ms an iteration seen at most.
+            assert part == "densification" or own < 0.04 * record.iterations, part
+
+
+def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None:
+    taken: list[str] = []
+
+    def slow(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        taken.append(type(optimizer).__name__)
+        time.sleep(STEP)
+
+    class SlowSteps(StageHook):
+        """Registered when a stage has begun: after what marks, so that the sleep is inside."""
+
+        def on_stage_start(self, stage: Any) -> None:
+            if not handles:
+                handles.append(register_optimizer_step_pre_hook(slow))
+
+    handles: list[Any] = []
+    try:
+        archive, _ = run_hierarchy(
+            STUBS["taming"], scene, tmp_path / "run", *TINY, "--sh_lower", hooks=(SlowSteps(),), breakdown=True
+        )
+    finally:
+        handles[0].remove()
+    assert len(taken) >= 18
+    optimizer = sum(record.breakdown_seconds["optimizer"] for record in archive.manifest.records)
+    assert STEP * len(taken) <= optimizer < (STEP + 0.02) * len(taken)
+
+
+def test_without_the_option_nothing_of_it_is_there(scene: Path, tmp_path: Path) -> None:
+    class Looking(StageHook):
+        seen: Any = None
+
+        def before_render(self, context: StageContext) -> None:
+            Looking.seen = torch.Tensor.backward
+
+    backward = torch.Tensor.backward
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, hooks=(Looking(),))
+    assert Looking.seen is backward
+    assert [record.breakdown_seconds for record in archive.manifest.records] == [{}, {}]
+    assert all(0 < record.mean_gaussians <= record.peak_gaussians for record in archive.manifest.records)
