@@ -1,0 +1,299 @@
+"""`lapgs bench EXPERIMENT.toml`: run what a file describes, keep what comes out, show it as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lapgs_plugin.errors import LapgsError, MissingExtraError, TrainingStoppedError, UserInputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lapgs_plugin.experiments.expansion import PlannedRun
+    from lapgs_plugin.experiments.launchers import Launcher
+    from lapgs_plugin.experiments.runner import Folder
+    from lapgs_plugin.experiments.schema import Experiment
+    from lapgs_plugin.experiments.store import Job, Outcome, ResultStore
+
+SELECTION = "What to run"
+PLACES = "Where"
+ENGINE = "On what"
+
+SET_BY_EXPERIMENTS = {
+    *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
+    *("script", "arguments", "off", "record"),
+}
+"""Parameters of `lapgs train` and `lapgs run` that an experiment says in its own way."""
+
+
+class RunsFailedError(LapgsError):
+    """Some runs of an experiment failed; the others are done and shown."""
+
+    exit_code = 1
+
+
+def bench_experiment(
+    experiment: Annotated[Path, typer.Argument(help="Experiment file, such as benchmarks/smoke.toml.")],
+    scene: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this scene; may be given several times.")
+    ] = None,
+    backbone: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this backbone; several times as well.")
+    ] = None,
+    variant: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this variant; several times as well.")
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(rich_help_panel=SELECTION, help="Instead of the file's, such as 0,1,2.")
+    ] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, rich_help_panel=SELECTION, help="Instead of the file's, for a shorter trial.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", rich_help_panel=PLACES, help="Folder for everything. Default: runs/bench/ and its name."
+        ),
+    ] = None,
+    path: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FOLDER",
+            rich_help_panel=PLACES,
+            help="Where a data set, a scene or a checkout is; several times. Instead, set LAPGS_<NAME>.",
+        ),
+    ] = None,
+    launcher: Annotated[
+        str, typer.Option(rich_help_panel=ENGINE, help="local, slurm (through submitit) or ray.")
+    ] = "local",
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, rich_help_panel=ENGINE, help="Runs at once. Default: one a GPU, or one without GPUs."),
+    ] = None,
+    gpus: Annotated[
+        str | None,
+        typer.Option(rich_help_panel=ENGINE, help="Which to use, as for CUDA_VISIBLE_DEVICES: 0,1. Default: all."),
+    ] = None,
+    launcher_option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            rich_help_panel=ENGINE,
+            help="For Slurm what submitit takes (slurm_partition=gpu, timeout_min=600), for Ray address, num_gpus, "
+            "num_cpus; several times.",
+        ),
+    ] = None,
+    evaluate: Annotated[
+        bool,
+        typer.Option(
+            "--eval/--no-eval",
+            help="Measure every run with `lapgs eval`; without, the PSNR that training noted at its end is taken.",
+        ),
+    ] = True,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands of every run, and run none.")] = False,
+    tables_only: Annotated[
+        bool, typer.Option("--tables-only", help="Write the tables again from results that are there.")
+    ] = False,
+) -> None:
+    """Run every scene, backbone, variant and seed of EXPERIMENT, and write tables with the paper's figures beside.
+
+    Each run is a process of its own. Stop with Ctrl-C or lose the machine: the same command goes on, and repeats no
+    finished run. Several of these commands may work on one folder at a time. Failed runs are reported, and tried again
+    by the next command.
+
+    Examples:
+
+        lapgs bench benchmarks/smoke.toml
+
+        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360 --path fastgs=~/FastGS --scene bonsai
+    """
+    from rich.console import Console
+
+    from lapgs_plugin.experiments.aggregate import check_table
+    from lapgs_plugin.experiments.commands import Places
+    from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+    from lapgs_plugin.experiments.runner import Folder, execute, make_samples, prepare
+    from lapgs_plugin.experiments.schema import load_experiment
+    from lapgs_plugin.experiments.store import ResultStore
+
+    console = Console(stderr=True)
+    loaded = load_experiment(experiment, _option_names())
+    check_table(loaded)
+    selection = Selection(scene, backbone, variant, _seeds(seeds), iterations)
+    planned, scenes = plan_runs(loaded, selection), scenes_of(loaded, selection)
+    folder = Folder(Path("runs", "bench", loaded.name) if out is None else out)
+    if not tables_only:
+        _require_measuring(evaluate)
+        places = Places(
+            {name: Path(value).expanduser() for name, value in _pairs(path, "--path").items()}, experiment.parent
+        )
+        jobs = prepare(planned, scenes, places, folder, evaluate)
+        if dry_run:
+            _print_commands(jobs)
+            return
+        start = _starter(launcher, workers, gpus, _pairs(launcher_option, "--launcher-option"), folder, jobs)
+        make_samples(scenes, folder)
+        store = ResultStore.create(folder.store)
+        store.plan(jobs)
+        _follow(execute, store, jobs, start, console)
+    _write(loaded, planned, ResultStore(folder.store), folder, console)
+
+
+def _option_names() -> dict[str, set[str]]:
+    """By command, what an experiment may set."""
+    from lapgs_plugin.cli.run import run
+    from lapgs_plugin.cli.train import train
+
+    functions = {"train": train, "run": run}
+    return {
+        name: {p for p in function.__annotations__ if p not in ("return", "context")} - SET_BY_EXPERIMENTS
+        for name, function in functions.items()
+    }
+
+
+def _seeds(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise UserInputError(f"--seeds {text}: expected whole numbers separated by commas, such as 0,1,2") from error
+
+
+def _pairs(texts: Sequence[str] | None, option: str) -> dict[str, str]:
+    found = {}
+    for text in texts or ():
+        name, separator, value = text.partition("=")
+        if not (separator and name and value):
+            raise UserInputError(f"{option} {text}: expected NAME=VALUE")
+        found[name] = value
+    return found
+
+
+def _require_measuring(evaluate: bool) -> None:
+    """`lapgs eval` reads scenes, for which not every machine has the packages."""
+    from importlib.util import find_spec
+
+    missing = [name for name in ("OpenImageIO", "pycolmap") if find_spec(name) is None]
+    if evaluate and missing:
+        raise UserInputError(
+            f"{' and '.join(missing)} cannot be imported here, which `lapgs eval` reads scenes with; give --no-eval to "
+            "take the PSNR that training notes"
+        )
+
+
+def _print_commands(jobs: Sequence[Job]) -> None:
+    import shlex
+
+    for job in jobs:
+        print(f"# {job.run_id}")
+        for step in job.steps:
+            print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
+
+
+def _starter(
+    launcher: str, workers: int | None, gpus: str | None, options: dict[str, str], folder: Folder, jobs: Sequence[Job]
+) -> Callable[[], Launcher]:
+    """Starts workers for these runs."""
+    from lapgs_plugin.experiments.launchers import LAUNCHERS, WorkOrder, launch
+
+    if launcher not in LAUNCHERS:
+        raise UserInputError(f"--launcher {launcher}: expected {', '.join(LAUNCHERS)}")
+    order = WorkOrder(
+        store=folder.store.absolute(),
+        run_ids=[job.run_id for job in jobs],
+        workers=workers,
+        gpus=None if gpus is None else gpus.split(","),
+        logs=folder.logs("workers").absolute(),
+        options={name: int(value) if value.isdecimal() else value for name, value in options.items()},
+    )
+    return lambda: launch(launcher, order)
+
+
+def _follow(
+    execute: Callable[..., list[Outcome]],
+    store: ResultStore,
+    jobs: Sequence[Job],
+    start: Callable[[], Launcher],
+    console: Console,
+) -> None:
+    """Run the jobs with a progress bar and a line for each that ends."""
+    import signal
+
+    from rich.markup import escape
+
+    from lapgs_plugin.experiments.store import DONE, FAILED
+    from lapgs_plugin.progress import item_progress
+
+    run_ids = [job.run_id for job in jobs]
+    finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
+    if finished:
+        console.print(f"{finished} of {len(run_ids)} runs are done already")
+    # A batch system ends a job with SIGTERM: the runs of its workers are given back, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with item_progress("runs") as progress:
+        task = progress.add_task("Running", total=len(run_ids), completed=finished)
+
+        def say(outcome: Outcome) -> None:
+            progress.advance(task)
+            if outcome.state == FAILED:
+                progress.console.print(f"[red]failed[/red] {outcome.run_id}", escape(outcome.error), sep="\n")
+            else:
+                progress.console.print(f"[green]done[/green]   {outcome.run_id}: {_summary(outcome.record or {})}")
+
+        try:
+            execute(store, run_ids, start, say)
+        except KeyboardInterrupt:
+            raise TrainingStoppedError("stopped; the same command goes on with the runs that are left") from None
+
+
+def _summary(record: dict[str, Any]) -> str:
+    patterns = {"psnr": "{:.2f} dB", "train_seconds": "{:.1f} s", "peak_gaussians": "at most {:,} Gaussians"}
+    return ", ".join(pattern.format(record[name]) for name, pattern in patterns.items() if name in record)
+
+
+def _write(
+    experiment: Experiment, planned: Sequence[PlannedRun], store: ResultStore, folder: Folder, messages: Console
+) -> None:
+    """Files of everything that is done, the table on the terminal, and what failed."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    from lapgs_plugin import __version__
+    from lapgs_plugin.experiments import exports
+    from lapgs_plugin.experiments.aggregate import make_table
+    from lapgs_plugin.experiments.store import FAILED
+    from lapgs_plugin.experiments.tables import latex, markdown
+
+    outcomes = {o.run_id: o for o in store.outcomes({run.spec.run_id for run in planned})}
+    records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}
+    rows = [
+        {"experiment": experiment.name, "variant": run.variant, **records[run.spec.run_id]}
+        for run in planned
+        if run.spec.run_id in records
+    ]
+    table = make_table(experiment, planned, records)
+    text = markdown(table)
+    exports.write_csv(folder.path / exports.CSV, rows)
+    exports.write_text(folder.path / exports.MARKDOWN, text)
+    exports.write_text(folder.path / exports.LATEX, latex(table))
+    try:
+        exports.write_parquet(folder.path / exports.PARQUET, rows)
+    except MissingExtraError as error:
+        messages.print(f"[yellow]{error}[/yellow]", highlight=False)
+    Console().print(Markdown(text))
+    others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
+    if others:
+        messages.print(
+            f"[yellow]some results were made by lapgs_plugin {', '.join(others)}; this is {__version__}[/yellow]"
+        )
+    print(f"{folder.path} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    if failed := [o for o in outcomes.values() if o.state == FAILED]:
+        raise RunsFailedError(
+            f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "
+            f"{folder.path / 'logs'}"
+        )

@@ -1,0 +1,134 @@
+"""`lapgs bench raster`: how fast the CPU rasterizer is on this machine, and whether it is as fast as promised."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import torch
+
+    from lapgs_plugin.evaluation.bench_raster import BenchCase, CaseResult
+
+DTYPES = ("float32", "float64")
+
+
+def raster(
+    sizes: Annotated[
+        str | None,
+        typer.Option(
+            help="What to time, separated by commas: 200x150, 400x300, 800x533, 1600x1066, or WIDTHxHEIGHT/GAUSSIANS. "
+            "Default: those four."
+        ),
+    ] = None,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Turns at each size; slow contenders get fewer at large ones.")
+    ] = 5,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write everything measured to this file.")
+    ] = None,
+    dtype: Annotated[
+        str, typer.Option(metavar="|".join(DTYPES), help="Precision; gsplat takes part in float32 only.")
+    ] = "float32",
+    check: Annotated[bool, typer.Option("--check", help="Exit with 1 if something is slower than promised.")] = False,
+) -> None:
+    """Time whole training iterations of the CPU rasterizer against plain PyTorch.
+
+    One iteration renders a random scene at SH degree 3, takes L1 + SSIM, goes backward and lets Adam step. The fast
+    rasterizer stands beside the readable oracle, differentiated by PyTorch, and beside gsplat's own PyTorch code, which
+    is made to run on a CPU. They take turns. All sizes together take a few minutes.
+    """
+    import json
+    import os
+
+    from lapgs_plugin.errors import UserInputError
+
+    if dtype not in DTYPES:
+        raise UserInputError(f"--dtype {dtype}: expected {' or '.join(DTYPES)}")
+    if json_file is not None and not os.access(json_file.parent, os.W_OK):
+        raise UserInputError(f"--json {json_file}: expected a file in a folder that exists and may be written")
+
+    import torch
+
+    from lapgs_plugin.evaluation import bench_raster
+    from lapgs_plugin.files import atomic_write
+
+    precision: torch.dtype = getattr(torch, dtype)
+    results = _measure(bench_raster.parse_cases(sizes), repeats, precision)
+    _print_results(results)
+    if json_file is not None:
+        with atomic_write(json_file) as stream:
+            stream.write(json.dumps(bench_raster.report(results, precision), indent=2).encode())
+    if check and any(result.missed for result in results):
+        raise typer.Exit(1)
+
+
+def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> list[CaseResult]:
+    """All cases, with a progress bar in units of estimated time."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from lapgs_plugin.evaluation.bench_raster import planned_cost, run_case
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("preparing", total=sum(planned_cost(case, repeats, dtype) for case in cases))
+
+        def advance(name: str, cost: float) -> None:
+            progress.update(task, description=f"{case.name} {name}", advance=cost)
+
+        results = []
+        for case in cases:
+            results.append(run_case(case, repeats, dtype, advance))
+    return results
+
+
+def _print_results(results: Sequence[CaseResult]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from lapgs_plugin.evaluation.bench_raster import FAST, machine
+
+    times = Table(title="A training iteration, medians", box=box.SIMPLE, pad_edge=False)
+    for heading in ("size", "Gaussians", "a pixel", "contender", "ms", "times cpu", "required"):
+        times.add_column(heading, justify="right", no_wrap=True)
+    parts = Table(title=f"Where the time of {FAST} goes, medians in ms", box=box.SIMPLE, pad_edge=False)
+    for heading in ("size", *(name.replace("_", "\n") for name in results[0].parts), "loss\nadds", "MB"):
+        parts.add_column(heading, justify="right", no_wrap=True)
+    for result in results:
+        case = result.case
+        for name, ms in result.milliseconds.items():
+            about = [""] * 3
+            if name == FAST:
+                about = [case.size, str(case.gaussians), f"{result.blended_per_pixel:.0f}"]
+            ratio = f"{result.ratios[name]:.1f}" if name in result.ratios else ""
+            required = f"{case.required[name]:g}" if name in case.required else ""
+            times.add_row(*about, name, f"{ms:.1f}", ratio, required)
+        times.add_section()
+        memory = "" if result.peak_memory is None else f"{result.peak_memory / 1e6:.0f}"
+        parts.add_row(case.size, *(f"{ms:.1f}" for ms in result.parts.values()), f"{result.loss_share:.0%}", memory)
+    console = Console()
+    console.print(times, parts)
+    for result in results:
+        if result.gsplat_tile_loop is not None:
+            console.print(f"{result.case.size}: {result.gsplat_tile_loop:.0f} ms of gsplat's are its loop over tiles")
+    console.print(", ".join(f"{key} {value}" for key, value in machine().items()))
+    for line in (line for result in results for line in result.missed):
+        console.print(f"[red]missed[/red] {line}")

@@ -1,0 +1,368 @@
+"""From rows of results to a table: means over scenes, spread over seeds, ratios to the baseline, the paper's figures.
+
+A cell is taken over the scenes that every row of the table has, so that rows can be compared while some runs are
+missing: first the mean over these scenes for each seed, then mean and sample deviation over the seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.expansion import PlannedRun
+from lapgs_plugin.experiments.schema import Experiment, nearest
+from lapgs_plugin.experiments.standard import DATASETS, PaperTable, Printed
+
+Row = Mapping[str, Any]
+"""A row of results, see `rows`."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        heading: as the paper writes it, without arrow.
+        better: "lower", "higher" or "".
+        sources: columns of the rows; the first that a row has is taken. One that ends with _level_ stands for all.
+        scale: what the value is multiplied with.
+        decimals: digits shown after the point.
+    """
+
+    heading: str
+    better: str
+    sources: tuple[str, ...]
+    scale: float = 1.0
+    decimals: int = 2
+
+
+def _milliseconds(heading: str, name: str) -> Column:
+    return Column(f"{heading} (ms)", "lower", (f"{name}_ms",), decimals=3)
+
+
+def _seconds(heading: str, name: str) -> Column:
+    return Column(f"{heading} (s)", "lower", (f"overhead_{name}_seconds",))
+
+
+COLUMNS: Mapping[str, Column] = {
+    "minutes": Column("Time (min)", "lower", ("train_seconds",), 1 / 60),
+    "train_seconds": Column("Time (s)", "lower", ("train_seconds",), decimals=1),
+    "overhead_seconds": Column("Overhead (s)", "lower", ("overhead_seconds",), decimals=1),
+    "psnr": Column("PSNR", "higher", ("psnr",)),
+    "ssim": Column("SSIM", "higher", ("ssim",), decimals=3),
+    "lpips": Column("LPIPS", "lower", ("lpips_vgg_3dgs", "lpips_vgg"), decimals=3),
+    "gaussians_millions": Column("N_GS (M)", "lower", ("gaussians_level_", "gaussians"), 1e-6),
+    "gaussians_thousands": Column("N_GS (k)", "lower", ("gaussians_level_", "gaussians"), 1e-3, 1),
+    "mean_gaussians": Column("Mean N_GS", "lower", ("mean_gaussians",), decimals=0),
+    "peak_gaussians": Column("Peak N_GS", "lower", ("peak_gaussians",), decimals=0),
+    "peak_memory_mb": Column("Peak GPU (MB)", "lower", ("peak_memory_without_images_bytes",), 1e-6, 0),
+    "peak_memory_with_images_mb": Column("with images (MB)", "lower", ("peak_memory_bytes",), 1e-6, 0),
+    "fps": Column("FPS", "higher", ("fps",), decimals=0),
+    "forward_ms": _milliseconds("Forward rendering", "forward"),
+    "loss_ms": _milliseconds("Composition + loss", "loss"),
+    "backward_ms": _milliseconds("Backward propagation", "backward"),
+    "densification_ms": _milliseconds("Densification + pruning", "densification"),
+    "optimizer_ms": _milliseconds("Optimizer step", "optimizer"),
+    "other_ms": _milliseconds("Other", "other"),
+    "iteration_ms": _milliseconds("Total", "iteration"),
+    "pyramid_seconds": _seconds("Pyramid", "pyramid"),
+    "cache_seconds": _seconds("Stage cache", "cache"),
+    "inheritance_seconds": _seconds("Inheritance", "inheritance"),
+    "archive_seconds": _seconds("Archive I/O", "archive"),
+}
+"""Everything a table can show, by the name that experiment files use."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure of one row.
+
+    Attributes:
+        values: the mean, or one for each level, coarsest first; empty when nothing was measured.
+        deviation: of all levels together over the seeds; None with one seed.
+        seeds: over how many.
+        paper: what the paper prints, None when it prints nothing.
+    """
+
+    values: tuple[float, ...] = ()
+    deviation: float | None = None
+    seeds: int = 0
+    paper: Printed | None = None
+
+    @property
+    def value(self) -> float | None:
+        """All levels together."""
+        return math.fsum(self.values) if self.values else None
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A row against its baseline, measured and printed; None where there is nothing to compare."""
+
+    measured: float | None
+    paper: float | None
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A variant on a backbone.
+
+    Attributes:
+        label: what it is called.
+        section: heading above it, "" without one.
+        cells: by column.
+        speedup: seconds of the baseline by its own.
+        psnr_gain: its PSNR less the baseline's, dB.
+        is_baseline: whether others are compared with it.
+    """
+
+    label: str
+    section: str
+    cells: Mapping[str, Cell]
+    speedup: Ratio
+    psnr_gain: Ratio
+    is_baseline: bool
+
+
+@dataclass(frozen=True)
+class Group:
+    """The part of a table that is about one data set, or one scene.
+
+    Attributes:
+        title: of it.
+        rows: in the experiment's order.
+        notes: what a reader has to know, as whole sentences.
+    """
+
+    title: str
+    rows: tuple[TableRow, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """What is written as Markdown and LaTeX.
+
+    Attributes:
+        title: of the experiment.
+        label: its name.
+        columns: names of `COLUMNS`.
+        transposed: columns are shown as rows.
+        groups: data sets, in the experiment's order.
+        scenes: scenes, when the experiment asks for them.
+    """
+
+    title: str
+    label: str
+    columns: tuple[str, ...]
+    transposed: bool
+    groups: tuple[Group, ...]
+    scenes: tuple[Group, ...]
+
+
+RowKey = tuple[str, str]
+"""Backbone and variant."""
+
+
+def check_table(experiment: Experiment) -> PaperTable | None:
+    """The paper's table of an experiment, after checking what the file says about tables.
+
+    Raises:
+        UserInputError: a column or a row of the paper's table is not known.
+    """
+    for column in experiment.table.columns:
+        if column not in COLUMNS:
+            raise UserInputError(f"table.columns: {column!r} is not known; {nearest(column, COLUMNS.keys())}")
+    if experiment.table.paper is None:
+        return None
+    paper = PaperTable(experiment.table.paper)
+    for variant in experiment.variants:
+        for backbone in experiment.backbones:
+            name = variant.paper_row(backbone)
+            if name and name not in paper.rows:
+                raise UserInputError(
+                    f"variant {variant.name!r}: the paper's table {paper.name} has no row {name!r}; "
+                    f"{nearest(name, paper.rows)}"
+                )
+    return paper
+
+
+def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> ResultTable:
+    """The table of an experiment.
+
+    Args:
+        experiment: its file.
+        planned: the runs that it is about.
+        records: the rows of those that are done, by run.
+    """
+    paper = check_table(experiment)
+    by_dataset: dict[str, list[PlannedRun]] = defaultdict(list)
+    by_scene: dict[tuple[str, str], list[PlannedRun]] = defaultdict(list)
+    for run in planned:
+        by_dataset[run.spec.dataset].append(run)
+        by_scene[run.spec.dataset, run.spec.scene].append(run)
+    groups = [_Part(experiment, paper, dataset, runs, records).group() for dataset, runs in by_dataset.items()]
+    single = [
+        _Part(experiment, paper, dataset, runs, records).group(scene) for (dataset, scene), runs in by_scene.items()
+    ]
+    return ResultTable(
+        title=experiment.title,
+        label=experiment.name,
+        columns=tuple(experiment.table.columns),
+        transposed=experiment.table.transposed,
+        groups=tuple(groups),
+        scenes=tuple(single) if experiment.table.by_scene and len(single) > len(groups) else (),
+    )
+
+
+class _Part:
+    """What one group of a table is made from.
+
+    Args:
+        experiment: its file.
+        paper: the paper's table.
+        dataset: that the runs are of, "" for scenes of one's own.
+        runs: those of the group.
+        records: rows of all runs that are done.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        paper: PaperTable | None,
+        dataset: str,
+        runs: Sequence[PlannedRun],
+        records: Mapping[str, Row],
+    ) -> None:
+        self._experiment, self._paper, self._dataset = experiment, paper, dataset
+        self._variants = {variant.name: variant for variant in experiment.variants}
+        asked = {(run.spec.backbone, run.variant) for run in runs}
+        self._keys: list[RowKey] = [
+            (backbone, variant)
+            for variant in self._variants
+            for backbone in experiment.backbones
+            if (backbone, variant) in asked
+        ]
+        self._scenes = list(dict.fromkeys(run.spec.scene for run in runs))
+        self._found: dict[RowKey, dict[int, dict[str, Row]]] = {key: defaultdict(dict) for key in self._keys}
+        for run in runs:
+            if (record := records.get(run.spec.run_id)) is not None:
+                self._found[run.spec.backbone, run.variant][run.spec.seed][run.spec.scene] = record
+        self._missing = sum(run.spec.run_id not in records for run in runs)
+        self._total = len(runs)
+        measured = [found for found in self._found.values() if found]
+        self._common = [
+            scene for scene in self._scenes if all(any(scene in one for one in found.values()) for found in measured)
+        ]
+
+    def group(self, title: str | None = None) -> Group:
+        cells = {key: self._cells(key) for key in self._keys}
+        return Group(
+            title or self._title(), tuple(self._row(key, cells) for key in self._keys), tuple(self._notes(cells))
+        )
+
+    def _title(self) -> str:
+        if not self._dataset:
+            return ", ".join(self._scenes)
+        known = DATASETS[self._dataset]
+        some = f" ({', '.join(self._scenes)})" if len(self._scenes) < len(known.scenes) else ""
+        return known.title + some
+
+    def _cells(self, key: RowKey) -> dict[str, Cell]:
+        # Seeds that have all scenes which are compared.
+        complete = [
+            [one[s] for s in self._common] for one in self._found[key].values() if {*self._common} <= one.keys()
+        ]
+        rows = complete if self._common else []
+        return {name: _cell(rows, COLUMNS[name], self._printed(key, name)) for name in self._experiment.table.columns}
+
+    def _printed(self, key: RowKey, column: str) -> Printed | None:
+        row = self._variants[key[1]].paper_row(key[0])
+        if self._paper is None or not row:
+            return None
+        return self._paper.figure(self._dataset, self._common or self._scenes, row, column)
+
+    def _row(self, key: RowKey, cells: Mapping[RowKey, Mapping[str, Cell]]) -> TableRow:
+        backbone, variant = key
+        base = self._baseline(backbone)
+        time = next((name for name in TIMES if name in cells[key]), None)
+        return TableRow(
+            label=variant if len({b for b, _ in self._keys}) == 1 else f"{variant} ({backbone})",
+            section=self._variants[variant].section,
+            cells=cells[key],
+            speedup=_compare(cells[base].get(time or ""), cells[key].get(time or ""), lambda base, own: base / own),
+            psnr_gain=_compare(cells[base].get("psnr"), cells[key].get("psnr"), lambda base, own: own - base),
+            is_baseline=key == base,
+        )
+
+    def _baseline(self, backbone: str) -> RowKey:
+        """The row that rows of a backbone are compared with: the one marked so, or the first."""
+        own = [key for key in self._keys if key[0] == backbone]
+        return next((key for key in own if self._variants[key[1]].baseline), own[0])
+
+    def _notes(self, cells: Mapping[RowKey, Mapping[str, Cell]]) -> list[str]:
+        notes = []
+        if self._missing:
+            notes.append(f"{self._missing} of {self._total} runs are missing.")
+        if self._common and len(self._common) < len(self._scenes):
+            notes.append(f"Means over {', '.join(self._common)}, the scenes that every row has.")
+        printed = [cell.paper for row in cells.values() for cell in row.values() if cell.paper is not None]
+        if any(not figure.exact for figure in printed):
+            whole = len(DATASETS[self._dataset].scenes)
+            notes.append(f"The paper's figures are means over all {whole} scenes of {DATASETS[self._dataset].title}.")
+        return notes
+
+
+TIMES = ("minutes", "train_seconds", "iteration_ms")
+"""Columns that a speed-up is taken from; the first that a table has."""
+
+
+def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: Printed | None) -> Cell:
+    """A figure from the rows of all scenes, for each seed."""
+    figures = [[_value(row, column) for row in scenes] for scenes in seeds]
+    if not figures or any(not value for scenes in figures for value in scenes):
+        return Cell(paper=paper)
+    if len({len(value) for scenes in figures for value in scenes}) > 1:
+        figures = [[(math.fsum(value),) for value in scenes] for scenes in figures]
+    means = [tuple(_mean(level) for level in zip(*scenes, strict=True)) for scenes in figures]  # by seed, by level
+    sums = [math.fsum(levels) for levels in means]
+    deviation = None
+    if len(sums) > 1:
+        centre = _mean(sums)
+        deviation = math.sqrt(math.fsum((value - centre) ** 2 for value in sums) / (len(sums) - 1))
+    return Cell(tuple(_mean(level) for level in zip(*means, strict=True)), deviation, len(sums), paper)
+
+
+def _value(row: Row, column: Column) -> tuple[float, ...]:
+    """A row's figure, or one for each level, coarsest first; empty when it has none."""
+    for source in column.sources:
+        if not source.endswith(LEVELS):
+            value = row.get(source)
+            if value is not None:
+                return (column.scale * value,)
+            continue
+        levels = sorted((int(name.removeprefix(source)) for name in row if name.startswith(source)), reverse=True)
+        if levels:
+            return tuple(column.scale * row[f"{source}{level}"] for level in levels)
+    return ()
+
+
+LEVELS = "_level_"
+"""End of a source that stands for one column a level."""
+
+
+def _compare(base: Cell | None, own: Cell | None, how: Callable[[float, float], float]) -> Ratio:
+    if base is None or own is None:
+        return Ratio(None, None)
+    measured = how(base.value, own.value) if base.value and own.value else None
+    printed = how(base.paper.value, own.paper.value) if base.paper and own.paper else None
+    return Ratio(measured, printed)
+
+
+def _mean(values: Iterable[float]) -> float:
+    listed = list(values)
+    return math.fsum(listed) / len(listed)

@@ -1,0 +1,236 @@
+"""From a run to the commands that train and measure it, and where scenes and checkouts lie on this machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters.known import recognise_checkout
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
+from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, BACKBONE_PREFIX, parse_resolution
+
+LAPGS = (sys.executable, "-m", "lapgs_plugin")
+SCRIPT = "train.py"
+IMPORTED = "lapgs"
+"""Folder inside a bare run's own where `lapgs import-run` puts what `lapgs eval` reads."""
+REFERENCE_ITERATIONS = 30_000
+"""Length of the run that the schedules of 3DGS codebases are written for."""
+NEVER = "-1"
+RASTER_OPTIONS = ("mult", "antialiasing")
+"""Options of scripts that change what a saved field looks like, see `lapgs import-run --set`."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command of a run.
+
+    Attributes:
+        command: with its arguments.
+        cwd: folder that it is started in.
+    """
+
+    command: tuple[str, ...]
+    cwd: str
+
+
+class Places:
+    """Where scenes, data sets and checkouts lie.
+
+    Args:
+        given: folders by name, from --path.
+        base: what relative paths in the experiment file start from.
+    """
+
+    def __init__(self, given: Mapping[str, Path], base: Path) -> None:
+        self._given, self._base = given, base
+
+    def scene(self, scene: SceneSpec) -> Path:
+        """The folder of a scene that exists.
+
+        Raises:
+            UserInputError: it is given nowhere, or is no folder with these images.
+        """
+        folder = self._find(scene.name)
+        if folder is None and scene.dataset and (root := self._find(scene.dataset)) is not None:
+            folder = root / scene.name
+        if folder is None and scene.folder is not None:
+            folder = self._base / scene.folder
+        names = [scene.name, *([scene.dataset] if scene.dataset else [])]
+        folder = self._existing(f"scene {scene.name}", folder, names)
+        transforms = any(folder.glob("transforms*.json"))
+        if not transforms and not (folder / scene.images).is_dir():
+            raise UserInputError(
+                f"scene {scene.name}: {folder} has no image folder {scene.images}; expected a COLMAP or Blender-style "
+                f'scene; give another folder with --path {scene.name}=FOLDER or set images = "..." in the experiment'
+            )
+        return folder
+
+    def checkout(self, name: str) -> Path:
+        """The folder of a backbone's checkout.
+
+        Raises:
+            UserInputError: it is given nowhere, or has no training script.
+        """
+        folder = self._existing(f"checkout {name}", self._find(name), [name])
+        if not (folder / SCRIPT).is_file():
+            raise UserInputError(
+                f"checkout {name}: {folder} has no {SCRIPT}; give its folder with --path {name}=FOLDER"
+            )
+        return folder
+
+    def _find(self, name: str) -> Path | None:
+        variable = os.environ.get(_variable(name))
+        return self._given.get(name, None if variable is None else Path(variable))
+
+    @staticmethod
+    def _existing(what: str, folder: Path | None, names: Iterable[str]) -> Path:
+        ways = " or ".join(f"--path {name}=FOLDER ({_variable(name)})" for name in names)
+        if folder is None:
+            raise UserInputError(f"{what}: nothing says where it is; give {ways}")
+        if not folder.is_dir():
+            raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
+        return folder.absolute()
+
+
+def _variable(name: str) -> str:
+    """The environment variable that says where something is."""
+    return "LAPGS_" + name.upper().replace("-", "_").replace(".", "_")
+
+
+def run_steps(spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, evaluate: bool) -> list[Step]:
+    """The commands of a run, one after the other.
+
+    Args:
+        spec: the run.
+        scene: its scene's folder.
+        checkout: of its backbone; None for the built-in trainer.
+        folder: that it writes into; what is there is replaced.
+        evaluate: end with `lapgs eval`.
+
+    Raises:
+        UserInputError: the script of a checkout knows no such resolution.
+    """
+    if checkout is None:
+        steps = [Step(_train(spec, scene, folder), str(folder.parent))]
+        measured = folder
+    else:
+        bare = spec.method == "bare"
+        steps = [Step((*_lapgs_run(spec, bare), *_script(spec, scene, checkout, folder)), str(checkout))]
+        measured = folder / IMPORTED if bare else folder
+        if bare and evaluate:
+            steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))
+    if evaluate:
+        steps.append(Step((*LAPGS, "eval", str(measured)), str(folder.parent)))
+    return steps
+
+
+def measured_folder(spec: RunSpec, folder: Path) -> Path:
+    """Where a run's manifest is."""
+    return folder / IMPORTED if spec.checkout is not None and spec.method == "bare" else folder
+
+
+def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
+    assert spec.rasterizer is not None, "checked by the schema"
+    levels = {"levels": 1} if spec.method == "bare" else {}
+    return (
+        *(*LAPGS, "train", str(scene), "--out", str(folder), "--overwrite", "--eval"),
+        *("--iterations", str(spec.iterations), "--resolution", spec.resolution, "--images", spec.images),
+        *("--seed", str(spec.seed), "--rasterizer", spec.rasterizer),
+        *_as_options({**spec.options, **levels}),
+    )
+
+
+def _lapgs_run(spec: RunSpec, bare: bool) -> tuple[str, ...]:
+    if bare:
+        return (*LAPGS, "run", "--off", "--record")
+    return (*LAPGS, "run", "--overwrite", "--seed", str(spec.seed), *_as_options(spec.options))
+
+
+def _script(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:
+    return (
+        *(str(checkout / SCRIPT), "-s", str(scene), "-i", spec.images, "-m", str(folder), "--eval"),
+        *("-r", _backbone_resolution(spec, scene)),
+        *("--test_iterations", NEVER, "--checkpoint_iterations", NEVER, "--save_iterations", str(spec.iterations)),
+        *_schedule(spec.iterations),
+        *spec.arguments,
+    )
+
+
+def _schedule(iterations: int) -> tuple[str, ...]:
+    """The family's schedule for another number of iterations: all shrinks or grows but the intervals."""
+    if iterations == REFERENCE_ITERATIONS:
+        return ()
+    start = max(1, round(500 * min(1.0, iterations / REFERENCE_ITERATIONS)))
+    return (
+        *("--iterations", str(iterations), "--position_lr_max_steps", str(iterations)),
+        *("--densify_from_iter", str(start), "--densify_until_iter", str(iterations // 2)),
+    )
+
+
+def _import(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:
+    known = recognise_checkout(checkout)
+    named = () if known is None or known.key is None else ("--backbone", known.key)
+    return (
+        *(*LAPGS, "import-run", str(folder), "--out", str(folder / IMPORTED), "--scene", str(scene), "--overwrite"),
+        *(*named, *_raster_options(spec.arguments)),
+    )
+
+
+def _raster_options(arguments: Sequence[str]) -> list[str]:
+    """Those of the script's arguments that a saved field is rendered with, the last of each kind."""
+    values: dict[str, str] = {}
+    for word, following in zip(arguments, [*arguments[1:], "--"], strict=True):
+        name = word.removeprefix("--")
+        if word.startswith("--") and name in RASTER_OPTIONS:
+            values[name] = "true" if following.startswith("--") else following
+    return [text for name, value in values.items() for text in ("--set", f"{name}={value}")]
+
+
+def _as_options(options: Mapping[str, Any]) -> list[str]:
+    words = []
+    for name, value in options.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            words += [f"--{option}", str(value)]
+    return words
+
+
+def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
+    """What a 3DGS codebase's -r is for one of our resolutions.
+
+    Raises:
+        UserInputError: it has none.
+    """
+    text = spec.resolution
+    if text.startswith(BACKBONE_PREFIX):
+        return text.removeprefix(BACKBONE_PREFIX)
+    rule = parse_resolution(text)
+    if rule.width is None:
+        divisor = 1 / rule.fraction
+        if divisor not in BACKBONE_DIVISORS:
+            raise UserInputError(
+                f"resolution {text!r} for scene {spec.scene}: the script of a checkout knows 1k, 2k, 4k, widths and "
+                f"{', '.join(str(Fraction(1, d)) for d in BACKBONE_DIVISORS)}"
+            )
+        return str(int(divisor))
+    width = _first_width(scene / spec.images)
+    return str(rule.size_for(width, 1)[0]) if width > rule.width else "1"
+
+
+def _first_width(images: Path) -> int:
+    """Width of a scene's first image, in pixels."""
+    from PIL import Image
+
+    for path in sorted(images.rglob("*")):
+        if path.is_file() and path.suffix.lower() in Image.registered_extensions():
+            with Image.open(path) as image:
+                return image.width
+    raise UserInputError(f"{images} holds no image; expected the photos of a scene")

@@ -1,0 +1,185 @@
+"""From an experiment to its runs: scenes x backbones x variants x seeds, in the order in which they are started."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.schema import Backbone, Experiment, SampleScene, Scenes, Variant, nearest
+from lapgs_plugin.experiments.standard import DATASETS, PRESETS
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """One scene of an experiment.
+
+    Attributes:
+        name: of the scene.
+        dataset: that it belongs to, "" for one's own.
+        folder: as written in the experiment, relative to its file; None where only --path or a variable says it.
+        sample: how to make it, if it is made.
+        resolution, images: see `schema.Scenes`.
+    """
+
+    name: str
+    dataset: str
+    folder: str | None
+    sample: SampleScene | None
+    resolution: str
+    images: str
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One training run: everything that decides its result besides the machine and where files lie.
+
+    Attributes:
+        scene, dataset, images, resolution: what it is trained on.
+        backbone: its name in the experiment.
+        rasterizer, checkout: one of them, see `schema.Backbone`.
+        method: "hierarchy" or "bare".
+        iterations, seed: of the whole run.
+        options: of `lapgs train` or `lapgs run`.
+        arguments: of the checkout's script.
+    """
+
+    scene: str
+    dataset: str
+    images: str
+    resolution: str
+    backbone: str
+    rasterizer: str | None
+    checkout: str | None
+    method: str
+    iterations: int
+    seed: int
+    options: Mapping[str, Any]
+    arguments: Sequence[str]
+
+    @property
+    def run_id(self) -> str:
+        """Readable, and another one for every difference. Variants that are trained alike share their runs."""
+        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
+        setting = "".join(f"-{name}{value}" for name, value in self.options.items())[:40]
+        words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
+        return re.sub(r"[^A-Za-z0-9.-]+", "_", words) + f"-{digest}"
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run and the variant that asks for it."""
+
+    spec: RunSpec
+    variant: str
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of an experiment is run; None leaves the file's.
+
+    Attributes:
+        scenes, backbones, variants: names of those to run.
+        seeds: instead of the file's.
+        iterations: instead of the file's, for every variant without its own.
+    """
+
+    scenes: Collection[str] | None = None
+    backbones: Collection[str] | None = None
+    variants: Collection[str] | None = None
+    seeds: Sequence[int] | None = None
+    iterations: int | None = None
+
+
+def scenes_of(experiment: Experiment, selection: Selection) -> list[SceneSpec]:
+    """The selected scenes in the file's order.
+
+    Raises:
+        UserInputError: a selected one is not in the file.
+    """
+    found = [scene for entry in experiment.scenes for scene in _scenes(entry)]
+    return _selected(found, [scene.name for scene in found], selection.scenes, "--scene")
+
+
+def plan_runs(experiment: Experiment, selection: Selection) -> list[PlannedRun]:
+    """All runs in their order: for every seed and scene all variants in turn, each time beginning with another one.
+
+    A machine that slows down or warms up in the course of an experiment so slows down all variants alike.
+
+    Raises:
+        UserInputError: something selected is not in the file.
+    """
+    backbones = _selected(
+        list(experiment.backbones.items()), list(experiment.backbones), selection.backbones, "--backbone"
+    )
+    variants = _selected(
+        experiment.variants, [variant.name for variant in experiment.variants], selection.variants, "--variant"
+    )
+    pairs = [
+        (name, backbone, variant)
+        for variant in variants
+        for name, backbone in backbones
+        if not variant.backbones or name in variant.backbones
+    ]
+    if not pairs:
+        raise UserInputError("no run is left: the selected variants are not for the selected backbones")
+    planned: list[PlannedRun] = []
+    rounds = 0
+    for seed in experiment.seeds if selection.seeds is None else selection.seeds:
+        for scene in scenes_of(experiment, selection):
+            first = rounds % len(pairs)
+            for name, backbone, variant in (*pairs[first:], *pairs[:first]):
+                spec = _spec(experiment, selection, scene, name, backbone, variant, seed)
+                planned.append(PlannedRun(spec, variant.name))
+            rounds += 1
+    return planned
+
+
+def _spec(
+    experiment: Experiment,
+    selection: Selection,
+    scene: SceneSpec,
+    name: str,
+    backbone: Backbone,
+    variant: Variant,
+    seed: int,
+) -> RunSpec:
+    preset = PRESETS[backbone.preset].arguments(scene.name) if backbone.preset else []
+    # What sets up a hierarchy means nothing to a script that runs by itself.
+    options = {**backbone.options, **variant.options} if backbone.checkout is None or variant.method != "bare" else {}
+    return RunSpec(
+        scene=scene.name,
+        dataset=scene.dataset,
+        images=scene.images,
+        resolution=variant.resolution or scene.resolution,
+        backbone=name,
+        rasterizer=backbone.rasterizer,
+        checkout=backbone.checkout,
+        method=variant.method,
+        iterations=variant.iterations or selection.iterations or experiment.iterations,
+        seed=seed,
+        options=options,
+        arguments=[] if backbone.checkout is None else [*preset, *backbone.arguments, *variant.arguments],
+    )
+
+
+def _scenes(entry: Scenes) -> Iterator[SceneSpec]:
+    if entry.dataset is None:
+        assert entry.name is not None, "checked by the schema"
+        yield SceneSpec(entry.name, "", entry.path, entry.sample, entry.resolution, entry.images)
+        return
+    known = DATASETS[entry.dataset].scenes
+    for name in entry.only or known:
+        images = known[name] if entry.images == "downscaled" else entry.images
+        yield SceneSpec(name, entry.dataset, None, None, entry.resolution, images)
+
+
+def _selected(items: Sequence[Any], names: Sequence[str], wanted: Collection[str] | None, option: str) -> list[Any]:
+    for name in wanted or ():
+        if name not in names:
+            raise UserInputError(f"{option} {name}: not in the experiment; {nearest(name, set(names))}")
+    return [item for item, name in zip(items, names, strict=True) if wanted is None or name in wanted]

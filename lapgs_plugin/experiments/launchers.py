@@ -1,0 +1,220 @@
+"""Where workers run: in threads of this process, as jobs of Slurm (through submitit), or as tasks of Ray.
+
+A launcher starts workers and says whether any is left. What they do to which run is between them and the store, so a
+worker that dies anywhere is made up for by another one, or by the next `lapgs bench`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.experiments.worker import Slot, work
+
+LAUNCHERS = ("local", "slurm", "ray")
+
+
+@dataclass(frozen=True)
+class WorkOrder:
+    """What workers are started for.
+
+    Attributes:
+        store: the store of results, on a disk that all workers see.
+        run_ids: the runs to do.
+        workers: how many at once; None leaves it to the launcher.
+        gpus: local only: names for CUDA_VISIBLE_DEVICES; None finds them.
+        logs: folder for what workers themselves print.
+        options: of the engine behind the launcher.
+    """
+
+    store: Path
+    run_ids: Sequence[str]
+    workers: int | None
+    gpus: Sequence[str] | None
+    logs: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Launcher(ABC):
+    """Workers of one engine, started when it is made."""
+
+    @abstractmethod
+    def running(self) -> bool:
+        """Whether a worker is running or waits to be started."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End all workers and wait for them; runs they had are given back, or found abandoned later."""
+
+    def troubles(self) -> list[str]:
+        """What went wrong with workers themselves, one line each."""
+        return []
+
+
+def launch(name: str, order: WorkOrder) -> Launcher:
+    """Start workers.
+
+    Args:
+        name: one of `LAUNCHERS`.
+        order: for what.
+
+    Raises:
+        UserInputError: the name or one of the options is not known.
+        MissingExtraError: the engine is not installed.
+    """
+    kinds: dict[str, Callable[[WorkOrder], Launcher]] = {
+        "local": LocalLauncher,
+        "slurm": SlurmLauncher,
+        "ray": RayLauncher,
+    }
+    if name not in kinds:
+        raise UserInputError(f"--launcher {name}: expected {', '.join(LAUNCHERS)}")
+    if order.gpus is not None and name != "local":
+        raise UserInputError(f"--gpus: {name} deals out GPUs itself; leave it out")
+    return kinds[name](order)
+
+
+class LocalLauncher(Launcher):
+    """Threads of this process: one a GPU, or one alone without GPUs. Cores are shared out evenly."""
+
+    def __init__(self, order: WorkOrder) -> None:
+        if order.options:
+            raise UserInputError(f"--launcher-option {next(iter(order.options))}: the local launcher has none")
+        self._stop = threading.Event()
+        self._errors: list[str] = []
+        self._threads = [
+            threading.Thread(target=partial(self._work, order, slot), daemon=True) for slot in _slots(order)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def running(self) -> bool:
+        return any(thread.is_alive() for thread in self._threads)
+
+    def stop(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def troubles(self) -> list[str]:
+        return self._errors
+
+    def _work(self, order: WorkOrder, slot: Slot) -> None:
+        try:
+            work(order.store, order.run_ids, slot, self._stop)
+        except Exception as error:  # said by whoever follows; a thread's own traceback would cut into the display
+            self._errors.append(f"worker on {slot.gpu or 'the processor'}: {type(error).__name__}: {error}")
+
+
+class SlurmLauncher(Launcher):
+    """Jobs of Slurm, one a worker, through submitit. Options are submitit's, such as slurm_partition=gpu.
+
+    The option cluster=local runs the same jobs on this machine, for trying it out.
+    """
+
+    def __init__(self, order: WorkOrder) -> None:
+        try:
+            import submitit
+        except ImportError as error:
+            raise MissingExtraError(
+                "--launcher slurm needs submitit, which is not installed; pip install 'lapgs_plugin[slurm]'"
+            ) from error
+        options = dict(order.options)
+        cluster = options.pop("cluster", "slurm")
+        if cluster == "slurm" and shutil.which("sbatch") is None:
+            raise UserInputError("--launcher slurm: there is no sbatch on this machine; start it on a login node")
+        try:
+            executor = submitit.AutoExecutor(folder=order.logs, cluster=cluster)
+            executor.update_parameters(**{"timeout_min": 24 * 60, "name": "lapgs-bench", **options})
+        except (NameError, TypeError, ValueError, RuntimeError, AssertionError) as error:
+            raise UserInputError(f"--launcher-option: {error}") from error
+        self._failed: list[str] = []
+        self._jobs = [executor.submit(work, order.store, list(order.run_ids)) for _ in range(order.workers or 1)]
+
+    def running(self) -> bool:
+        return not all(job.done() for job in self._jobs)
+
+    def stop(self) -> None:
+        for job in self._jobs:
+            job.cancel(check=False)
+
+    def troubles(self) -> list[str]:
+        failed = [job for job in self._jobs if job.done() and job.exception() is not None]
+        return [f"job {job.job_id}: {str(job.exception()).strip().splitlines()[-1]}" for job in failed]
+
+
+class RayLauncher(Launcher):
+    """Tasks of Ray, one a worker, on the cluster this machine belongs to or a new local one.
+
+    Options: address, num_gpus and num_cpus of a worker. Ray starts a task whose process died again.
+    """
+
+    def __init__(self, order: WorkOrder) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise MissingExtraError(
+                "--launcher ray needs Ray, which is not installed; pip install 'lapgs_plugin[ray]'"
+            ) from error
+        options = dict(order.options)
+        if unknown := sorted(options.keys() - {"address", "num_gpus", "num_cpus"}):
+            raise UserInputError(f"--launcher-option {unknown[0]}: Ray takes address, num_gpus and num_cpus")
+        self._ray = ray
+        self._started = not ray.is_initialized()
+        if self._started:
+            ray.init(address=options.get("address"), log_to_driver=False, include_dashboard=False)
+        resources = ray.cluster_resources()
+        gpus = float(options.get("num_gpus", 1 if resources.get("GPU") else 0))
+        cpus = float(options.get("num_cpus", 1))
+        count = order.workers or max(1, int(resources["GPU"] / gpus if gpus else resources["CPU"] / cpus))
+        task = ray.remote(num_gpus=gpus, num_cpus=cpus, max_retries=3)(work)
+        self._tasks = [task.remote(order.store, list(order.run_ids)) for _ in range(count)]
+
+    def running(self) -> bool:
+        return bool(self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=0)[1])
+
+    def stop(self) -> None:
+        for task in self._tasks:
+            self._ray.cancel(task, force=True)
+        if self._started:
+            self._ray.shutdown()
+
+    def troubles(self) -> list[str]:
+        done, _ = self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=0)
+        lines = []
+        for task in done:
+            try:
+                self._ray.get(task)
+            except Exception as error:
+                lines.append(f"a worker: {str(error).strip().splitlines()[-1]}")
+        return lines
+
+
+def _slots(order: WorkOrder) -> list[Slot]:
+    """A part of this machine for each worker."""
+    gpus = visible_gpus() if order.gpus is None else list(order.gpus)
+    count = order.workers or max(1, len(gpus))
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    shares = [tuple(cores[i * len(cores) // count : (i + 1) * len(cores) // count]) for i in range(count)]
+    return [Slot(gpus[i % len(gpus)] if gpus else None, share) for i, share in enumerate(shares)]
+
+
+def visible_gpus() -> list[str]:
+    """What to put into CUDA_VISIBLE_DEVICES to get each of this machine's GPUs."""
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name.strip()]
+    if shutil.which("nvidia-smi") is None:
+        return []
+    answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False, timeout=60)
+    lines = [line for line in answer.stdout.splitlines() if line.startswith("GPU ")]
+    return [str(number) for number in range(len(lines))]

@@ -1,0 +1,129 @@
+"""From a finished run's folder to its row of results: flat, one value a column, units in the column's name.
+
+    run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    what it is of
+    psnr, ssim, lpips_*, fps            and every other single figure of metrics.json
+    measured_by                         "lapgs eval" or "training": who measured the images
+    train_seconds, overhead_seconds, overhead_<what>_seconds, wall_seconds
+    gaussians, gaussians_level_<l>      in the archived fields; peak_gaussians, mean_gaussians while training
+    peak_memory_bytes, peak_memory_without_images_bytes    on a GPU
+    <part>_ms, iteration_ms             milliseconds an iteration, where --breakdown measured them
+    lapgs_version, torch, gpu, processor, host, python, started, attempt, folder
+
+A row lacks what was not measured.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.archive import LevelRecord, RunArchive
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.experiments.commands import measured_folder
+from lapgs_plugin.experiments.expansion import RunSpec
+from lapgs_plugin.experiments.store import Job
+
+EVALUATED, RECORDED = "lapgs eval", "training"
+BARE_RECORD = "lapgs_record.json"
+"""What `lapgs run --off --record` writes into the script's output folder."""
+
+
+def result_row(job: Job) -> dict[str, Any]:
+    """The figures of a finished run; `worker` adds where and when it ran.
+
+    Raises:
+        RunFolderError: the run's folder lacks what its commands should have written.
+    """
+    folder = measured_folder(job.spec, Path(job.folder))
+    row = {**_identity(job.spec, job.run_id), "measured_by": EVALUATED if job.evaluate else RECORDED}
+    if not job.evaluate and folder != Path(job.folder):
+        return {**row, **_bare_figures(Path(job.folder))}
+    archive = RunArchive.open(folder)
+    manifest = archive.manifest
+    if not manifest.complete:
+        raise RunFolderError(f"{folder} is not complete, though its command ended well; look at {job.log}")
+    return {**row, **_figures_of_records(manifest.records), **_image_figures(archive, job.evaluate)}
+
+
+def _identity(spec: RunSpec, run_id: str) -> dict[str, Any]:
+    return {
+        "run": run_id,
+        **{
+            name: getattr(spec, name)
+            for name in ("scene", "dataset", "images", "resolution", "backbone", "method", "iterations", "seed")
+        },
+        "options": json.dumps(dict(spec.options), sort_keys=True),
+        "arguments": json.dumps(list(spec.arguments)),
+    }
+
+
+def _image_figures(archive: RunArchive, evaluate: bool) -> dict[str, Any]:
+    """How good its images are."""
+    if not evaluate:
+        recorded = [entry["psnr"] for entry in archive.history() if entry.get("psnr") is not None]
+        return {"psnr": recorded[-1]} if recorded else {}
+    metrics = archive.metrics()
+    if metrics is None:
+        raise RunFolderError(f"{archive.path()} has no metrics.json, though `lapgs eval` ended well; run it again")
+    return {
+        name: value for name, value in metrics.items() if isinstance(value, (int, float, str)) and name != "rasterizer"
+    }
+
+
+def _figures_of_records(records: Sequence[LevelRecord]) -> dict[str, Any]:
+    """What the manifest says about training."""
+    overhead = _sums(record.overhead_seconds for record in records)
+    iterations = sum(record.iterations for record in records)
+    row: dict[str, Any] = {
+        "train_seconds": math.fsum(record.train_seconds for record in records),
+        "overhead_seconds": math.fsum(overhead.values()),
+        **{f"overhead_{name}_seconds": seconds for name, seconds in overhead.items()},
+        "gaussians": sum(record.num_gaussians for record in records),
+        **{f"gaussians_level_{record.level}": record.num_gaussians for record in records},
+        "peak_gaussians": max(record.peak_gaussians for record in records),
+    }
+    means = [(record.mean_gaussians, record.iterations) for record in records]
+    if iterations and all(mean is not None for mean, _ in means):
+        row["mean_gaussians"] = math.fsum((mean or 0.0) * count for mean, count in means) / iterations
+    if memory := [record.memory_bytes for record in records if record.memory_bytes]:
+        row["peak_memory_bytes"] = max(each["peak"] for each in memory)
+        row["peak_memory_without_images_bytes"] = max(each["peak"] - each["images"] for each in memory)
+    if parts := _sums(record.breakdown_seconds for record in records):
+        row |= {f"{name}_ms": 1e3 * seconds / iterations for name, seconds in parts.items()}
+        row["iteration_ms"] = 1e3 * math.fsum(parts.values()) / iterations
+    return row
+
+
+def _bare_figures(folder: Path) -> dict[str, Any]:
+    """What was noted while a script ran by itself."""
+    path = folder / BARE_RECORD
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(
+            f"{path} cannot be read ({error}); expected what `lapgs run --off --record` writes"
+        ) from error
+    count = values["num_gaussians"]
+    row = {
+        "train_seconds": values["train_seconds"],
+        "gaussians": count,
+        "gaussians_level_0": count,
+        **{name: values[name] for name in ("peak_gaussians", "mean_gaussians")},
+    }
+    if values["psnr"] is not None:
+        row["psnr"] = values["psnr"]
+    if memory := values["memory_bytes"]:
+        row["peak_memory_bytes"] = memory["peak"]
+        row["peak_memory_without_images_bytes"] = memory["peak"] - memory["images"]
+    return row
+
+
+def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    total: dict[str, float] = {}
+    for each in parts:
+        for name, value in each.items():
+            total[name] = total.get(name, 0.0) + value
+    return total

@@ -1,0 +1,180 @@
+"""A table of results as Markdown and as LaTeX: each measured figure with the paper's beside it, in its layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lapgs_plugin.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
+
+GROUPS_BESIDE = 3
+"""Data sets or scenes side by side in a LaTeX table, as in the paper."""
+ARROWS = {"lower": "↓", "higher": "↑", "": ""}
+TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
+SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
+NOTHING = "-"
+
+
+def markdown(table: ResultTable) -> str:
+    """The table for people and for a repository's pages."""
+    lines = [f"# {table.title}", "", _legend(table), ""]
+    for group in (*table.groups, *table.scenes):
+        lines += [f"## {group.title}", ""]
+        lines += (
+            _markdown_transposed(group, table.columns) if table.transposed else _markdown_rows(group, table.columns)
+        )
+        lines += ["", *group.notes, *([""] if group.notes else [])]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def latex(table: ResultTable) -> str:
+    r"""The table for a paper: needs booktabs, and prints the paper's figures through \paper{...}."""
+    parts = [
+        "% Needs \\usepackage{booktabs,multirow}. Measured figures; the paper's in small print.",
+        r"\providecommand{\paper}[1]{{\scriptsize\,[#1]}}",
+    ]
+    parts += _latex_table(table, table.groups, table.title, table.label)
+    if table.scenes:
+        parts += ["", *_latex_table(table, table.scenes, f"{table.title}, scene by scene", f"{table.label}-scenes")]
+    return "\n".join(parts) + "\n"
+
+
+def _legend(table: ResultTable) -> str:
+    seeds = max((cell.seeds for group in table.groups for row in group.rows for cell in row.cells.values()), default=0)
+    spread = f"mean ± sample deviation over {seeds} seeds" if seeds > 1 else "one seed"
+    has_paper = any(c.paper for group in table.groups for row in group.rows for c in row.cells.values())
+    paper = "; the paper's figure in brackets" if has_paper else ""
+    bases = {row.label for group in table.groups for row in group.rows if row.is_baseline}
+    return f"Each figure is a {spread}{paper}. Compared with: {', '.join(sorted(bases))}."
+
+
+def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
+    headings = [COLUMNS[name].heading + ARROWS[COLUMNS[name].better] for name in columns]
+    yield _markdown_line(["", *headings, SPEEDUP, GAIN])
+    yield _markdown_line(["---"] * (len(columns) + 3))
+    section = ""
+    for row in group.rows:
+        if row.section != section:
+            section = row.section
+            yield _markdown_line([f"**{section}**", *[""] * (len(columns) + 2)])
+        yield _markdown_line([row.label, *(_text(row.cells[name], COLUMNS[name]) for name in columns), *_ratios(row)])
+
+
+def _markdown_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
+    yield _markdown_line(["", *(row.label for row in group.rows)])
+    yield _markdown_line(["---"] * (len(group.rows) + 1))
+    for name in columns:
+        yield _markdown_line([COLUMNS[name].heading, *(_text(row.cells[name], COLUMNS[name]) for row in group.rows)])
+
+
+def _markdown_line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _ratios(row: TableRow) -> list[str]:
+    if row.is_baseline:
+        return ["", ""]
+    return [_ratio(row.speedup, "{:.2f}x"), _ratio(row.psnr_gain, "{:+.2f}")]
+
+
+def _ratio(ratio: Ratio, pattern: str) -> str:
+    measured = NOTHING if ratio.measured is None else pattern.format(ratio.measured)
+    return measured if ratio.paper is None else f"{measured} [{pattern.format(ratio.paper)}]"
+
+
+def _text(cell: Cell, column: Column) -> str:
+    """0.71/0.87 ±0.01 [0.70/0.88]"""
+    measured = _number(cell.values, column) or NOTHING
+    if cell.deviation is not None:
+        measured += f" ±{cell.deviation:.{column.decimals}f}"
+    return measured if cell.paper is None else f"{measured} [{_number(cell.paper.values, column)}]"
+
+
+def _number(values: Sequence[float], column: Column) -> str:
+    return "/".join(f"{value:,.{column.decimals}f}" for value in values)
+
+
+def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label: str) -> list[str]:
+    lines = [
+        r"\begin{table*}[t]",
+        r"\centering",
+        rf"\caption{{{_escaped(title)}.}}",
+        rf"\label{{tab:{label}}}",
+        r"\small",
+    ]
+    if table.transposed:
+        for group in groups:
+            lines += _latex_transposed(group, table.columns)
+    else:
+        lines += _latex_blocks(groups, table.columns)
+    notes = dict.fromkeys(note for group in groups for note in group.notes)
+    return [*lines, *(rf"\par\footnotesize {_escaped(note)}" for note in notes), r"\end{table*}"]
+
+
+def _latex_blocks(groups: Sequence[Group], columns: Sequence[str]) -> Iterator[str]:
+    """Groups side by side, in blocks below each other."""
+    width = len(columns) + 2
+    beside = min(GROUPS_BESIDE, len(groups))
+    yield rf"\begin{{tabular}}{{l{('c' * width) * beside}}}"
+    yield r"\toprule"
+    for start in range(0, len(groups), beside):
+        block = groups[start : start + beside]
+        if start:
+            yield r"\midrule\midrule"
+        titles = [rf"\multicolumn{{{width}}}{{c}}{{\textbf{{{_escaped(group.title)}}}}}" for group in block]
+        yield " & ".join(["", *titles]) + r" \\"
+        yield "".join(rf"\cmidrule(lr){{{2 + i * width}-{1 + (i + 1) * width}}}" for i in range(len(block)))
+        headings = [_escaped(COLUMNS[name].heading) + TEX_ARROWS[COLUMNS[name].better] for name in columns]
+        yield " & ".join(["", *[*headings, SPEEDUP, r"$\Delta$PSNR"] * len(block)]) + r" \\"
+        yield r"\midrule"
+        yield from _latex_rows(block, columns, 1 + width * beside)
+    yield r"\bottomrule"
+    yield r"\end{tabular}"
+
+
+def _latex_rows(block: Sequence[Group], columns: Sequence[str], width: int) -> Iterator[str]:
+    by_label = [{row.label: row for row in group.rows} for group in block]
+    rows = {row.label: row for group in block for row in group.rows}
+    section = ""
+    for label, row in rows.items():
+        if row.section != section:
+            section = row.section
+            yield rf"\multicolumn{{{width}}}{{l}}{{\textbf{{{_escaped(section)}}}}} \\"
+        cells = []
+        for found in by_label:
+            own = found.get(label)
+            if own is None:
+                cells += [""] * (len(columns) + 2)
+                continue
+            cells += [_latex_text(own.cells[name], COLUMNS[name]) for name in columns]
+            cells += [_latex_marked(text) for text in _ratios(own)]
+        yield " & ".join([_escaped(label), *cells]) + r" \\"
+
+
+def _latex_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
+    yield rf"\begin{{tabular}}{{l{'c' * len(group.rows)}}}"
+    yield r"\toprule"
+    yield " & ".join([_escaped(group.title), *(_escaped(row.label) for row in group.rows)]) + r" \\"
+    yield r"\midrule"
+    for name in columns:
+        cells = [_latex_text(row.cells[name], COLUMNS[name]) for row in group.rows]
+        yield " & ".join([_escaped(COLUMNS[name].heading), *cells]) + r" \\"
+    yield r"\bottomrule"
+    yield r"\end{tabular}"
+
+
+def _latex_text(cell: Cell, column: Column) -> str:
+    return _latex_marked(_text(cell, column))
+
+
+def _latex_marked(text: str) -> str:
+    r"""1.0 ±0.1 [2.0] -> 1.0 $\pm$0.1\paper{2.0}"""
+    measured, bracket, paper = text.partition(" [")
+    tex = _escaped(measured).replace("±", r"$\pm$")
+    return tex + (rf"\paper{{{_escaped(paper.removesuffix(']'))}}}" if bracket else "")
+
+
+def _escaped(text: str) -> str:
+    text = text.replace("N_GS", "@")
+    for special in "&%#_":
+        text = text.replace(special, f"\\{special}")
+    return text.replace("@", r"$N_{\mathrm{GS}}$").replace("rho", r"$\rho$")

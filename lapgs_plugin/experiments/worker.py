@@ -1,0 +1,177 @@
+"""A worker: takes runs from the store until none is left, each in processes of its own."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from lapgs_plugin import __version__
+from lapgs_plugin.environment import versions
+from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.experiments.commands import Step
+from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
+
+RENEW_EVERY = LEASE / 8
+LAST_LINES = 12
+"""Lines of a failed run's log that are reported."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """The part of a machine that a worker uses.
+
+    Attributes:
+        gpu: for CUDA_VISIBLE_DEVICES; None leaves it as it is.
+        cores: processor numbers; empty means all.
+    """
+
+    gpu: str | None = None
+    cores: tuple[int, ...] = ()
+
+
+class RunStopped(Exception):
+    """The run was killed: on request, or because its claim was lost."""
+
+
+def work(
+    store_path: Path, run_ids: Collection[str], slot: Slot | None = None, stop: threading.Event | None = None
+) -> int:
+    """Run what can be claimed of these runs.
+
+    Args:
+        store_path: of the results.
+        run_ids: those that may be taken.
+        slot: what to run them on.
+        stop: when set, the current run is killed and given back.
+
+    Returns:
+        How many were finished, well or not.
+    """
+    store = ResultStore(store_path)
+    slot, stop = slot or Slot(), stop or threading.Event()
+    finished = 0
+    while not stop.is_set() and (claim := store.claim(run_ids)) is not None:
+        try:
+            row = _run(store, claim, slot, stop)
+        except RunStopped:
+            store.release(claim)
+            continue
+        except LapgsError as error:
+            store.fail(claim, str(error))
+        else:
+            store.record(claim, row)
+        finished += 1
+    return finished
+
+
+class RunFailedError(LapgsError):
+    """A command of a run ended badly; the message has the end of its log."""
+
+
+def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
+    """Train and measure one run.
+
+    Raises:
+        RunStopped: it was killed.
+        LapgsError: it failed.
+    """
+    from lapgs_plugin.experiments.rows import result_row
+
+    job = claim.job
+    folder = Path(job.folder)
+    if folder.exists():  # what an earlier attempt left
+        shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    log = Path(job.log)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    started, clock = datetime.now(timezone.utc).isoformat(timespec="seconds"), time.perf_counter()
+    with log.open("wb") as stream:
+        for step in job.steps:
+            if code := _execute(step, stream, store, claim, slot, stop):
+                stream.flush()
+                raise RunFailedError(f"exit code {code}; {log} ends with\n{last_lines(log)}")
+    return {
+        **result_row(job),
+        "wall_seconds": time.perf_counter() - clock,
+        "lapgs_version": __version__,
+        "torch": versions()["torch"],
+        "gpu": gpu_name(slot.gpu),
+        "processor": versions()["processor"],
+        "host": socket.gethostname(),
+        "python": platform.python_version(),
+        "started": started,
+        "attempt": claim.number,
+        "folder": job.folder,
+    }
+
+
+def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> int:
+    """One command, on a leash; its exit code.
+
+    Raises:
+        RunStopped: it was killed.
+    """
+    log.write(f"$ {' '.join(step.command)}\n".encode())
+    log.flush()
+    environment = dict(os.environ)
+    if slot.gpu is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = slot.gpu
+    # The same package as here, also where it is found by the current folder alone.
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    environment["PYTHONUNBUFFERED"] = "1"
+    cores = ",".join(map(str, slot.cores)) or "-"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lapgs_plugin.experiments.leash", cores, *step.command],
+        cwd=step.cwd,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,  # Ctrl-C in the terminal is for the worker, which then lets go of the leash
+    )
+    assert process.stdin is not None
+    try:
+        next_renewal = time.monotonic() + RENEW_EVERY
+        while True:
+            try:
+                return process.wait(timeout=0.2)
+            except subprocess.TimeoutExpired:
+                pass
+            if stop.is_set():
+                raise RunStopped
+            if time.monotonic() >= next_renewal:
+                if not store.renew(claim):
+                    raise RunStopped
+                next_renewal = time.monotonic() + RENEW_EVERY
+    finally:
+        process.stdin.close()
+        process.wait()
+
+
+def last_lines(log: Path) -> str:
+    """The end of a log, progress bars left out."""
+    text = log.read_text(encoding="utf-8", errors="replace")
+    lines = [line.rsplit("\r", 1)[-1].rstrip() for line in re.split(r"\n", text)]
+    return "\n".join([line for line in lines if line][-LAST_LINES:])
+
+
+def gpu_name(index: str | None) -> str:
+    """Name of the GPU that a slot uses, "" without one."""
+    if shutil.which("nvidia-smi") is None:
+        return ""
+    chosen = index or os.environ.get("CUDA_VISIBLE_DEVICES") or "0"
+    command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", "-i", chosen.split(",")[0]]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    return answer.stdout.strip() if answer.returncode == 0 else ""
