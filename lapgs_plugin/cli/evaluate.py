@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SHOWN_VIEWS = 12
 """How many views the terminal shows; metrics.json and the report hold all."""
@@ -20,58 +23,117 @@ def evaluate(
     scene: Annotated[
         Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
     ] = None,
+    lpips: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VARIANTS",
+            help="Which LPIPS to measure: some of vgg, alex, squeeze and vgg_3dgs (VGG as 3DGS codebases compute and "
+            "print it) with commas between, or none. Default: those of the named weights, or else both of VGG.",
+        ),
+    ] = None,
+    lpips_weights: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Weights of one network in torchvision's layout, .pth or .safetensors; once for each network. "
+            "Default: what torchvision downloaded at some time. Nothing is ever downloaded here."
+        ),
+    ] = None,
     device: DeviceOption = "auto",
     rasterizer: RasterizerOption = "auto",
 ) -> None:
     """Measure RUN on its held-out views, print the figures and write them to RUN/metrics.json.
 
-    PSNR and SSIM are means over the views, of float images clamped to [0, 1], as 3DGS reports them. Without held-out
-    views (`lapgs train --eval`) the training views are measured, which flatters. Times are those of training: the
-    optimization, and everything around it beside it.
+    PSNR, SSIM and LPIPS are means over the views, of float images clamped to [0, 1], as 3DGS reports them. LPIPS needs
+    weights of its networks; without them its column says so. Without held-out views (`lapgs train --eval`) the training
+    views are measured, which flatters. Times are those of training: the optimization, and everything around it beside
+    it. Frames a second are those of the composed image.
     """
     from lapgs_plugin.archive import METRICS, RunArchive
     from lapgs_plugin.evaluation.figures import evaluate_run
+    from lapgs_plugin.evaluation.lpips import LpipsRequest
 
+    wanted = LpipsRequest.parse(lpips, lpips_weights or ())
     archive = RunArchive.open(run)
     show_log()
-    metrics = evaluate_run(archive, scene, device=device, rasterizer=rasterizer)
+    metrics = evaluate_run(archive, scene, device=device, rasterizer=rasterizer, lpips=wanted)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
 
 
 def _print(metrics: dict[str, Any]) -> None:
-    from rich import box
     from rich.console import Console
+
+    console = Console()
+    _print_views(console, metrics)
+    _print_levels(console, metrics)
+    if metrics["breakdown_seconds"]:
+        _print_breakdown(console, metrics)
+    _print_summary(console, metrics)
+
+
+def _print_views(console: Console, metrics: dict[str, Any]) -> None:
+    from rich import box
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console()
-    by_view = Table("view", "PSNR (dB)", "SSIM", box=box.SIMPLE_HEAD)
+    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+
+    measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
+    missing = list(metrics["lpips_missing"])
+    headings = [f"LPIPS ({title_of(name)})" for name in (*measured, *missing)]
+    table = Table("view", "PSNR (dB)", "SSIM", *headings, box=box.SIMPLE_HEAD)
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
-        by_view.add_row(escape(view["name"]), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
+        distances = [*(f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured), *("not measured" for _ in missing)]
+        table.add_row(escape(view["name"]), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}", *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
-    console.print(f"[bold]Views, worst first[/bold]{more}", by_view, highlight=False)
+    console.print(f"[bold]Views, worst first[/bold]{more}", table, highlight=False)
 
-    by_level = Table("level", "size", "steps", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD)
+
+def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table("level", "size", "steps", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD)
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]
-        by_level.add_row(
+        table.add_row(
             *(level, f"{width}x{height}", f"{figures['iterations']:,}", f"{figures['train_seconds']:.1f}"),
             *(f"{figures['num_gaussians']:,}", f"{figures['peak_gaussians']:,}"),
             *(f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}"),
         )
     console.print(
         "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels",
-        by_level,
+        table,
         highlight=False,
     )
+
+
+def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    levels = metrics["levels"].items()
+    table = Table("part", *(f"level {level}" for level, _ in levels), "run", box=box.SIMPLE_HEAD)
+    total = sum(metrics["breakdown_seconds"].values())
+    for part, seconds in metrics["breakdown_seconds"].items():
+        each = [f"{1e3 * f['breakdown_seconds'][part] / f['iterations']:.2f} ms" for _, f in levels]
+        table.add_row(part, *each, f"{seconds:.1f} s, {seconds / total:.1%}")
+    console.print("[bold]Where the time of iterations went[/bold], an iteration of each level", table, highlight=False)
+
+
+def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
         f"{metrics['num_views']} {kind} views; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
-        f"at most {metrics['peak_gaussians']:,} Gaussians at once",
+        f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
         highlight=False,
     )
+    if (peak := metrics["peak_memory_bytes"]) is not None:
+        bare = metrics["peak_memory_without_images_bytes"]
+        console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
+    for name, reason in metrics["lpips_missing"].items():
+        console.print(f"LPIPS {name} was not measured: {reason}", highlight=False, markup=False)

@@ -8,9 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from lapgs_plugin.archive import Manifest
+from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 
 Metrics = dict[str, Any]
 """What metrics.json holds, see `figures.run_figures`."""
+
+NOT_EVERYWHERE = {"mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
+"""Left out where no run has them: imported runs tell little of their training, and there is no GPU on a CPU."""
+PAIR = 2
 
 
 @dataclass(frozen=True)
@@ -18,12 +23,12 @@ class Cell:
     """One figure of one run.
 
     Attributes:
-        value: the number.
+        value: the number; None where it was not measured.
         text: how it is written.
         parts: what it is the sum of, each with its name; empty when it is no sum.
     """
 
-    value: float
+    value: float | None
     text: str
     parts: tuple[str, ...] = ()
 
@@ -55,22 +60,37 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
+        *(
+            (LPIPS_KEY.format(name), f"LPIPS ({title_of(name)}), {views} views", "{:.4f}", _difference("{:+.4f}"))
+            for name in VARIANTS
+            if any(LPIPS_KEY.format(name) in each or name in each["lpips_missing"] for each in metrics)
+        ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
         ("num_gaussians", "Gaussians, all levels", "{:,.0f}", _ratio),
+        ("weighted_gaussians", "Gaussians, mean of levels by iterations", "{:,.0f}", _ratio),
+        ("mean_gaussians", "Gaussians at once, mean of iterations", "{:,.0f}", _ratio),
         ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),
+        ("peak_memory_bytes", "Peak GPU memory (GB)", "{:.2f}", _ratio),
+        ("peak_memory_without_images_bytes", "Peak GPU memory without images (GB)", "{:.2f}", _ratio),
+        ("fps", "Frames a second", "{:,.0f}", _ratio),
     )
     rows = []
     for key, label, pattern, compare in table:
-        cells = tuple(_cell(each[key], pattern) for each in metrics)
-        change = compare(cells[0].value, cells[1].value) if len(cells) > 1 else ""
-        rows.append(Row(key, label, cells, change))
+        cells = tuple(_cell(each.get(key), pattern, 1e-9 if key.endswith("_bytes") else 1.0) for each in metrics)
+        values = [cell.value for cell in cells if cell.value is not None]
+        if not values and key in NOT_EVERYWHERE:
+            continue
+        rows.append(Row(key, label, cells, compare(*values) if len(values) == PAIR else ""))
     return tuple(rows)
 
 
-def _cell(value: float | dict[str, float], pattern: str) -> Cell:
+def _cell(value: float | dict[str, float] | None, pattern: str, scale: float) -> Cell:
     """A number, or the sum of named numbers."""
+    if value is None:
+        return Cell(None, "not measured")
     if not isinstance(value, dict):
+        value *= scale
         return Cell(value, pattern.format(value))
     total = math.fsum(value.values())
     parts = [f"{f'level {name}' if name.isdigit() else name} {pattern.format(part)}" for name, part in value.items()]

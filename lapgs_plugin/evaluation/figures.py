@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,25 @@ from typing import Any
 from lapgs_plugin.archive import METRICS, LevelRecord, Manifest, RunArchive
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
-    *("psnr", "ssim", "split", "num_views", "views", "levels"),
-    *("train_seconds", "overhead_seconds", "num_gaussians", "peak_gaussians", "rasterizer", "versions"),
+    *("psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
+    *("train_seconds", "overhead_seconds", "breakdown_seconds", "num_gaussians", "weighted_gaussians"),
+    *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
+    *("rasterizer", "versions"),
 }
 """What metrics.json holds; `run_figures` says what each is."""
+
+FPS_VIEWS, FPS_ROUNDS = 16, 3
+"""Frames a second are measured over at most so many views, so many times."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,7 @@ class ViewMetrics:
     Attributes:
         name: of the view's image.
         psnr, ssim: of the composition at full resolution.
+        lpips: the same by variant, those that were measured.
         level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at that
             level's size.
         upsampled_psnr: by level, PSNR in dB of I_hat^l brought to full resolution with Up, against the photo: what
@@ -41,11 +49,12 @@ class ViewMetrics:
     name: str
     psnr: float
     ssim: float
+    lpips: dict[str, float]
     level_psnr: dict[int, float]
     upsampled_psnr: dict[int, float]
 
 
-def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer) -> ViewMetrics:
+def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics) -> ViewMetrics:
     """Compare a rendered view with its photo, level by level, where it was rendered."""
     photo = view.image.to(renderer.device)
     targets = renderer.pyramid.gaussian(photo, renderer.levels)
@@ -54,11 +63,17 @@ def measure_view(view: View, composition: Composition, renderer: HierarchyRender
         level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), photo)
         for level, image in composition.composed.items()
     }
-    return ViewMetrics(view.name, level_psnr[0], ssim(composition.composed[0], photo), level_psnr, upsampled)
+    whole = composition.composed[0]
+    return ViewMetrics(view.name, level_psnr[0], ssim(whole, photo), lpips.measure(whole, photo), level_psnr, upsampled)
 
 
 def evaluate_run(
-    archive: RunArchive, moved_to: Path | None = None, *, device: str = "auto", rasterizer: str = "auto"
+    archive: RunArchive,
+    moved_to: Path | None = None,
+    *,
+    device: str = "auto",
+    rasterizer: str = "auto",
+    lpips: LpipsRequest | None = None,
 ) -> dict[str, Any]:
     """Render the held-out views of a complete run, or the training views when none were held out, and measure it.
 
@@ -68,24 +83,33 @@ def evaluate_run(
         archive: the run.
         moved_to: where its scene is now; None when it did not move.
         device, rasterizer: what renders it, see `rendering.run.run_renderer`.
+        lpips: which distances to measure; those of VGG when not given. What has no weights is left out and said so.
 
     Returns:
         What is written, described in `run_figures`.
 
     Raises:
         RunFolderError: the run is not complete, or its scene is not where it was.
+        UserInputError: a file of LPIPS weights is not usable.
     """
     require_complete(archive)
     renderer = run_renderer(archive, device, rasterizer)
     with one_pool():
         scene = run_scene(archive, moved_to)
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
+        smallest = min(min(view.camera.width, view.camera.height) for view in views)
+        distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
         with item_progress("views") as progress:
             measured = [
-                measure_view(view, renderer.render(view.camera), renderer)
+                measure_view(view, renderer.render(view.camera), renderer, distances)
                 for view in progress.track(views, description=f"Measuring {split} views")
             ]
-    metrics = run_figures(archive.manifest, split, measured, renderer.rasterizer.name)
+        speed = composed_speed(renderer, [view.camera for view in views[:FPS_VIEWS]], FPS_ROUNDS)
+    metrics = {
+        **run_figures(archive.manifest, split, measured, renderer.rasterizer.name),
+        "lpips_missing": dict(distances.missing),
+        "fps": speed.fps,
+    }
     archive.write_metrics(metrics)
     return metrics
 
@@ -124,33 +148,46 @@ def require_complete(archive: RunArchive) -> None:
 
 
 def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], rasterizer: str) -> dict[str, Any]:
-    """Figures of a complete run as JSON.
+    """Figures of a complete run as JSON, all but what `evaluate_run` adds.
 
     Keys, with levels as text because JSON has no other keys:
-        psnr, ssim: means over the views of each view's own value, at full resolution.
+        psnr, ssim, lpips_<variant>: means over the views of each view's own value, at full resolution.
+        lpips_missing: why others could not be measured, by variant; fps: frames a second of the composed image, median
+            over some views; both added by `evaluate_run`.
         split, num_views: which views, "test" or "train", and how many.
         train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
+        breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
         num_gaussians: by level; peak_gaussians: the most that were optimized at once.
+        weighted_gaussians: num_gaussians weighted by the levels' iterations, as the paper's plot of time against count.
+        mean_gaussians: those being optimized, mean over all iterations; None when not recorded.
+        peak_memory_bytes, peak_memory_without_images_bytes: of the GPU in training, the highest stage; None on a CPU.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
-            num_gaussians, peak_gaussians.
-        views: name, psnr, ssim of each, in the scene's order.
+            num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, memory_bytes.
+        views: name, psnr, ssim, lpips_<variant> of each, in the scene's order.
         rasterizer, versions: what rendered them.
     """
-    overhead: dict[str, float] = {}
-    for record in manifest.records:
-        for name, seconds in record.overhead_seconds.items():
-            overhead[name] = overhead.get(name, 0.0) + seconds
+    records = manifest.records
+    iterations = [record.iterations for record in records]
+    means = [record.mean_gaussians for record in records if record.mean_gaussians is not None]
+    memory = [record.memory_bytes for record in records if record.memory_bytes]
+    whole = all(record.breakdown_seconds for record in records)
     return {
         "psnr": _mean(view.psnr for view in views),
         "ssim": _mean(view.ssim for view in views),
+        **{LPIPS_KEY.format(name): _mean(view.lpips[name] for view in views) for name in views[0].lpips},
         "split": split,
         "num_views": len(views),
-        "train_seconds": math.fsum(record.train_seconds for record in manifest.records),
-        "overhead_seconds": overhead,
-        "num_gaussians": {str(record.level): record.num_gaussians for record in manifest.records},
-        "peak_gaussians": max(record.peak_gaussians for record in manifest.records),
-        "levels": {str(record.level): _level_figures(record, views) for record in manifest.records},
-        "views": [{"name": view.name, "psnr": view.psnr, "ssim": view.ssim} for view in views],
+        "train_seconds": math.fsum(record.train_seconds for record in records),
+        "overhead_seconds": _sums(record.overhead_seconds for record in records),
+        "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
+        "num_gaussians": {str(record.level): record.num_gaussians for record in records},
+        "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
+        "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
+        "peak_gaussians": max(record.peak_gaussians for record in records),
+        "peak_memory_bytes": max((each["peak"] for each in memory), default=None),
+        "peak_memory_without_images_bytes": max((each["peak"] - each["images"] for each in memory), default=None),
+        "levels": {str(record.level): _level_figures(record, views) for record in records},
+        "views": [_view_figures(view) for view in views],
         "rasterizer": rasterizer,
         "versions": versions(),
     }
@@ -164,8 +201,29 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
         "image_size": list(record.image_size),
         "train_seconds": record.train_seconds,
         "num_gaussians": record.num_gaussians,
+        "mean_gaussians": record.mean_gaussians,
         "peak_gaussians": record.peak_gaussians,
+        "breakdown_seconds": record.breakdown_seconds,
+        "memory_bytes": record.memory_bytes,
     }
+
+
+def _view_figures(view: ViewMetrics) -> dict[str, Any]:
+    distances = {LPIPS_KEY.format(name): value for name, value in view.lpips.items()}
+    return {"name": view.name, "psnr": view.psnr, "ssim": view.ssim, **distances}
+
+
+def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Each name's values added up."""
+    total: dict[str, float] = {}
+    for each in parts:
+        for name, value in each.items():
+            total[name] = total.get(name, 0.0) + value
+    return total
+
+
+def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
+    return math.fsum(value * weight for value, weight in zip(values, weights, strict=True)) / sum(weights)
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -19,6 +19,15 @@ VIEWS = 10
 BACKGROUND = (0.1, 0.2, 0.3)
 ITERATIONS = {1: 100, 0: 200}
 SECONDS = {1: 3.5, 0: 8.25}
+MEMORY = {
+    1: {"peak": 3_500_000_000, "images": 500_000_000},
+    0: {"peak": 5_000_000_000, "images": 2_000_000_000},
+}
+MEANS = {1: 130.5, 0: 110.25}
+BREAKDOWN = {
+    1: {"forward": 0.5, "loss": 0.25, "backward": 1.75, "other": 1.0},
+    0: {"forward": 1.5, "loss": 0.5, "backward": 3.25, "other": 3.0},
+}
 
 
 def write_scene(folder: Path, view_names: list[str] | None = None, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
@@ -61,6 +70,9 @@ def write_run(
                 train_seconds=SECONDS[level],
                 overhead_seconds={"pyramid": 0.5, "cache": 0.25} if signed else {"pyramid": 0.125},
                 image_size=level_size((WIDTH, HEIGHT), level),
+                memory_bytes=MEMORY[level],
+                mean_gaussians=MEANS[level],
+                breakdown_seconds=BREAKDOWN[level],
             )
             for iteration in range(10, ITERATIONS[level] + 1, 10):
                 share = iteration / ITERATIONS[level]

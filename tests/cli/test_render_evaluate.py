@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 import typer
 from typer.testing import CliRunner
 
@@ -18,6 +19,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError, UserInputError
+from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.scenes import read_image
 from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
@@ -152,11 +154,43 @@ def test_eval_sums_what_training_recorded(run: Path) -> None:
     assert metrics["train_seconds"] == SECONDS[0] + SECONDS[1]
     assert metrics["num_gaussians"] == {"1": 250, "0": 200}
     assert metrics["peak_gaussians"] == 257
-    assert metrics["overhead_seconds"] == {"pyramid": 0.625, "cache": 0.25}
+    overhead = dict(metrics["overhead_seconds"])
+    assert overhead.pop("archive") > 0  # timed when the run folder was written
+    assert overhead == {"pyramid": 0.625, "cache": 0.25}
+    assert metrics["weighted_gaussians"] == pytest.approx((100 * 250 + 200 * 200) / 300)
+    assert metrics["mean_gaussians"] == pytest.approx((100 * 130.5 + 200 * 110.25) / 300)
+    assert metrics["breakdown_seconds"] == {"forward": 2.0, "loss": 0.75, "backward": 5.0, "other": 4.0}
+    assert metrics["peak_memory_bytes"] == 5_000_000_000
+    assert metrics["peak_memory_without_images_bytes"] == 3_000_000_000
+    assert metrics["levels"]["1"]["memory_bytes"] == {"peak": 3_500_000_000, "images": 500_000_000}
+    assert metrics["fps"] > 0
     assert metrics["levels"]["1"]["image_size"] == [28, 20]
     assert metrics["rasterizer"] == "cpu"
     assert metrics["versions"].keys() >= {"lapgs_plugin", "torch", "python"}
     assert RunArchive.open(run).metrics() == metrics
+
+
+def test_lpips_is_measured_where_there_are_weights_and_said_where_not(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "nothing"))
+    output = lapgs("eval", run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert set(metrics["lpips_missing"]) == {"vgg", "vgg_3dgs"}
+    assert "not measured" in output
+    assert "LPIPS vgg was not measured: no weights" in output
+
+    layers = {f"features.{key}": value for key, value in NETWORKS["alex"].layers().state_dict().items()}
+    learned = {f"lin{k}.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(NETWORKS["alex"].channels)}
+    torch.save({**layers, **learned}, tmp_path / "alex.pth")
+    output = lapgs("eval", run, "--lpips-weights", tmp_path / "alex.pth")
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["lpips_missing"] == {}
+    assert metrics["lpips_alex"] == pytest.approx(np.mean([view["lpips_alex"] for view in metrics["views"]]))
+    assert metrics["lpips_alex"] > 0
+    assert "LPIPS (AlexNet)" in output
+    with pytest.raises(UserInputError, match="--lpips magic: expected none, or some of vgg"):
+        lapgs("eval", run, "--lpips", "magic")
 
 
 def test_without_held_out_views_eval_says_so(scene: Path, tmp_path: Path) -> None:

@@ -17,7 +17,13 @@ def metrics(**changes: Any) -> dict[str, Any]:
         "train_seconds": 300.0,
         "overhead_seconds": {"pyramid": 1.5, "cache": 2.0},
         "num_gaussians": {"1": 1_130_000, "0": 1_470_000},
+        "weighted_gaussians": 1_356_666.7,
+        "mean_gaussians": 1_200_000.0,
         "peak_gaussians": 1_500_000,
+        "peak_memory_bytes": None,
+        "peak_memory_without_images_bytes": None,
+        "lpips_missing": {},
+        "fps": 90.0,
     }
     return {**values, **changes}
 
@@ -28,7 +34,10 @@ BASELINE = metrics(
     train_seconds=525.0,
     overhead_seconds={"pyramid": 0.5},
     num_gaussians={"0": 2_290_000},
+    weighted_gaussians=2_290_000.0,
+    mean_gaussians=2_000_000.0,
     peak_gaussians=3_000_000,
+    fps=120.0,
 )
 
 
@@ -40,7 +49,10 @@ def test_rows_of_a_run_and_its_baseline() -> None:
         "train_seconds": "1.75x as fast",
         "overhead_seconds": "+3.0 s",
         "num_gaussians": "1.14x",
+        "weighted_gaussians": "0.59x",
+        "mean_gaussians": "0.60x",
         "peak_gaussians": "0.50x",
+        "fps": "0.75x",
     }
     assert rows["num_gaussians"].cells == (
         Cell(2_600_000, "2,600,000", ("level 1 1,130,000", "level 0 1,470,000")),
@@ -49,6 +61,19 @@ def test_rows_of_a_run_and_its_baseline() -> None:
     assert [cell.value for cell in rows["train_seconds"].cells] == [300.0, 525.0]
     assert rows["overhead_seconds"].cells[0] == Cell(3.5, "3.5", ("pyramid 1.5", "cache 2.0"))
     assert rows["psnr"].label == "PSNR, held-out views (dB)"
+
+
+def test_what_only_one_of_two_runs_has_is_said_and_not_compared() -> None:
+    ours = metrics(lpips_alex=0.2, peak_memory_bytes=3_500_000_000, lpips_missing={"vgg_3dgs": "no weights"})
+    rows = {row.key: row for row in comparison_rows([ours, BASELINE])}
+    assert rows["lpips_alex"].label == "LPIPS (AlexNet), held-out views"
+    assert rows["lpips_alex"].cells == (Cell(0.2, "0.2000"), Cell(None, "not measured"))
+    assert rows["lpips_vgg_3dgs"].label == "LPIPS (VGG as 3DGS), held-out views"
+    assert [cell.text for cell in rows["lpips_vgg_3dgs"].cells] == ["not measured"] * 2
+    assert [cell.text for cell in rows["peak_memory_bytes"].cells] == ["3.50", "not measured"]
+    assert [rows[key].change for key in ("lpips_alex", "lpips_vgg_3dgs", "peak_memory_bytes")] == [""] * 3
+    both = comparison_rows([metrics(lpips_alex=0.2), metrics(lpips_alex=0.25)])
+    assert {row.key: row.change for row in both}["lpips_alex"] == "-0.0500"
 
 
 def test_a_run_alone_has_one_cell_and_no_change() -> None:

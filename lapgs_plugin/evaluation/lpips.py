@@ -1,0 +1,325 @@
+"""LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018).
+
+The packages lpips and torchmetrics take their networks from torchvision, which is compiled for one version of PyTorch
+and often missing. The networks are a dozen convolutions that never changed, so they stand here; their weights come from
+a file in torchvision's layout, or from torchvision's own cache if they were ever downloaded, never from the network.
+The learned layers on top come from the same file, or from whichever of the two packages is installed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""What LPIPS takes from each channel of an image in [-1, 1] and divides it by."""
+EPSILON = 1e-8
+"""Added to squared lengths of feature vectors, as torchmetrics does; lpips adds 1e-10 to the length."""
+LINEAR_FILES = {"torchmetrics": "functional/image/lpips_models/{}.pth", "lpips": "weights/v0.1/{}.pth"}
+"""Where packages keep the learned layers."""
+
+
+class _Fire(nn.Module):
+    """A block of SqueezeNet: fewer channels, then two convolutions side by side; names as torchvision's."""
+
+    def __init__(self, before: int, squeezed: int, expanded: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(before, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(n, before, h, w) -> (n, 2 expanded, h, w)."""
+        values = self.squeeze(values).relu()
+        return torch.cat([self.expand1x1(values).relu(), self.expand3x3(values).relu()], dim=1)
+
+
+def _pool(ceil: bool = False) -> nn.Module:
+    return nn.MaxPool2d(3, 2, ceil_mode=ceil)
+
+
+def _alexnet() -> list[nn.Module]:
+    return [
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), _pool()),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), _pool()),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    ]
+
+
+def _vgg16() -> list[nn.Module]:
+    layers: list[nn.Module] = []
+    channels = 3
+    for block, (width, depth) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
+        layers += [nn.MaxPool2d(2)] * (block > 0)
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+    return layers
+
+
+def _squeezenet() -> list[nn.Module]:
+    return [
+        *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), _pool(ceil=True)),
+        *(_Fire(64, 16, 64), _Fire(128, 16, 64), _pool(ceil=True)),
+        *(_Fire(128, 32, 128), _Fire(256, 32, 128), _pool(ceil=True)),
+        *(_Fire(256, 48, 192), _Fire(384, 48, 192), _Fire(384, 64, 256), _Fire(512, 64, 256)),
+    ]
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network that LPIPS can look at images with.
+
+    Attributes:
+        title: as tables call it.
+        taps: layers whose output is compared.
+        channels: of these outputs.
+        cached_as: name of torchvision's weights in PyTorch's cache of downloads.
+        smallest: shorter side in pixels of the smallest image that reaches its last layer.
+    """
+
+    title: str
+    taps: tuple[int, ...]
+    channels: tuple[int, ...]
+    cached_as: str
+    smallest: int
+
+    def layers(self) -> nn.Sequential:
+        """Its convolutions with random weights, up to the last tap."""
+        make = {"AlexNet": _alexnet, "VGG": _vgg16, "SqueezeNet": _squeezenet}[self.title]
+        return nn.Sequential(*make())
+
+
+NETWORKS = {
+    "vgg": Network("VGG", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), "vgg16-397923af.pth", 16),
+    "alex": Network("AlexNet", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), "alexnet-owt-7be5be79.pth", 31),
+    "squeeze": Network(
+        "SqueezeNet", (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512), "squeezenet1_1-b8a52dc0.pth", 17
+    ),
+}
+AS_3DGS = "vgg_3dgs"
+"""The VGG distance as the 3DGS codebases compute it, and papers print it: they hand images in [0, 1] to a network that
+expects them in [-1, 1]."""
+VARIANTS = (*NETWORKS, AS_3DGS)
+LPIPS_KEY = "lpips_{}"
+"""What a variant is called in metrics.json."""
+
+
+def network_of(variant: str) -> str:
+    """The key in `NETWORKS` of one of `VARIANTS`."""
+    return "vgg" if variant == AS_3DGS else variant
+
+
+def title_of(variant: str) -> str:
+    """One of `VARIANTS` in words."""
+    return NETWORKS[network_of(variant)].title + (" as 3DGS" if variant == AS_3DGS else "")
+
+
+class Lpips(nn.Module):
+    """The distance of two images under one network.
+
+    Args:
+        name: key in `NETWORKS`.
+        weights: `features.<layer>...` of the network and `lin<k>.weight`, (1, c, 1, 1), of the learned layers.
+
+    Raises:
+        UserInputError: weights are missing or have other shapes; names the first.
+    """
+
+    def __init__(self, name: str, weights: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        network = NETWORKS[name]
+        self._taps = network.taps
+        self.features = network.layers()
+        self.learned = nn.ParameterList([nn.Parameter(torch.zeros(1, c, 1, 1)) for c in network.channels])
+        found = {re.sub(r"^lin(\d)\.weight$", r"learned.\1", key): value for key, value in weights.items()}
+        for key, own in self.state_dict().items():
+            if key not in found or found[key].shape != own.shape:
+                shape = tuple(found[key].shape) if key in found else "nothing"
+                raise UserInputError(
+                    f"LPIPS weights of {network.title}: {key} is {shape}, expected {tuple(own.shape)}; give a file of "
+                    "torchvision's weights, or one with the learned layers lin<k>.weight too"
+                )
+        self.load_state_dict({key: found[key] for key in self.state_dict()})
+        self.requires_grad_(False)
+        self.eval()
+
+    @torch.no_grad()
+    def forward(self, image: Tensor, target: Tensor, as_3dgs: bool = False) -> float:
+        """The distance of two images, 0 for equal ones.
+
+        Args:
+            image, target: (3, h, w) on the network's device, clamped to [0, 1] here.
+            as_3dgs: leave out the step from [0, 1] to [-1, 1], see `AS_3DGS`.
+        """
+        total = 0.0
+        outputs = zip(self._outputs(image, as_3dgs), self._outputs(target, as_3dgs), self.learned, strict=True)
+        for one, other, learned in outputs:
+            total += float(nn.functional.conv2d((one - other).square(), learned).mean())
+        return total
+
+    def _outputs(self, image: Tensor, as_3dgs: bool) -> Iterable[Tensor]:
+        """(1, c, h', w') of each tapped layer, feature vectors of unit length."""
+        like = self.learned[0]
+        values = image.clamp(0.0, 1.0).to(like.dtype)[None]
+        values = values if as_3dgs else 2.0 * values - 1.0
+        values = (values - like.new_tensor(SHIFT)[:, None, None]) / like.new_tensor(SCALE)[:, None, None]
+        for index, layer in enumerate(self.features):
+            values = layer(values)
+            if index in self._taps:
+                yield values / (values.square().sum(dim=1, keepdim=True) + EPSILON).sqrt()
+
+
+@dataclass(frozen=True)
+class LpipsMetrics:
+    """The distances to be measured of every view.
+
+    Attributes:
+        networks: by key in `NETWORKS`, those whose weights were found.
+        variants: of `VARIANTS`, those that can be measured.
+        missing: of the others that were asked for, why they cannot.
+    """
+
+    networks: Mapping[str, Lpips]
+    variants: tuple[str, ...]
+    missing: Mapping[str, str]
+
+    def measure(self, image: Tensor, target: Tensor) -> dict[str, float]:
+        """Each variant's distance of two images, (3, h, w)."""
+        return {v: self.networks[network_of(v)](image, target, as_3dgs=v == AS_3DGS) for v in self.variants}
+
+
+@dataclass(frozen=True)
+class LpipsRequest:
+    """What is asked for.
+
+    Attributes:
+        variants: of `VARIANTS`; None for those of the files' networks, or of VGG, which papers print, without files.
+        files: weights that the user names; which network each is of is told by its shapes.
+    """
+
+    variants: tuple[str, ...] | None = None
+    files: tuple[Path, ...] = ()
+
+    @classmethod
+    def parse(cls, variants: str | None, files: Iterable[Path] = ()) -> LpipsRequest:
+        """From the command line; variants are separated by commas, "none" asks for nothing.
+
+        Raises:
+            UserInputError: a variant is not known.
+        """
+        if variants is None:
+            return cls(None, tuple(files))
+        words = () if variants.strip() == "none" else tuple(dict.fromkeys(word.strip() for word in variants.split(",")))
+        for word in words:
+            if word not in VARIANTS:
+                raise UserInputError(
+                    f"--lpips {word}: expected none, or some of {', '.join(VARIANTS)} with commas between"
+                )
+        return cls(words, tuple(files))
+
+
+def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.device) -> LpipsMetrics:
+    """Load the networks of what is asked for, as far as there are weights.
+
+    Args:
+        request: what is asked for.
+        smallest_side: of the images to come, in pixels.
+        device: of the images to come.
+
+    Raises:
+        UserInputError: a named file cannot be read, or is of no known network.
+        MissingExtraError: it is a .safetensors file, and their package is not installed.
+    """
+    named = dict(_read_named(path) for path in request.files)
+    networks: dict[str, Lpips] = {}
+    missing: dict[str, str] = {}
+    variants = request.variants
+    if variants is None:
+        variants = tuple(variant for variant in VARIANTS if network_of(variant) in (named or {"vgg"}))
+    for variant in variants:
+        name = network_of(variant)
+        if name in networks:
+            continue
+        weights = named.get(name) or _cached(name)
+        if weights is None:
+            missing[variant] = f"no weights: name a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
+        elif smallest_side < NETWORKS[name].smallest:
+            missing[variant] = f"images of {smallest_side} pixels are too small, it takes {NETWORKS[name].smallest}"
+        elif (complete := _with_learned(name, weights)) is None:
+            missing[variant] = "no learned layers in the weights: pip install 'lapgs_plugin[lpips]'"
+        else:
+            networks[name] = Lpips(name, complete).to(device)
+    return LpipsMetrics(networks, tuple(v for v in variants if network_of(v) in networks), missing)
+
+
+def _read_named(path: Path) -> tuple[str, Mapping[str, Tensor]]:
+    """A named file's network and weights."""
+    weights = _read(path)
+    for name, network in NETWORKS.items():
+        expected = network.layers().state_dict()
+        if all(
+            f"features.{key}" in weights and weights[f"features.{key}"].shape == expected[key].shape for key in expected
+        ):
+            return name, weights
+    raise UserInputError(
+        f"--lpips-weights {path}: these are the layers of none of {', '.join(n.title for n in NETWORKS.values())}; "
+        "expected torchvision's names and shapes, such as features.0.weight"
+    )
+
+
+def _read(path: Path) -> Mapping[str, Tensor]:
+    """A file of tensors by name, .safetensors or .pth.
+
+    Raises:
+        UserInputError: it cannot be read.
+        MissingExtraError: reading it needs a package that is not installed.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(weights, dict):
+            raise TypeError(f"a {type(weights).__name__}, expected a dictionary of tensors")
+    except ImportError as error:
+        raise MissingExtraError(
+            f"LPIPS weights {path}: reading .safetensors needs a package; pip install 'lapgs_plugin[lpips]'"
+        ) from error
+    except Exception as error:  # torch and safetensors raise whatever a damaged file makes of them
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise UserInputError(
+            f"LPIPS weights {path} cannot be read ({reason}); expected tensors by name, .safetensors or .pth"
+        ) from error
+    return weights
+
+
+def _cached(name: str) -> Mapping[str, Tensor] | None:
+    """What torchvision has downloaded at some time, by itself or for lpips or torchmetrics."""
+    path = Path(torch.hub.get_dir()) / "checkpoints" / NETWORKS[name].cached_as
+    return _read(path) if path.is_file() else None
+
+
+def _with_learned(name: str, weights: Mapping[str, Tensor]) -> Mapping[str, Tensor] | None:
+    """Weights with learned layers: their own, or else an installed package's."""
+    if "lin0.weight" in weights:
+        return weights
+    for package, pattern in LINEAR_FILES.items():
+        spec = find_spec(package)
+        for folder in (spec and spec.submodule_search_locations) or ():
+            path = Path(folder) / pattern.format(name)
+            if path.is_file():
+                learned = _read(path)
+                return {**weights, **{key.replace(".model.1.", "."): value for key, value in learned.items()}}
+    return None

@@ -1,0 +1,207 @@
+"""LPIPS against torchmetrics' arithmetic in float64 over networks built here, and files that are no weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.evaluation import lpips
+from lapgs_plugin.evaluation.lpips import AS_3DGS, NETWORKS, Lpips, LpipsRequest, lpips_metrics
+
+CPU = torch.device("cpu")
+
+
+class Fire(nn.Module):
+    """As the paper of SqueezeNet draws it."""
+
+    def __init__(self, channels: int, squeeze: int, expand: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeeze, 1)
+        self.expand1x1 = nn.Conv2d(squeeze, expand, 1)
+        self.expand3x3 = nn.Conv2d(squeeze, expand, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = torch.relu(self.squeeze(x))
+        return torch.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], 1))
+
+
+def from_text(text: str) -> nn.Sequential:
+    """A network from a line a layer: "conv 3 64 11 4 2", "relu", "pool 3 2", "fire 64 16 64"."""
+    layers: list[nn.Module] = []
+    for line in text.split(","):
+        kind, *numbers = line.split()
+        values = [int(number) for number in numbers]
+        if kind == "conv":
+            before, after, size, stride, padding = values
+            layers.append(nn.Conv2d(before, after, size, stride, padding))
+        elif kind == "relu":
+            layers.append(nn.ReLU())
+        elif kind == "fire":
+            layers.append(Fire(*values))
+        else:
+            layers.append(nn.MaxPool2d(values[0], values[1], ceil_mode=kind == "ceilpool"))
+    return nn.Sequential(*layers)
+
+
+def vgg_text() -> str:
+    channels, lines = 3, []
+    for width in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512):
+        if width:
+            lines += [f"conv {channels} {width} 3 1 1", "relu"]
+            channels = width
+        else:
+            lines.append("pool 2 2")
+    return ",".join(lines)
+
+
+TEXTS = {
+    "alexnet": "conv 3 64 11 4 2,relu,pool 3 2,conv 64 192 5 1 2,relu,pool 3 2,conv 192 384 3 1 1,relu,"
+    "conv 384 256 3 1 1,relu,conv 256 256 3 1 1,relu",
+    "vgg16": vgg_text(),
+    "squeezenet1_1": "conv 3 64 3 2 0,relu,ceilpool 3 2,fire 64 16 64,fire 128 16 64,ceilpool 3 2,fire 128 32 128,"
+    "fire 256 32 128,ceilpool 3 2,fire 256 48 192,fire 384 48 192,fire 384 64 256,fire 512 64 256",
+}
+NAMES = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}
+
+
+def random_weights(name: str, learned: bool = True) -> dict[str, Tensor]:
+    """In torchvision's layout, classifier included; learned layers are positive, as those of LPIPS."""
+    weights = {f"features.{key}": value for key, value in from_text(TEXTS[NAMES[name]]).state_dict().items()}
+    weights["classifier.1.weight"] = torch.zeros(2, 2)
+    if learned:
+        for index, channels in enumerate(NETWORKS[name].channels):
+            weights[f"lin{index}.weight"] = torch.rand(1, channels, 1, 1)
+    return weights
+
+
+@pytest.fixture
+def reference(monkeypatch: pytest.MonkeyPatch) -> Callable[..., float]:
+    """The distance as torchmetrics computes it, in float64, over this file's networks instead of torchvision's."""
+    theirs = pytest.importorskip("torchmetrics.functional.image.lpips")
+
+    def distance(name: str, weights: dict[str, Tensor], image: Tensor, target: Tensor, rescaled: bool = True) -> float:
+        network = from_text(TEXTS[NAMES[name]])
+        features = {key.removeprefix("features."): v for key, v in weights.items() if key.startswith("features.")}
+        network.load_state_dict(features)
+        monkeypatch.setattr(theirs, "_get_tv_model_features", lambda _, pretrained: network)
+        model: Any = theirs._LPIPS(net=name, pnet_rand=True)  # with its own learned layers
+        for index in range(len(NETWORKS[name].channels)):
+            if f"lin{index}.weight" in weights:
+                getattr(model, f"lin{index}").model[-1].weight.data = weights[f"lin{index}.weight"]
+        return float(model.double()(image.double()[None], target.double()[None], normalize=rescaled))
+
+    return distance
+
+
+def images(height: int = 70, width: int = 85) -> tuple[Tensor, Tensor]:
+    target = torch.rand(3, height, width)
+    return (target + 0.2 * torch.randn(3, height, width)).clamp(0, 1), target
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("learned", [True, False])
+def test_distances_are_those_of_torchmetrics(
+    name: str, learned: bool, tmp_path: Path, reference: Callable[..., float]
+) -> None:
+    weights = random_weights(name, learned)
+    torch.save(weights, tmp_path / "weights.pth")
+    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 70, CPU)
+    assert metrics.missing == {}
+    image, target = images()
+    found = metrics.measure(image, target)
+    assert set(found) == ({name, AS_3DGS} if name == "vgg" else {name})
+    expected = reference(name, weights, image, target)
+    assert found[name] == pytest.approx(expected, rel=2e-4)  # float32 against float64; 2e-5 seen
+    if name == "vgg":
+        unscaled = reference(name, weights, image, target, rescaled=False)
+        assert found[AS_3DGS] == pytest.approx(unscaled, rel=2e-4)
+        assert abs(unscaled - expected) > 1e-3 * expected  # or the two would not be told apart
+
+
+def test_a_safetensors_file_and_what_is_shown(tmp_path: Path) -> None:
+    safetensors = pytest.importorskip("safetensors.torch")
+    safetensors.save_file(random_weights("alex"), tmp_path / "alex.safetensors")
+    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "alex.safetensors",)), 70, CPU)
+    image, target = images()
+    assert metrics.measure(target, target) == {"alex": 0.0}
+    assert metrics.measure(target + 2.0, torch.ones_like(target)) == {"alex": 0.0}  # clamped to what is shown
+    assert metrics.measure(image, target)["alex"] > 0
+    assert metrics.measure(image, target) == metrics.measure(target, image)
+
+
+def test_published_weights_of_alexnet(shared_data: Path, reference: Callable[..., float]) -> None:
+    path = shared_data.parent / "lpips" / "alexnet.safetensors"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    weights = pytest.importorskip("safetensors.torch").load_file(path)
+    image, target = images()
+    distance = Lpips("alex", weights)(image, target)
+    assert distance == pytest.approx(reference("alex", weights, image, target), rel=1e-5)  # 2e-7 seen
+    without = {key: value for key, value in weights.items() if key.startswith("features.")}
+    # The learned layers that torchmetrics ships are these.
+    assert distance == pytest.approx(reference("alex", without, image, target), rel=1e-5)
+
+
+def test_without_weights_it_is_said_and_nothing_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    metrics = lpips_metrics(LpipsRequest(), 70, CPU)
+    assert set(metrics.missing) == {"vgg", AS_3DGS}
+    assert all("--lpips-weights" in reason for reason in metrics.missing.values())
+    assert metrics.measure(*images()) == {}
+    assert lpips_metrics(LpipsRequest.parse("none"), 70, CPU).missing == {}
+
+    (tmp_path / "checkpoints").mkdir()
+    torch.save(random_weights("squeeze"), tmp_path / "checkpoints" / NETWORKS["squeeze"].cached_as)
+    metrics = lpips_metrics(LpipsRequest.parse("squeeze,alex"), 70, CPU)
+    assert set(metrics.measure(*images())) == {"squeeze"}
+    assert set(metrics.missing) == {"alex"}
+
+    monkeypatch.setattr(lpips, "LINEAR_FILES", {})
+    torch.save(random_weights("alex", learned=False), tmp_path / "checkpoints" / NETWORKS["alex"].cached_as)
+    assert "lapgs_plugin[lpips]" in lpips_metrics(LpipsRequest.parse("alex"), 70, CPU).missing["alex"]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_smallest_image_is_measured_and_a_smaller_one_said(name: str, tmp_path: Path) -> None:
+    torch.save(random_weights(name), tmp_path / "weights.pth")
+    smallest, request = NETWORKS[name].smallest, LpipsRequest((name,), (tmp_path / "weights.pth",))
+    metrics = lpips_metrics(request, smallest, CPU)
+    assert metrics.measure(*images(smallest, 40))[name] > 0
+    assert "too small" in lpips_metrics(request, smallest - 1, CPU).missing[name]
+
+
+def damaged(folder: Path) -> dict[str, Path]:
+    """Files that are no weights, by what is said of them."""
+    files = {name: folder / f"{index}.pth" for index, name in enumerate(("layers of none", "cannot be read", "a list"))}
+    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["layers of none"])
+    files["cannot be read"].write_bytes(b"PK\x03\x04 cut short")
+    torch.save([1, 2], files["a list"])
+    return {**files, "No such file": folder / "nowhere.safetensors"}
+
+
+@pytest.mark.parametrize("said", ["layers of none", "cannot be read", "a list", "No such file"])
+def test_files_that_are_no_weights(said: str, tmp_path: Path) -> None:
+    path = damaged(tmp_path)[said]
+    with pytest.raises(UserInputError, match=said) as raised:
+        lpips_metrics(LpipsRequest(files=(path,)), 70, CPU)
+    assert str(path) in str(raised.value)
+    assert "expected" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_learned_layers_of_another_shape(tmp_path: Path) -> None:
+    weights = {**random_weights("alex"), "lin2.weight": torch.zeros(1, 5, 1, 1)}
+    torch.save(weights, tmp_path / "weights.pth")
+    with pytest.raises(UserInputError, match=r"learned.2 is \(1, 5, 1, 1\), expected \(1, 384, 1, 1\)"):
+        lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 70, CPU)
+
+
+def test_an_unknown_variant_names_the_known_ones() -> None:
+    with pytest.raises(UserInputError, match=r"--lpips vgg19: expected none, or some of vgg, alex, squeeze, vgg_3dgs"):
+        LpipsRequest.parse("alex,vgg19")
