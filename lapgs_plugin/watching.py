@@ -5,7 +5,7 @@ A `StageHook` takes part in an iteration and may change it. A `Watcher` is shown
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from lapgs_plugin.plan import Stage
@@ -29,16 +29,21 @@ class Watcher:
         return False
 
     def look(
-        self, stage: Stage, iteration: int, field: Callable[[], GaussianField], interrupted: Callable[[], bool]
+        self,
+        stage: Stage,
+        iteration: int,
+        fields: Callable[[], Mapping[int, GaussianField]],
+        interrupted: Callable[[], bool],
     ) -> None:
-        """Look at the field under training, for as long as it takes.
+        """Look at what is under training, for as long as it takes.
 
         Args:
             stage: that runs.
             iteration: the last finished one, from 1 within the stage.
-            field: gives the current parameters; they may change when `look` has returned.
+            fields: gives the current parameters by level: those of the stage, and of finished levels where they are
+                trained along; without gradients. They may change when `look` has returned.
             interrupted: whether the user asked training to stop; whoever waits for anything asks it now and then.
         """
 
-    def stage_finished(self, stage: Stage, field: GaussianField) -> None:
-        """A stage is archived; `field` is its result."""
+    def stage_finished(self, stage: Stage, fields: Callable[[], Mapping[int, GaussianField]]) -> None:
+        """A stage is archived; `fields` gives its result, and finished fields that were trained along, by level."""

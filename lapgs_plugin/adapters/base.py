@@ -262,10 +262,8 @@ class BackboneAdapter(ABC):
 
     @torch.no_grad()
     def export_field(self, gaussians: Any, signed: bool) -> GaussianField:
-        """The model's parameters as a field on their device; shares no memory with the model."""
-        if gaussians.opacity_activation is torch.sigmoid:
-            logits = gaussians._opacity
-        else:
+        """The model's parameters as `snapshot` gives them, to be archived: says how many a PLY cannot hold."""
+        if gaussians.opacity_activation is not torch.sigmoid:
             opacity = gaussians.get_opacity
             if cut := int((opacity > LARGEST_OPACITY).sum()):
                 logger.warning(
@@ -273,7 +271,15 @@ class BackboneAdapter(ABC):
                     cut,
                     len(opacity),
                 )
-            logits = torch.logit(opacity.clamp(1e-6, LARGEST_OPACITY))
+        return self.snapshot(gaussians, signed)
+
+    @torch.no_grad()
+    def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
+        """The model's parameters as a field on their device; shares no memory with the model."""
+        if gaussians.opacity_activation is torch.sigmoid:
+            logits = gaussians._opacity
+        else:
+            logits = torch.logit(gaussians.get_opacity.clamp(1e-6, LARGEST_OPACITY))
         return GaussianField(
             means=gaussians._xyz.detach().clone(),
             quaternions=gaussians._rotation.detach().clone(),

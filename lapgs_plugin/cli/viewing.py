@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.watching import Watcher
 
 if TYPE_CHECKING:
     from lapgs_plugin.viewer.page import Page
@@ -38,16 +41,6 @@ def require_viser(what: str) -> None:
         )
 
 
-def check_view_port(view: bool, port: int | None) -> None:
-    """Refuse a port without a viewer.
-
-    Raises:
-        UserInputError: there is one.
-    """
-    if port is not None and not view:
-        raise UserInputError(f"--view-port {port} needs --view; leave it out")
-
-
 def open_page(host: str, port: int, label: str, until: str) -> Page:
     """Serve the page, and say where.
 
@@ -59,3 +52,28 @@ def open_page(host: str, port: int, label: str, until: str) -> Page:
     page = Page(host, port, label)
     print(f"open {page.address} in a browser; {until}", flush=True)
     return page
+
+
+@contextmanager
+def watching(view: bool, port: int | None, label: str, device: str = "auto") -> Iterator[Watcher]:
+    """Who watches a run that is about to be trained: with `--view` whoever loads a page, else nobody.
+
+    Args:
+        view, port: as the options say.
+        label: of the page.
+        device: where pictures are rendered.
+
+    Raises:
+        UserInputError: a port without a viewer, or none that is free.
+        MissingExtraError: pages cannot be served.
+    """
+    if not view:
+        if port is not None:
+            raise UserInputError(f"--view-port {port} needs --view; leave it out")
+        yield Watcher()
+        return
+    require_viser("--view")
+    with open_page(HOST, PORT if port is None else port, label, "it shows the run while it is trained") as page:
+        from lapgs_plugin.viewer.live import LiveView
+
+        yield LiveView(page, device)

@@ -28,7 +28,7 @@ class Pacing:
         self._moving = 0.25  # scale; before anything was measured
         self._largest = 1.0  # scale of a picture when nothing moves
         self._changed: float | None = None  # time of the last change that was not drawn
-        self._renewed = False  # the scene is another than the one that is shown
+        self._renewed: float | None = None  # since when the scene is another than the one that is shown
         self._last_change = -math.inf
         self._drawn = 1.0  # scale of the picture that is shown
 
@@ -36,19 +36,23 @@ class Pacing:
         """What is shown is out of date: the camera moved, a control was used, the window has another size."""
         self._changed = self._last_change = now
 
-    def renew(self) -> None:
+    def renew(self, now: float) -> None:
         """The scene is another, seen as before: what is drawn next need not be smaller than what is shown."""
-        self._renewed = True
+        if self._renewed is None:
+            self._renewed = now
 
     def due(self) -> float | None:
         """When the next picture is to be drawn; None while the one that is shown is as good as it gets."""
         if self._changed is not None:
             return self._changed
-        return self._last_change + SETTLE_SECONDS if self._renewed or self._drawn < self._largest else None
+        settled = self._last_change + SETTLE_SECONDS
+        if self._renewed is not None:
+            return max(self._renewed, settled)
+        return settled if self._drawn < self._largest else None
 
     def begin(self) -> float:
         """The scale to draw at now; changes from here on ask for another picture."""
-        self._renewed = False
+        self._renewed = None
         if self._changed is None:
             return min(self._largest, STEP * self._drawn)
         self._changed = None

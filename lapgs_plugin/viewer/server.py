@@ -55,6 +55,13 @@ class Viewer:
                 session.show(exhibit)
             self._awake.notify()
 
+    def forget(self) -> None:
+        """Let go of what was shown: nothing is drawn until there is something else."""
+        with self._awake:
+            self._exhibit = None
+            for session in self._sessions.values():
+                session.forget()
+
     def serve(self, stop: threading.Event | None = None) -> None:
         """Draw for whoever is connected, until `stop` is set or the process is interrupted."""
         while stop is None or not stop.is_set():

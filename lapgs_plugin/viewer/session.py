@@ -80,6 +80,8 @@ class Session:
         self._pacing = Pacing(seconds.moving, seconds.still)
         self._lock = threading.Lock()
         self._exhibit: Exhibit | None = None
+        self._cameras: Mapping[str, Camera] = {}
+        self._rig: Rig | None = None
         self._coming: Exhibit | None = None  # what the next picture shows
         self._controls: Controls | None = None
         self._handle: viser.IcosphereHandle | None = None
@@ -94,7 +96,12 @@ class Session:
         """Look at this from the next picture on."""
         with self._lock:
             self._coming = exhibit
-            self._pacing.renew()
+            self._pacing.renew(time.perf_counter())
+
+    def forget(self) -> None:
+        """Let go of what was shown; the picture stays."""
+        with self._lock:
+            self._exhibit = self._coming = None
 
     def stand_at(self, start: Start) -> None:
         """Begin there."""
@@ -120,7 +127,9 @@ class Session:
         with self._lock:
             scale = self._pacing.begin()
             exhibit, self._coming = self._coming or self._exhibit, None
-        assert exhibit is not None, "nothing is due before there is something to look at"
+            self._exhibit = exhibit
+        if exhibit is None:  # forgotten since somebody found it due
+            return
         controls = self._adopt(exhibit)
         picture = self._draw(exhibit, controls.settings, scale)
         if self._left:
@@ -136,7 +145,7 @@ class Session:
 
     def _adopt(self, exhibit: Exhibit) -> Controls:
         """Make the panel that of the exhibit."""
-        self._exhibit = exhibit
+        self._cameras, self._rig = exhibit.cameras, exhibit.rig
         if self._controls is None or not self._controls.fits(exhibit.run, exhibit.other):
             self._controls = Controls(
                 self._client,
@@ -169,6 +178,7 @@ class Session:
 
     def _send(self, picture: Picture, quality: int) -> None:
         self._client.scene.set_background_image(as_bytes(picture.image), format="jpeg", jpeg_quality=quality)
+        self._client.flush()  # or viser collects messages for up to 1/60 s
 
     def _change(self) -> None:
         with self._lock:
@@ -205,17 +215,15 @@ class Session:
 
     def _go_to(self, index: int) -> None:
         """Stand where a camera of the scene stands."""
-        exhibit = self._exhibit
-        assert exhibit is not None, "the panel came with one"
-        assert exhibit.rig is not None, "there are cameras"
-        pose = Pose.of(list(exhibit.cameras.values())[index])
+        assert self._rig is not None, "there are cameras"
+        pose = Pose.of(list(self._cameras.values())[index])
         camera = self._client.camera
         with self._client.atomic():
             camera.fov = pose.fov
             camera.position = pose.position
             camera.wxyz = pose.wxyz
             ahead = viser.transforms.SO3(pose.wxyz).as_matrix()[:, 2]
-            camera.look_at = pose.position + turning_distance(pose.position, exhibit.rig) * ahead
+            camera.look_at = pose.position + turning_distance(pose.position, self._rig) * ahead
 
     def _keep(self) -> int:
         """Remember the view for a path."""
@@ -236,22 +244,22 @@ class Session:
         self._go_to(index)
 
     def _show_cameras(self, wanted: bool) -> None:
-        if wanted and not self._frustums and self._exhibit is not None:
-            self._frustums = self._add_frustums(self._exhibit)
+        if wanted and not self._frustums:
+            self._frustums = self._add_frustums()
         for frustum in self._frustums:
             frustum.visible = wanted
 
-    def _add_frustums(self, exhibit: Exhibit) -> list[viser.CameraFrustumHandle]:
-        assert exhibit.rig is not None, "there are cameras"
+    def _add_frustums(self) -> list[viser.CameraFrustumHandle]:
+        assert self._rig is not None, "there are cameras"
         frustums = []
-        for index, (name, camera) in enumerate(exhibit.cameras.items()):
+        for index, (name, camera) in enumerate(self._cameras.items()):
             pose = Pose.of(camera)
             frustum = self._client.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov=pose.fov,
                 aspect=camera.width / camera.height,
-                scale=0.05 * exhibit.rig.distance,
-                thickness=0.001 * exhibit.rig.distance,
+                scale=0.05 * self._rig.distance,
+                thickness=0.001 * self._rig.distance,
                 color=(240, 150, 40),
                 wxyz=pose.wxyz,
                 position=pose.position,

@@ -1,0 +1,221 @@
+"""Watching a run while it is trained: pictures come, the result has the same bits, and nothing that fails ends it."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.plan import Stage
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from lapgs_plugin.watching import Watcher
+from tests.training_scene import ring_scene
+
+pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from lapgs_plugin.viewer import live
+from lapgs_plugin.viewer.live import LiveView
+from lapgs_plugin.viewer.page import Page
+from lapgs_plugin.viewer.server import Viewer
+from tests.viewer.wire import WireClient, wire_client
+
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    with Page("127.0.0.1", 8850, "run") as page:
+        yield page
+
+
+def train(folder: Path, watcher: Watcher, iterations: int) -> RunArchive:
+    settings = TrainSettings(
+        iterations=iterations, levels=2, sh_degree=1, densification=Densification(start=20, every=20)
+    )
+    scene = ring_scene()
+    reference = SceneReference(str(scene.path), "full", True, scene.background, "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
+    with RunArchive.create(folder, manifest) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer(), watcher=watcher).run()
+    return archive
+
+
+class Watched(LiveView):
+    """Trains no further than to the second iteration of a stage before `go` is set."""
+
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self.go = threading.Event()
+        self.looks = 0
+
+    def wants_look(self) -> bool:
+        self.go.wait(PATIENCE)
+        return super().wants_look()
+
+    def look(self, *args: object) -> None:  # type: ignore[override]  # counts
+        self.looks += 1
+        super().look(*args)  # type: ignore[arg-type]
+
+
+def watched_run(
+    folder: Path, page: Page, watcher: Watched, client_does: Callable[[WireClient], None], iterations: int = 300
+) -> RunArchive:
+    """Train in a thread while a client looks on."""
+    result: list[RunArchive] = []
+    thread = threading.Thread(target=lambda: result.append(train(folder, watcher, iterations)))
+    thread.start()
+    try:
+        with wire_client(page.address) as client:
+            wait_for(lambda: watcher._viewer.watched)
+            watcher.go.set()
+            client_does(client)
+    finally:
+        watcher.go.set()
+        thread.join(PATIENCE)
+    assert len(result) == 1, "training did not come to its end"
+    return result[0]
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def same_bits(one: RunArchive, other: RunArchive) -> bool:
+    return all(
+        torch.equal(a, b)
+        for level in (1, 0)
+        for a, b in zip(one.field(level).parameters.values(), other.field(level).parameters.values(), strict=True)
+    )
+
+
+def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(page: Page, tmp_path: Path) -> None:
+    watcher = Watched(page)
+    watcher._percent.value = 50.0
+
+    def look(client: WireClient) -> None:
+        wait_for(lambda: client.listen(0.05) > 0 and any("training level 0 of 2" in text for text in client.words))
+
+    archive = watched_run(tmp_path / "watched", page, watcher, look)
+    assert watcher.looks > 3
+    assert all(record.overhead_seconds["view"] > 0 for record in archive.manifest.records)
+    assert same_bits(archive, train(tmp_path / "alone", Watcher(), 300))
+
+
+def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: Path) -> None:
+    watcher = Watched(page)
+    watcher._percent.value = 50.0
+
+    def look(client: WireClient) -> None:
+        assert client.listen(PATIENCE, pictures=1) == 1
+        client.connection.close()
+        wait_for(lambda: not watcher._viewer.watched)
+        with wire_client(page.address) as again:
+            assert again.listen(PATIENCE, pictures=1) == 1
+
+    watched_run(tmp_path / "run", page, watcher, look, iterations=600)
+
+
+def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, tmp_path: Path) -> None:
+    watcher = Watched(page)
+    watcher._pause.value = True
+
+    def look(client: WireClient) -> None:
+        assert client.listen(PATIENCE, pictures=1) == 1
+        status = page.status
+        assert "iteration 1 of" in status
+        client.look_from(0.5, 0.0, -4.0)  # pictures come without training going on
+        assert client.listen(PATIENCE, pictures=1) == 1
+        assert page.status == status
+        watcher._pause.value = False
+        wait_for(lambda: client.listen(0.05) >= 0 and "iteration 1 of" not in page.status)
+        watcher._pause.value = True
+
+    watched_run(tmp_path / "run", page, watcher, look)  # it ends although it is paused: the client has left
+
+
+def test_a_stop_is_heard_while_training_is_paused(page: Page) -> None:
+    watcher = LiveView(page)
+    watcher._pause.value = True
+    asked: list[bool] = []
+    with wire_client(page.address):
+        wait_for(lambda: watcher._viewer.watched)
+        stage = ring_stage()
+        watcher._show = lambda *_: None  # type: ignore[method-assign]
+        watcher.look(stage, 1, dict, lambda: asked.append(True) or len(asked) > 2)  # type: ignore[func-returns-value]
+    assert len(asked) == 3
+
+
+def ring_stage() -> Stage:
+    return Stage(level=0, image_size=(56, 40), iterations=10, signed=False)
+
+
+@pytest.mark.parametrize("broken", ["draw_next", "show", "begin_at"])
+def test_a_viewer_that_fails_ends_watching_not_training(
+    page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("no more memory for pictures")
+
+    monkeypatch.setattr(Viewer, broken, fail)
+    watcher = Watched(page)
+    archive = watched_run(tmp_path / "run", page, watcher, lambda client: wait_for(lambda: watcher._failed), 30)
+    assert archive.manifest.complete
+    assert watcher.looks <= 1
+    assert [record.message for record in caplog.records] == [
+        "nobody can watch any more, training goes on: no more memory for pictures"
+    ]
+
+
+@pytest.mark.parametrize("percent", [2.0, 10.0, 50.0])
+def test_pictures_take_no_more_than_their_share(page: Page, monkeypatch: pytest.MonkeyPatch, percent: float) -> None:
+    """On a clock of the test's own: iterations of 3 ms, pictures of 1 to 40 ms."""
+    clock = Clock()
+    monkeypatch.setattr(live.time, "perf_counter", clock)
+    watcher = LiveView(page)
+    watcher._percent.value = percent
+    durations = itertools.cycle([0.001, 0.04, 0.013])
+    monkeypatch.setattr(watcher, "_show", lambda *_: clock.sleep(next(durations)))
+    monkeypatch.setattr(watcher._viewer, "draw_next", lambda patience: True)
+    monkeypatch.setattr(Viewer, "watched", True)
+    looking = training = 0.0
+    for iteration in range(20_000):
+        clock.sleep(0.003)
+        training += 0.003
+        if watcher.wants_look():
+            before = clock()
+            watcher.look(ring_stage(), iteration, dict, lambda: False)
+            looking += clock() - before
+    share = percent / 100.0
+    first_and_last = 2 * 0.04  # the first picture waits for nothing, the last one's time has not come
+    assert looking <= share * (training + looking) + first_and_last
+    assert looking >= 0.75 * share * (training + looking)  # worst seen 0.84: iterations are not divided
+
+
+def test_no_share_is_no_picture(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    watcher = LiveView(page)
+    monkeypatch.setattr(Viewer, "watched", True)
+    assert watcher.wants_look()
+    watcher._percent.value = 0.0
+    assert not watcher.wants_look()
+
+
+class Clock:
+    def __init__(self) -> None:
+        self._now = 100.0
+
+    def __call__(self) -> float:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        self._now += seconds
