@@ -16,6 +16,9 @@ from lapgs_plugin.errors import RunFolderError
 MANIFEST = "manifest.json"
 """Name of the file that makes a folder a run."""
 
+BARE_RECORD = "lapgs_record.json"
+"""Name of the file in which `lapgs run --off --record` notes what a script's own run took."""
+
 LOCK = ".lock"
 """Name of the file that `FolderLock` locks."""
 

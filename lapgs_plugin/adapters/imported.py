@@ -5,6 +5,7 @@
     FOLDER/L<l>/point_cloud/iteration_<n>/point_cloud.ply  the release's field of level l, 0 the finest
     FOLDER/L<l>/TRAIN_INFO                                 its seconds and Gaussians, counted since the first stage
     FOLDER/runtime_breakdown.json                          its options, where it was asked for one
+    FOLDER/lapgs_record.json                               what a codebase's run took, where `lapgs run` recorded it
 
 The release's rasterizer for residuals evaluates SH without the 0.5 and the clamp, which is our signed colour: its
 coefficients are taken over as they are. Its images are composed of renders that are clamped each, on a pixel grid of
@@ -27,7 +28,7 @@ from lapgs_plugin.adapters.known import adapters
 from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.files import one_line_errors
+from lapgs_plugin.files import BARE_RECORD, one_line_errors
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import MIXED_GRID
 from lapgs_plugin.rendering.compose import CLAMPED
@@ -66,12 +67,14 @@ class ForeignRun:
         options: the model's options, from cfg_args.
         levels: coarsest first, without gaps.
         codebase: name of the backbone, None where the folder does not tell.
+        record: what `lapgs run --off --record` noted, empty without it.
     """
 
     folder: Path
     options: Mapping[str, Any]
     levels: tuple[ForeignLevel, ...]
     codebase: str | None
+    record: Mapping[str, Any]
 
     @property
     def is_hierarchy(self) -> bool:
@@ -80,7 +83,7 @@ class ForeignRun:
 
     @property
     def times_are_known(self) -> bool:
-        return all(level.seconds is not None for level in self.levels)
+        return bool(self.record) or all(level.seconds is not None for level in self.levels)
 
 
 def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
@@ -112,7 +115,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
             f"{folder} holds {found}, expected point_cloud/, or L<n>/point_cloud/ of the coarsest level and of those "
             "below it without gaps; give the folder that training wrote with -m"
         )
-    breakdown = _breakdown(folder)
+    breakdown = _read_json(folder / BREAKDOWN)
     if trained[expected[0]] != folder and options.get("white_background"):
         raise RunFolderError(
             f"{folder} was trained with --white_background, which the release adds again with every residual; "
@@ -121,7 +124,8 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
     if breakdown.get("config", {}).get("blur_up") is False:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
-    return ForeignRun(folder, options, levels, _recognised(options, breakdown))
+    record = _read_json(folder / BARE_RECORD) if levels[0].ply.is_relative_to(folder / "point_cloud") else {}
+    return ForeignRun(folder, options, levels, _recognised(options, breakdown), record)
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:
@@ -207,9 +211,25 @@ def import_run(
                 overhead_seconds={},
                 image_size=level_size(size, level.level),
             )
-            archive.finish_level(record, field)
+            archive.finish_level(_as_recorded(record, run.record), field)
             seconds, peak = level.seconds or seconds, max(peak, level.peak or 0)
+        for entry in run.record.get("timeline", ()):
+            archive.append_history({"level": 0, **entry})
     return archive
+
+
+def _as_recorded(record: LevelRecord, noted: Mapping[str, Any]) -> LevelRecord:
+    """A level's record with what was noted while it was trained."""
+    if not noted:
+        return record
+    return replace(
+        record,
+        train_seconds=noted["train_seconds"],
+        peak_gaussians=noted["peak_gaussians"],
+        mean_gaussians=noted["mean_gaussians"],
+        memory_bytes=noted["memory_bytes"],
+        overhead_seconds={"saving": noted["saving_seconds"]},
+    )
 
 
 def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
@@ -245,8 +265,8 @@ def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str
     return noted if noted in known else None
 
 
-def _breakdown(folder: Path) -> dict[str, Any]:
-    path = folder / BREAKDOWN
+def _read_json(path: Path) -> dict[str, Any]:
+    """A JSON object, empty when there is no file."""
     if not path.is_file():
         return {}
     try:

@@ -26,6 +26,13 @@ def run(
         list[str] | None, typer.Argument(help="The script's own arguments, as without lapgs.", metavar="ARGUMENTS...")
     ] = None,
     off: Annotated[bool, typer.Option("--off", help="Replace nothing: the script as Python would run it.")] = False,
+    record: Annotated[
+        bool,
+        typer.Option(
+            "--record",
+            help="With --off: note time, Gaussians, memory and held-out PSNR of the script's own run in its -m folder.",
+        ),
+    ] = False,
     backbone: Annotated[
         str | None, typer.Option(help="fastgs, taming or graphdeco; recognised from the checkout when not given.")
     ] = None,
@@ -129,11 +136,14 @@ def run(
     from lapgs_plugin.adapters.known import adapter_class
     from lapgs_plugin.adapters.run_state import HierarchyOptions
     from lapgs_plugin.adapters.script import loaded_script, require_script
+    from lapgs_plugin.adapters.witness import Witness
     from lapgs_plugin.inheritance import parse_inheritance
 
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
+    if record and not off:
+        raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
     mode, ratio = parse_inheritance(inherit)
     options = HierarchyOptions(
         levels=levels,
@@ -161,6 +171,9 @@ def run(
     on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
     try:
         with on_device, loaded_script(script, words) as loaded:
+            if off and record:
+                Witness(kind(loaded), chosen).run()
+                return
             if off:
                 loaded.run_main()
                 return

@@ -25,10 +25,9 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
+from lapgs_plugin.files import BARE_RECORD
 
 EVALUATED, RECORDED = "lapgs eval", "training"
-BARE_RECORD = "lapgs_record.json"
-"""What `lapgs run --off --record` writes into the script's output folder."""
 
 
 def result_row(job: Job) -> dict[str, Any]:
