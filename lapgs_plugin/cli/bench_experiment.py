@@ -25,7 +25,7 @@ ENGINE = "On what"
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
-    *("script", "arguments", "off", "record"),
+    *("script", "arguments", "off", "record", "view", "view_port"),
 }
 """Parameters of `lapgs train` and `lapgs run` that an experiment says in its own way."""
 
@@ -94,6 +94,9 @@ def bench_experiment(
             help="Measure every run with `lapgs eval`; without, the PSNR that training noted at its end is taken.",
         ),
     ] = True,
+    lpips_weights: Annotated[
+        list[Path] | None, typer.Option(help="For `lapgs eval`: weights of an LPIPS network; once for each network.")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands of every run, and run none.")] = False,
     tables_only: Annotated[
         bool, typer.Option("--tables-only", help="Write the tables again from results that are there.")
@@ -127,11 +130,13 @@ def bench_experiment(
     planned, scenes = plan_runs(loaded, selection), scenes_of(loaded, selection)
     folder = Folder(Path("runs", "bench", loaded.name) if out is None else out)
     if not tables_only:
-        _require_measuring(evaluate)
+        if evaluate:
+            _require_measuring()
         places = Places(
             {name: Path(value).expanduser() for name, value in _pairs(path, "--path").items()}, experiment.parent
         )
-        jobs = prepare(planned, scenes, places, folder, evaluate)
+        weights = [word for file in lpips_weights or () for word in ("--lpips-weights", str(file.absolute()))]
+        jobs = prepare(planned, scenes, places, folder, weights if evaluate else None)
         if dry_run:
             _print_commands(jobs)
             return
@@ -174,12 +179,12 @@ def _pairs(texts: Sequence[str] | None, option: str) -> dict[str, str]:
     return found
 
 
-def _require_measuring(evaluate: bool) -> None:
+def _require_measuring() -> None:
     """`lapgs eval` reads scenes, for which not every machine has the packages."""
     from importlib.util import find_spec
 
     missing = [name for name in ("OpenImageIO", "pycolmap") if find_spec(name) is None]
-    if evaluate and missing:
+    if missing:
         raise UserInputError(
             f"{' and '.join(missing)} cannot be imported here, which `lapgs eval` reads scenes with; give --no-eval to "
             "take the PSNR that training notes"

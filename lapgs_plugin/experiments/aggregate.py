@@ -291,13 +291,16 @@ class _Part:
         base = self._baseline(backbone)
         time = next((name for name in TIMES if name in cells[key]), None)
         return TableRow(
-            label=variant if len({b for b, _ in self._keys}) == 1 else f"{variant} ({backbone})",
+            label=variant if len({b for b, _ in self._keys}) == 1 else f"{variant} ({self._backbone_title(backbone)})",
             section=self._variants[variant].section,
             cells=cells[key],
             speedup=_compare(cells[base].get(time or ""), cells[key].get(time or ""), lambda base, own: base / own),
             psnr_gain=_compare(cells[base].get("psnr"), cells[key].get("psnr"), lambda base, own: own - base),
             is_baseline=key == base,
         )
+
+    def _backbone_title(self, backbone: str) -> str:
+        return self._experiment.backbones[backbone].title or backbone
 
     def _baseline(self, backbone: str) -> RowKey:
         """The row that rows of a backbone are compared with: the one marked so, or the first."""

@@ -103,7 +103,9 @@ def _variable(name: str) -> str:
     return "LAPGS_" + name.upper().replace("-", "_").replace(".", "_")
 
 
-def run_steps(spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, evaluate: bool) -> list[Step]:
+def run_steps(
+    spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, evaluate: Sequence[str] | None
+) -> list[Step]:
     """The commands of a run, one after the other.
 
     Args:
@@ -111,7 +113,7 @@ def run_steps(spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, e
         scene: its scene's folder.
         checkout: of its backbone; None for the built-in trainer.
         folder: that it writes into; what is there is replaced.
-        evaluate: end with `lapgs eval`.
+        evaluate: options of `lapgs eval`, which is then the last command; None leaves it out.
 
     Raises:
         UserInputError: the script of a checkout knows no such resolution.
@@ -123,10 +125,10 @@ def run_steps(spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, e
         bare = spec.method == "bare"
         steps = [Step((*_lapgs_run(spec, bare), *_script(spec, scene, checkout, folder)), str(checkout))]
         measured = folder / IMPORTED if bare else folder
-        if bare and evaluate:
+        if bare and evaluate is not None:
             steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))
-    if evaluate:
-        steps.append(Step((*LAPGS, "eval", str(measured)), str(folder.parent)))
+    if evaluate is not None:
+        steps.append(Step((*LAPGS, "eval", str(measured), *evaluate), str(folder.parent)))
     return steps
 
 

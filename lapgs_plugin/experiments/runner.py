@@ -33,9 +33,20 @@ class Folder:
 
 
 def prepare(
-    planned: Sequence[PlannedRun], scenes: Sequence[SceneSpec], places: Places, folder: Folder, evaluate: bool
+    planned: Sequence[PlannedRun],
+    scenes: Sequence[SceneSpec],
+    places: Places,
+    folder: Folder,
+    evaluate: Sequence[str] | None,
 ) -> list[Job]:
     """The jobs of all runs that are different, in their order, after checking that their files are there.
+
+    Args:
+        planned: the runs.
+        scenes: that they are trained on.
+        places: where scenes and checkouts lie.
+        folder: of the experiment.
+        evaluate: options of `lapgs eval`; None leaves it out.
 
     Raises:
         UserInputError: a scene or a checkout is missing.
@@ -49,7 +60,7 @@ def prepare(
         checkout = checkouts[spec.checkout] if spec.checkout else None
         steps = run_steps(spec, where[spec.scene], checkout, own, evaluate)
         log = str(folder.logs(f"{spec.run_id}.log").absolute())
-        jobs.setdefault(spec.run_id, Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate))
+        jobs.setdefault(spec.run_id, Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None))
     return list(jobs.values())
 
 

@@ -78,6 +78,7 @@ class Backbone(_Part):
     """One `[backbones.NAME]`: the built-in trainer on a rasterizer, or a checkout.
 
     Attributes:
+        title: in tables; NAME when it is not given.
         rasterizer: of `lapgs train`: gsplat, cpu, auto, ...
         checkout: name under which --path or an environment variable gives the checkout's folder.
         preset: published options for the scenes of standard data sets, a name in data/presets.toml.
@@ -85,6 +86,7 @@ class Backbone(_Part):
         options: of `lapgs train` for every run, or of `lapgs run` for every hierarchy.
     """
 
+    title: str = ""
     rasterizer: str | None = None
     checkout: str | None = Field(None, pattern=NAME)
     preset: str | None = None

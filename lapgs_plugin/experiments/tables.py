@@ -40,11 +40,11 @@ def latex(table: ResultTable) -> str:
 
 def _legend(table: ResultTable) -> str:
     seeds = max((cell.seeds for group in table.groups for row in group.rows for cell in row.cells.values()), default=0)
-    spread = f"mean ± sample deviation over {seeds} seeds" if seeds > 1 else "one seed"
+    spread = f"Means ± sample deviation over {seeds} seeds" if seeds > 1 else "One seed"
     has_paper = any(c.paper for group in table.groups for row in group.rows for c in row.cells.values())
-    paper = "; the paper's figure in brackets" if has_paper else ""
+    paper = "; the paper's figures in brackets" if has_paper else ""
     bases = {row.label for group in table.groups for row in group.rows if row.is_baseline}
-    return f"Each figure is a {spread}{paper}. Compared with: {', '.join(sorted(bases))}."
+    return f"{spread}{paper}. Speed-up and change of PSNR are against {', '.join(sorted(bases))}."
 
 
 def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
