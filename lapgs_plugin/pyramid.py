@@ -83,6 +83,24 @@ class Pyramid:
             values = _blur(_sample(values, dim, self._fine_centres(fine, (fine + 1) // 2)), dim)
         return values.to(image.dtype)
 
+    def up_taps(self, fine: int) -> tuple[Tensor, Tensor]:
+        """Up along one side as sums: fine sample i is that of weights[i, k] * coarse[first[i] + k] over k.
+
+        Args:
+            fine: samples of the finer side.
+
+        Returns:
+            first (fine,) int64 and weights (fine, k) float64, k at most 5, both on the CPU.
+        """
+        coarse = (fine + 1) // 2
+        every = torch.eye(coarse, dtype=torch.float64)
+        matrix = _blur(_sample(every, 0, self._fine_centres(fine, coarse)), 0)  # (fine, coarse)
+        used = matrix != 0
+        first = used.to(torch.uint8).argmax(1)
+        taps = int((coarse - used.flip(1).to(torch.uint8).argmax(1) - first).max())
+        first = first.clamp_max(coarse - taps)
+        return first, matrix.gather(1, first[:, None] + torch.arange(taps))
+
     def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
         """Gaussian pyramid: I^0 = `image`, I^(l+1) = Down(I^l), finest first.
 

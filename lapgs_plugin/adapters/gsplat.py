@@ -1,7 +1,8 @@
 """gsplat's CUDA rasterizer behind the one interface `lapgs_plugin.raster.Rasterizer`.
 
 gsplat passes colours through as they are, so signed colour needs nothing from it: SH are evaluated by its own kernel,
-and nothing is added or clamped. For ordinary colour it gets the SH, and evaluates them where they are visible.
+and nothing is added or clamped. Ordinary colour is evaluated here, too: where gsplat does it, it inverts the camera's
+pose, and PyTorch waits for the GPU to learn whether that worked.
 
 A call waits for the GPU once, inside of gsplat, which asks how many pairs of Gaussian and tile there are; a packed one
 also asks how many Gaussians are visible.
@@ -10,6 +11,7 @@ also asks how many Gaussians are visible.
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +109,6 @@ class GsplatRasterizer:
             raise UserInputError(
                 f"means is {means.dtype} on {means.device}, expected float32 on {self._device}; use .to()"
             )
-        from gsplat import rasterization, spherical_harmonics
-
         n, width, height = len(field), camera.width, camera.height
         differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
         means2d = means.new_zeros(n, 2).requires_grad_(differentiated)  # (n, 2)
@@ -121,34 +121,52 @@ class GsplatRasterizer:
                 image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
             )
         degree = field.sh_degree if sh_degree is None else sh_degree
-        viewmat, intrinsics, position = _on_device(camera, means)
-        colors = field.sh  # (n, k, 3)
-        if field.signed:
-            colors = spherical_harmonics(degree, means - position, field.sh)  # (n, 3)
-        images, alphas, found = rasterization(
-            means,
-            field.quaternions,
-            torch.exp(field.log_scales),
-            torch.sigmoid(field.opacity_logits),
-            colors,
-            viewmat[None],
-            intrinsics[None],
-            width,
-            height,
-            sh_degree=None if field.signed else degree,
-            near_plane=NEAR_DEPTH,
-            eps2d=PIXEL_VARIANCE,
-            radius_clip=0.0,
-            packed=self._packed,
-            backgrounds=background.to(means)[None],  # (1, 3)
-            rasterize_mode=self._mode,
-            absgrad=absgrad2d is not None,
-        )  # (1, h, w, 3), (1, h, w, 1)
+        images, alphas, found = self._rasterize(field, [camera], background, degree, absgrad2d is not None)
         if differentiated:
             _hand_over_gradients(found, means2d, absgrad2d)
         with torch.no_grad():
             radii = self._describe(found, means2d)
         return RenderResult(images[0].permute(2, 0, 1), 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
+
+    @torch.no_grad()
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        """Images alone, of several cameras at once; see `lapgs_plugin.raster.ImageRasterizer`."""
+        if len(field) == 0:
+            shape = len(cameras), 3, cameras[0].height, cameras[0].width
+            return background.to(field.means)[:, None, None].expand(shape)
+        images, _, _ = self._rasterize(field, cameras, background, field.sh_degree, absgrad=False)
+        return images.permute(0, 3, 1, 2)
+
+    def _rasterize(
+        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, absgrad: bool
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Images (b, h, w, 3), opacities (b, h, w, 1) and what gsplat found on the way; cameras of one size."""
+        from gsplat import rasterization, spherical_harmonics
+
+        means = field.means
+        viewmats, intrinsics, positions = _on_device(cameras, means)
+        colors = [spherical_harmonics(degree, means - position, field.sh) for position in positions]  # (n, 3) each
+        if not field.signed:
+            colors = [torch.clamp_min(color + 0.5, 0.0) for color in colors]
+        found: tuple[Tensor, Tensor, dict[str, Any]] = rasterization(
+            means,
+            field.quaternions,
+            torch.exp(field.log_scales),
+            torch.sigmoid(field.opacity_logits),
+            colors[0] if len(colors) == 1 else torch.stack(colors),
+            viewmats,
+            intrinsics,
+            cameras[0].width,
+            cameras[0].height,
+            near_plane=NEAR_DEPTH,
+            eps2d=PIXEL_VARIANCE,
+            radius_clip=0.0,
+            packed=self._packed,
+            backgrounds=background.to(means).expand(len(cameras), 3),
+            rasterize_mode=self._mode,
+            absgrad=absgrad,
+        )
+        return found
 
     def _describe(self, found: dict[str, Any], means2d: Tensor) -> Tensor:
         """Fill in `means2d` (n, 2) and return the radii (n,) from what gsplat found."""
@@ -165,14 +183,19 @@ class GsplatRasterizer:
         return radii
 
 
-def _on_device(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose (4, 4), intrinsics (3, 3) and centre (3,) as tensors beside `like`, without waiting for its GPU."""
-    intrinsics = torch.tensor([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0], dtype=like.dtype)
-    pose = camera.world_to_camera
-    if pose.device.type != "cpu":
-        return pose.to(like), _sent(intrinsics, like.device).view(3, 3), camera.position.to(like)
-    numbers = _sent(torch.cat([intrinsics, pose.to(like.dtype).flatten(), camera.position.to(like.dtype)]), like.device)
-    return numbers[9:25].view(4, 4), numbers[:9].view(3, 3), numbers[25:]
+def _on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU."""
+    kind = like.dtype
+    intrinsics = torch.tensor(
+        [[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0] for c in cameras], dtype=kind
+    )  # (b, 9)
+    poses = torch.stack([camera.world_to_camera for camera in cameras])  # (b, 4, 4)
+    positions = torch.stack([camera.position for camera in cameras])  # (b, 3)
+    if poses.device.type != "cpu":
+        return poses.to(like), _sent(intrinsics, like.device).view(-1, 3, 3), positions.to(like)
+    numbers = torch.cat([intrinsics, poses.to(kind).flatten(1), positions.to(kind)], dim=1)  # (b, 28)
+    numbers = _sent(numbers, like.device)
+    return numbers[:, 9:25].reshape(-1, 4, 4), numbers[:, :9].reshape(-1, 3, 3), numbers[:, 25:]
 
 
 def _sent(numbers: Tensor, device: torch.device) -> Tensor:

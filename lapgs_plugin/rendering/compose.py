@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,22 +13,28 @@ from torch import Tensor
 
 from lapgs_plugin.archive import Manifest, RunArchive
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.raster import Rasterizer, render_images
+from lapgs_plugin.rendering.raising import add_raised
+from lapgs_plugin.rendering.residence import Residence
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
 
 
+LARGEST_GAIN = 1000.0
+"""Of a band. More is a slip: a residual of one step of 8 bits becomes 4 times the whole range with it."""
+
+
 @dataclass(frozen=True)
 class Composition:
-    """One view, level by level; the sums are never clamped.
+    """One view, or a batch of views of one size, level by level; the sums are never clamped.
 
     Attributes:
-        base: (3, h, w) the coarsest level's render, background blended in.
+        base: (3, h, w) the coarsest level's render, background blended in; of a batch (b, 3, h, w), as all images.
         residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size. Base and residuals
             include their gains, where any were asked for.
         composed: by level, finest last: (3, h, w) I_hat^l at that level's size; at the coarsest level it is `base`.
@@ -36,6 +43,13 @@ class Composition:
     base: Tensor
     residuals: dict[int, Tensor]
     composed: dict[int, Tensor]
+
+    def view(self, index: int) -> Composition:
+        """One view of a batch."""
+        residuals, composed = (
+            {level: images[index] for level, images in band.items()} for band in (self.residuals, self.composed)
+        )
+        return Composition(self.base[index], residuals, composed)
 
 
 def level_camera(camera: Camera, level: int) -> Camera:
@@ -61,12 +75,13 @@ def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) ->
 class HierarchyRenderer:
     """Renders the finished levels of a hierarchy and adds them up.
 
-    On a GPU every field is rendered in a stream of its own, and so is Up of what it gives: a coarse level, which leaves
-    most of a GPU idle, costs little beside a fine one. Nothing here waits for the GPU; images are for the stream that
-    is current when `render` is called.
+    On a GPU every field is rendered in a stream of its own: a coarse level, which leaves most of a GPU idle, costs
+    little beside a fine one. Up and the sum of a level are one kernel, in the stream that is current when `render` is
+    called, and that images are for. Nothing here waits for the GPU, but for a field that has to be brought there first.
 
     Attributes:
-        fields: by level; contiguous from `levels - 1` down to the finest that is finished.
+        fields: by level; contiguous from `levels - 1` down to the finest that is finished. Wherever they are, with a
+            `residence`, or else all on the device that renders them.
         levels: number of levels of the whole hierarchy, L.
         pyramid: Up between two levels; on the grid the hierarchy was trained with.
         rasterizer: renders every field.
@@ -74,6 +89,7 @@ class HierarchyRenderer:
         clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
             paper authors' release does in training and rendering.
         concurrent: on a GPU, let fields be rendered beside each other instead of one after the other.
+        residence: brings fields to the device when they are needed; None where they are there.
 
     Raises:
         UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
@@ -87,6 +103,7 @@ class HierarchyRenderer:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clamped: bool = False
     concurrent: bool = True
+    residence: Residence | None = None
 
     def __post_init__(self) -> None:
         given = sorted(self.fields, reverse=True)
@@ -105,26 +122,46 @@ class HierarchyRenderer:
 
     @classmethod
     def from_archive(
-        cls, archive: RunArchive, rasterizer: Rasterizer, device: torch.device | str = "cpu"
+        cls,
+        archive: RunArchive,
+        rasterizer: Rasterizer,
+        device: torch.device | str = "cpu",
+        *,
+        finest: int = 0,
+        keep: bool = True,
     ) -> HierarchyRenderer:
         """A renderer of a run's finished levels.
 
         Args:
             archive: the run.
             rasterizer: renders every field.
-            device: where it wants them; they are moved there once, and images stay there.
+            device: where it wants them, and images come out. Fields are brought there when they are first rendered.
+            finest: the finest level that is wanted; fields of finer ones are not read.
+            keep: let fields stay on the device. Otherwise they wait in page-locked memory and come for each frame anew,
+                which costs time and leaves the device's memory to images.
 
         Raises:
             RunFolderError: a field is damaged, or no level is finished.
         """
         manifest = archive.manifest
         manifest.record(manifest.levels - 1)
-        fields = {level: archive.field(level).to(device) for level in archive.available_levels}
-        return cls.of(manifest, fields, rasterizer)
+        fields: dict[int, GaussianField] = {}
+        for level in (each for each in archive.available_levels if each >= finest):
+            try:
+                fields[level] = archive.field(level)
+            except RunFolderError as error:
+                raise _with_what_is_left(error, list(fields)) from error
+        return cls.of(manifest, fields, rasterizer, Residence(torch.device(device), keep))
 
     @classmethod
-    def of(cls, manifest: Manifest, fields: Mapping[int, GaussianField], rasterizer: Rasterizer) -> HierarchyRenderer:
-        """A renderer of these fields of a run, where they are."""
+    def of(
+        cls,
+        manifest: Manifest,
+        fields: Mapping[int, GaussianField],
+        rasterizer: Rasterizer,
+        residence: Residence | None = None,
+    ) -> HierarchyRenderer:
+        """A renderer of these fields of a run, where they are, or with a `residence` where that brings them."""
         return cls(
             fields=fields,
             levels=manifest.levels,
@@ -132,12 +169,18 @@ class HierarchyRenderer:
             rasterizer=rasterizer,
             background=manifest.scene.background,
             clamped=bool(manifest.settings.get(CLAMPED, False)),
+            residence=residence,
         )
 
     @property
     def device(self) -> torch.device:
-        """Where the fields are, and the images come out."""
-        return self.fields[self.levels - 1].means.device
+        """Where fields are rendered, and the images come out."""
+        return self.fields[self.levels - 1].means.device if self.residence is None else self.residence.device
+
+    def field(self, level: int) -> GaussianField:
+        """A level's field on `device`."""
+        field = self.fields[level]
+        return field if self.residence is None else self.residence.bring(level, field)
 
     @property
     def finest(self) -> int:
@@ -172,37 +215,54 @@ class HierarchyRenderer:
                 return level
         return self.finest
 
-    @torch.no_grad()
     def render(self, camera: Camera, level: int = 0, gains: Mapping[int, float] | None = None) -> Composition:
         """Render a view from the coarsest level down to `level`.
 
         Args:
             camera: of the full-resolution view.
             level: finest level to add.
-            gains: by level, what its band is multiplied by; 1 where nothing is said, which is the image as trained. A
-                level with gain 0 is not rendered.
+            gains: by level, what its band is multiplied by, at least 0; 1 where nothing is said, which is the image as
+                trained. A level with gain 0 is not rendered.
 
         Raises:
-            UserInputError: that level is not there, or a gain is given for one that is not.
+            UserInputError: that level is not there, or a gain is out of range or for a level that is not there.
         """
-        self.require_level(level)
-        gains = {} if gains is None else gains
-        for each in gains:
-            self.require_level(each)
-        rendered: dict[int, Tensor] = {}
-        composed: dict[int, Tensor] = {}
-        raised: Tensor | None = None  # Up of what is composed so far
-        for each in range(self.levels - 1, level - 1, -1):
-            with self._beside(each):
-                rendered[each] = self._render_band(each, level_camera(camera, each), gains.get(each, 1.0))
-                composed[each] = rendered[each] if raised is None else self._after(each + 1, raised) + rendered[each]
-                if each > level:
-                    finer = level_camera(camera, each - 1)
-                    raised = self.pyramid.up(composed[each], (finer.height, finer.width))
-        self._gather([*rendered.values(), *composed.values()])
-        base = rendered.pop(self.levels - 1)
-        return Composition(base, residuals=rendered, composed=composed)
+        return self.render_batch([camera], level, gains).view(0)
 
+    @torch.no_grad()
+    def render_batch(
+        self, cameras: Sequence[Camera], level: int = 0, gains: Mapping[int, float] | None = None
+    ) -> Composition:
+        """Render several views at once, which spares launches where the rasterizer takes several cameras.
+
+        Args:
+            cameras: of full-resolution views, all of one size; at least one.
+            level, gains: as `render` takes them.
+
+        Returns:
+            A composition of images (b, 3, h, w).
+
+        Raises:
+            UserInputError: as `render`, or the cameras differ in size.
+        """
+        gains = self._checked(level, gains)
+        if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
+            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
+            raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
+        rendered: dict[int, Tensor] = {}
+        # The finest first: it takes longest, and coarser levels are rendered in its shadow.
+        for each in range(level, self.levels):
+            at_level = [level_camera(camera, each) for camera in cameras]
+            with self._beside(each):
+                rendered[each] = self._render_band(each, at_level, gains.get(each, 1.0))
+        base = self._for_current(self.levels - 1, rendered.pop(self.levels - 1))
+        residuals, composed = {}, {self.levels - 1: base}
+        for each in sorted(rendered, reverse=True):
+            residuals[each] = self._for_current(each, rendered[each])
+            composed[each] = add_raised(self.pyramid, composed[each + 1], residuals[each])
+        return Composition(base, residuals, composed)
+
+    @torch.no_grad()
     def render_level(
         self, camera: Camera, level: int, coarser: Tensor | None, gain: float = 1.0
     ) -> tuple[Tensor, Tensor]:
@@ -212,16 +272,28 @@ class HierarchyRenderer:
             camera: of the full-resolution view.
             level: which field to render.
             coarser: (3, h, w) I_hat^(l+1) of the same view, None for the coarsest level.
-            gain: what the render is multiplied by; 0 gives zeros without rendering.
+            gain: what the render is multiplied by, at least 0; 0 gives zeros without rendering.
 
         Returns:
             The field's own render times its gain and the composed image I_hat^l, both (3, h, w) at the level's size.
+
+        Raises:
+            UserInputError: as `render`.
         """
-        at_level = level_camera(camera, level)
-        image = self._render_band(level, at_level, gain)
-        if coarser is None:
-            return image, image
-        return image, self.pyramid.up(coarser, (at_level.height, at_level.width)) + image
+        self._checked(level, {level: gain})
+        image = self._render_band(level, [level_camera(camera, level)], gain)[0]
+        return image, image if coarser is None else add_raised(self.pyramid, coarser, image)
+
+    def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:
+        self.require_level(level)
+        for each, gain in (gains or {}).items():
+            self.require_level(each)
+            if not (math.isfinite(gain) and 0.0 <= gain <= LARGEST_GAIN):
+                raise UserInputError(
+                    f"gain {gain:g} of level {each}: expected a number from 0 (leave the band out) to "
+                    f"{LARGEST_GAIN:g}; 1 is the band as trained"
+                )
+        return gains or {}
 
     @cached_property
     def _streams(self) -> dict[int, torch.cuda.Stream]:
@@ -229,7 +301,11 @@ class HierarchyRenderer:
         if not self.concurrent or self.device.type != "cuda" or len(self.fields) == 1:
             return {}
         torch.cuda.synchronize(self.device)  # the fields are complete: no stream has to wait for them later
-        return {level: torch.cuda.Stream(self.device) for level in self.fields}  # type: ignore[no-untyped-call]  # torch's
+        # Coarser levels go first wherever the finer ones, which fill the GPU, leave room.
+        return {
+            level: torch.cuda.Stream(self.device, priority=-min(level - self.finest, 1))  # type: ignore[no-untyped-call]  # torch's
+            for level in self.fields
+        }
 
     @contextmanager
     def _beside(self, level: int) -> Iterator[None]:
@@ -240,23 +316,13 @@ class HierarchyRenderer:
         with torch.cuda.stream(self._streams[level]):
             yield
 
-    def _after(self, level: int, image: Tensor) -> Tensor:
-        """An image that a level's stream makes, for use in the current one."""
+    def _for_current(self, level: int, images: Tensor) -> Tensor:
+        """Images that a level's stream makes, for use in the current one."""
         if level in self._streams:
             current = torch.cuda.current_stream(self.device)
             current.wait_stream(self._streams[level])
-            image.record_stream(current)
-        return image
-
-    def _gather(self, images: Iterable[Tensor]) -> None:
-        """Let the current stream go on when the levels' streams are done, and use their images."""
-        if not self._streams:
-            return
-        current = torch.cuda.current_stream(self.device)
-        for stream in self._streams.values():
-            current.wait_stream(stream)
-        for image in images:
-            image.record_stream(current)
+            images.record_stream(current)
+        return images
 
     def behind(self, level: int) -> Tensor:
         """(3,) what a level's field is rendered over: a residual adds to the image, it would add a background again."""
@@ -269,14 +335,21 @@ class HierarchyRenderer:
     @cached_property
     def _colored(self) -> Tensor:
         """(3,) `background` beside the fields, sent there once: sending waits for a GPU."""
-        return torch.tensor(self.background).to(self.fields[self.levels - 1].means)
+        return torch.tensor(self.background).to(self.field(self.levels - 1).means)
 
-    def _render_band(self, level: int, at_level: Camera, gain: float) -> Tensor:
-        """A field's own render times its gain, (3, h, w) at the size of `at_level`."""
-        field = self.fields[level]
+    def _render_band(self, level: int, at_level: Sequence[Camera], gain: float) -> Tensor:
+        """A field's own renders times its gain, (b, 3, h, w) at the size of `at_level`."""
         if gain == 0.0:
-            return field.means.new_zeros(3, at_level.height, at_level.width)
-        image = self.rasterizer(field, at_level, background=self.behind(level)).image
+            return self._black.new_zeros(len(at_level), 3, at_level[0].height, at_level[0].width)
+        field = self.field(level)
+        images = render_images(self.rasterizer, field, at_level, self.behind(level))
         if self.clamped:
-            image = image.clamp(-1.0 if field.signed else 0.0, 1.0)
-        return image if gain == 1.0 else gain * image
+            images = images.clamp(-1.0 if field.signed else 0.0, 1.0)
+        return images if gain == 1.0 else gain * images
+
+
+def _with_what_is_left(error: RunFolderError, whole: Sequence[int]) -> RunFolderError:
+    """The error of a damaged level, with how to render those before it."""
+    if not whole:
+        return error
+    return RunFolderError(f"{error}; what was trained before it is whole: `lapgs render --level {min(whole)}`")

@@ -13,20 +13,23 @@ from lapgs_plugin.rendering.rasterizers import rasterizer_for
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 
 
-def run_renderer(archive: RunArchive, device: str = "auto", rasterizer: str = "auto") -> HierarchyRenderer:
+def run_renderer(
+    archive: RunArchive, device: str = "auto", rasterizer: str = "auto", *, finest: int = 0
+) -> HierarchyRenderer:
     """A renderer of a run's finished levels.
 
     Args:
         archive: the run.
         device, rasterizer: as `rasterizer_for` takes them; what is left to it is the rasterizer of the training, or the
             nearest that runs here.
+        finest: the finest level that is wanted; fields of finer ones are not read.
 
     Raises:
         RunFolderError: no level is finished, or a field is damaged.
         UserInputError, MissingExtraError: as `rasterizer_for`.
     """
     placed = rasterizer_for(archive.manifest, device, rasterizer)
-    return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device)
+    return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device, finest=finest)
 
 
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:

@@ -11,6 +11,7 @@ from statistics import median
 import torch
 
 from lapgs_plugin.camera import Camera
+from lapgs_plugin.raster import render_images
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
 
 ROUNDS = 5
@@ -100,8 +101,8 @@ def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
-    field, behind = renderer.fields[level], renderer.behind(level)
-    return lambda camera: renderer.rasterizer(field, level_camera(camera, size_level), background=behind).image
+    field, behind = renderer.field(level), renderer.behind(level)
+    return lambda camera: render_images(renderer.rasterizer, field, [level_camera(camera, size_level)], behind)
 
 
 @torch.no_grad()

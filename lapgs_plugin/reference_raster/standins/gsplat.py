@@ -1,7 +1,7 @@
 """`gsplat.rasterization` and `gsplat.spherical_harmonics` on the CPU, for loops that are written against gsplat.
 
-One camera a call, plain colours or SH, no depths. What is rendered is what `CpuRasterizer` renders: alpha is capped at
-0.99 instead of 0.999, and footprints end at three sigma.
+Plain colours or SH, no depths, and gradients of one camera a call. What is rendered is what `CpuRasterizer` renders:
+alpha is capped at 0.99 instead of 0.999, and footprints end at three sigma.
 """
 
 from __future__ import annotations
@@ -66,30 +66,40 @@ def rasterization(
     tile_size: int = TILE,
     **conventions: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render n Gaussians from one camera.
+    """Render n Gaussians from b cameras.
 
     Args:
         means: (n, 3).
         quats: (n, 4), wxyz.
         scales: (n, 3), not logarithms.
         opacities: (n,) in [0, 1], not logits.
-        colors: (n, 3), shown as they are; or, with `sh_degree`, SH coefficients (n, k, 3) for max(SH + 0.5, 0).
-        viewmats: (1, 4, 4) world to camera.
-        Ks: (1, 3, 3) intrinsics.
+        colors: (n, 3), or (b, n, 3) of each camera, shown as they are; or, with `sh_degree`, SH coefficients (n, k, 3)
+            for max(SH + 0.5, 0).
+        viewmats: (b, 4, 4) world to camera.
+        Ks: (b, 3, 3) intrinsics.
         sh_degree: highest degree to evaluate.
-        backgrounds: (1, 3), zero when None.
+        backgrounds: (b, 3), zero when None.
         absgrad: leave absolute gradients of the centres in `info["means2d"].absgrad`.
         conventions: the other arguments of gsplat, as far as they ask for what is done anyway.
 
     Returns:
-        (1, h, w, 3) colours, (1, h, w, 1) opacities, and what densification looks at: "means2d" (1, n, 2) whose
-        gradient is there after `backward()`, "radii" (1, n, 2), "gaussian_ids", "width", "height", "n_cameras".
+        (b, h, w, 3) colours, (b, h, w, 1) opacities, and of one camera what densification looks at: "means2d" (1, n, 2)
+        whose gradient is there after `backward()`, "radii" (1, n, 2), "gaussian_ids", "width", "height", "n_cameras".
 
     Raises:
-        UserInputError: more than one camera, or an argument asks for what this does not do.
+        UserInputError: an argument asks for what this does not do.
     """
-    if len(viewmats) != 1:
-        raise UserInputError(f"{len(viewmats)} cameras, expected one a call")
+    if len(viewmats) > 1:
+        options = {"sh_degree": sh_degree, "absgrad": absgrad, "tile_size": tile_size, **conventions}
+        each = [
+            rasterization(
+                means, quats, scales, opacities, colors if colors.ndim == 2 or sh_degree is not None else colors[i],
+                viewmats[i : i + 1], Ks[i : i + 1], width, height,
+                backgrounds=None if backgrounds is None else backgrounds[i : i + 1], **options,
+            )
+            for i in range(len(viewmats))
+        ]  # fmt: skip
+        return torch.cat([images for images, _, _ in each]), torch.cat([alphas for _, alphas, _ in each]), {}
     for name, value in conventions.items():
         if value not in CONVENTIONS.get(name, ()):
             raise UserInputError(f"{name}={value!r}: expected {CONVENTIONS.get(name, 'no such argument')} on the CPU")

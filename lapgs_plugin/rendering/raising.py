@@ -1,0 +1,71 @@
+"""Up and the sum of one level in one pass over the images: Up(coarse) + fine.
+
+As PyTorch operations Up alone goes over an image some twenty times. Along one side it is linear and short: a fine
+sample is a sum of at most five neighbouring coarse ones, whose weights `Pyramid.up_taps` gives. A GPU does the sum over
+both sides in one kernel, a CPU first across and then down.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_plugin.pyramid import Pyramid
+
+logger = logging.getLogger(__name__)
+
+Raise = Callable[[Pyramid, Tensor, Tensor], Tensor]
+
+
+def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+    """Up(coarse) + fine, as `pyramid.up` gives it but for rounding.
+
+    Args:
+        coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images.
+        fine: (c, h, w) or (b, c, h, w), of the same type and on the same device. Images that a gradient is wanted of
+            take the way of PyTorch's operations.
+    """
+    if not (torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad)):
+        if fine.device.type == "cpu" and fine.dtype in (torch.float32, torch.float64):
+            return _on_cpu(pyramid, coarse, fine)
+        if fine.device.type == "cuda" and fine.dtype == torch.float32 and (kernel := _cuda_kernel()) is not None:
+            return kernel(pyramid, coarse, fine)
+    return pyramid.up(coarse, (fine.shape[-2], fine.shape[-1])) + fine
+
+
+def _on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+    from lapgs_plugin.reference_raster.raising import add_raised_cpu
+
+    height, width = fine.shape[-2:]
+    first_row, row_weights = _numpy_taps(pyramid.grid, height, fine.dtype)
+    first_column, column_weights = _numpy_taps(pyramid.grid, width, fine.dtype)
+    below, above = (image.reshape(-1, *image.shape[-2:]).contiguous().numpy() for image in (coarse, fine))
+    result = add_raised_cpu(below, above, first_row, row_weights, first_column, column_weights)
+    return torch.from_numpy(result).view(fine.shape)
+
+
+@lru_cache(maxsize=64)
+def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
+    first, weights = Pyramid(grid).up_taps(size)
+    return first.numpy(), weights.to(dtype).numpy()
+
+
+@lru_cache(maxsize=1)
+def _cuda_kernel() -> Raise | None:
+    """The kernel in Triton, which comes with PyTorch for CUDA on Linux; None where it is missing or fails."""
+    try:
+        from lapgs_plugin.rendering.raising_triton import add_raised_triton
+
+        small, large = (torch.zeros(1, side, side, device="cuda") for side in (2, 4))
+        add_raised_triton(Pyramid(), small, large)
+    except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
+        logger.info("Up in many small operations instead of one kernel: %s", str(error).strip().split("\n")[0])
+        return None
+    return add_raised_triton
