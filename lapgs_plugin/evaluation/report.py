@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
-import base64
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from torch import Tensor
 
 from lapgs_plugin.archive import REPORT, RunArchive
-from lapgs_plugin.evaluation.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Chart, Mark, Series, draw
+from lapgs_plugin.evaluation.charts import (
+    Bar,
+    BarChart,
+    Chart,
+    Mark,
+    Move,
+    Series,
+    draw,
+    draw_bars,
+    draw_moves,
+)
 from lapgs_plugin.evaluation.comparison import Metrics, comparison_rows, unlike
+from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+from lapgs_plugin.evaluation.pictures import Strip, make_strip
 from lapgs_plugin.files import atomic_write, one_line_errors
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.run import run_renderer, run_scene
-from lapgs_plugin.scenes.images import resize_image, write_image
-from lapgs_plugin.scenes.scene import View
 
 TEMPLATE = "report.html.jinja"
-IMAGE_SIDE = 800
-"""Longest side in pixels of an image on the page."""
-MOST_COLUMNS = 5
 MINUTES_FROM = 300.0
 """Runs at least this many seconds long are charted in minutes."""
+START_SHARE = 0.15
+"""Of the longest run's time, drawn once more as an inset."""
+RUN, BASELINE = "run", "baseline"
+"""Styles of lines and arrows."""
 
 
 @dataclass(frozen=True)
@@ -44,38 +51,22 @@ class MeasuredRun:
     archive: RunArchive
     metrics: Metrics
 
+    @property
+    def name(self) -> str:
+        return self.archive.path().name
+
 
 @dataclass(frozen=True)
-class Picture:
-    """One image of the page.
+class ViewRow:
+    """One view in the table of all.
 
     Attributes:
-        caption, detail: what it is, in words.
-        width, height: in pixels, of what is embedded.
-        data: a data URI.
+        name: of the view.
+        cells: value and text of every metric of the run, then of the baseline's PSNR and how much the run gains on it.
     """
 
-    caption: str
-    detail: str
-    width: int
-    height: int
-    data: str
-
-
-@dataclass(frozen=True)
-class Strip:
-    """The pictures of one view, from the photo to the composition, and why this view is shown."""
-
     name: str
-    why: str
-    figures: str
-    pictures: tuple[Picture, ...]
-
-    @property
-    def columns(self) -> int:
-        """Pictures in a row of a wide page: all of them, or half when they would get too small."""
-        count = len(self.pictures)
-        return count if count <= MOST_COLUMNS else (count + 1) // 2
+    cells: tuple[tuple[float, str], ...]
 
 
 def write_report(
@@ -101,26 +92,32 @@ def write_report(
         RunFolderError: the scene is not where it was, or the file cannot be written.
     """
     runs = [run] if baseline is None else [run, baseline]
+    kinds = [RUN, BASELINE][: len(runs)]
     renderers = [run_renderer(each.archive, device, rasterizer) for each in runs]
-    page = _render(
-        name=run.archive.path().name,
+    view_columns, view_rows = view_table(runs)
+    page = render_page(
+        TEMPLATE,
+        name=run.name,
         scene=Path(run.archive.manifest.scene.path).name,
         manifest=run.archive.manifest,
         metrics=run.metrics,
-        baseline_name=baseline.archive.path().name if baseline else None,
+        baseline_name=baseline.name if baseline else None,
         unlike=unlike(run.archive.manifest, baseline.archive.manifest) if baseline else [],
         rows=comparison_rows([each.metrics for each in runs]),
-        charts=_charts(runs),
-        strips=_strips(runs, renderers, moved_to),
+        charts=training_charts(runs, kinds, marked=run),
+        moves=_moves(run, baseline) if baseline else None,
+        breakdown=breakdown_bars(runs),
+        overhead=overhead_bars(runs),
+        strips=view_strips(run, renderers, moved_to),
+        view_columns=view_columns,
+        view_rows=view_rows,
         settings=_settings(run),
     )
-    path = run.archive.path(REPORT)
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(page.encode())
-    return path
+    return write_page(run.archive.path(REPORT), page)
 
 
-def _render(**values: Any) -> str:
+def render_page(template: str, **values: Any) -> str:
+    """A template of this folder, filled in."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -128,18 +125,49 @@ def _render(**values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    size = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": RIGHT, "top": TOP, "bottom": BOTTOM}
-    return environment.get_template(TEMPLATE).render(values, size=size)
+    return environment.get_template(template).render(values)
 
 
-def _charts(runs: Sequence[MeasuredRun]) -> dict[str, list[Chart]]:
-    """Loss, held-out PSNR and number of Gaussians, over seconds and over iterations; without what was not recorded."""
+def write_page(path: Path, page: str) -> Path:
+    """Write a whole page or none.
+
+    Raises:
+        RunFolderError: it cannot be written.
+    """
+    with one_line_errors(path), atomic_write(path) as stream:
+        stream.write(page.encode())
+    return path
+
+
+# What was recorded during training.
+
+
+def training_charts(runs: Sequence[MeasuredRun], kinds: Sequence[str], marked: MeasuredRun) -> dict[str, list[Chart]]:
+    """Loss, held-out PSNR and number of Gaussians, over seconds and over iterations; without what was not recorded.
+
+    Args:
+        runs: whose lines are drawn, the first on top.
+        kinds: style of each one's lines.
+        marked: whose stages are marked.
+    """
     longest = max(run.metrics["train_seconds"] for run in runs)
     unit, scale = ("minutes", 60.0) if longest >= MINUTES_FROM else ("seconds", 1.0)
+
+    def elapsed(run: MeasuredRun, entry: dict[str, Any]) -> float:
+        return _elapsed(run, entry) / scale
+
+    start = START_SHARE * longest / scale
     return {
-        "time": _chart_row(runs, f"{unit} of optimization", lambda run, entry: entry["elapsed"] / scale),
-        "iterations": _chart_row(runs, "iterations, all stages", _iteration),
+        "time": _chart_row(runs, kinds, marked, f"{unit} of optimization", elapsed, start),
+        "iterations": _chart_row(runs, kinds, marked, "iterations, all stages", _iteration, None),
     }
+
+
+def _elapsed(run: MeasuredRun, entry: dict[str, Any]) -> float:
+    """Seconds of optimization since the start of the run; what is noted after a stage has no time of its own."""
+    if "elapsed" in entry:
+        return float(entry["elapsed"])
+    return sum(record.train_seconds for record in run.archive.manifest.records if record.level >= entry["level"])
 
 
 def _iteration(run: MeasuredRun, entry: dict[str, Any]) -> float:
@@ -148,31 +176,46 @@ def _iteration(run: MeasuredRun, entry: dict[str, Any]) -> float:
     return float(before + entry["iteration"])
 
 
+Position = Callable[[MeasuredRun, dict[str, Any]], float]
+
+
 def _chart_row(
-    runs: Sequence[MeasuredRun], x_label: str, x_of: Callable[[MeasuredRun, dict[str, Any]], float]
+    runs: Sequence[MeasuredRun],
+    kinds: Sequence[str],
+    marked: MeasuredRun,
+    x_label: str,
+    x_of: Position,
+    start: float | None,
 ) -> list[Chart]:
-    marks = _stage_marks(runs[0], x_of)
+    marks = _stage_marks(marked, x_of)
     charts = []
     for key, title, from_zero, by_stage, format_y in (
         ("loss", "Loss", True, True, "{:g}".format),
         ("psnr", "Held-out PSNR (dB)", False, False, "{:g}".format),
-        ("num_gaussians", "Gaussians in training", True, True, _count),
+        ("num_gaussians", "Gaussians in training", True, True, count_text),
     ):
         series = [
             Series(kind, points)
-            for run, kind in reversed(list(zip(runs, ("run", "baseline"), strict=False)))  # ours on top
+            for run, kind in reversed(list(zip(runs, kinds, strict=True)))  # the first on top
             for points in _lines(run, key, by_stage, x_of)
         ]
         if series:
             charts.append(
-                draw(title, x_label, series, marks=marks, from_zero=from_zero, format_x=_count, format_y=format_y)
+                draw(
+                    title,
+                    x_label,
+                    series,
+                    marks=marks,
+                    from_zero=from_zero,
+                    format_x=count_text,
+                    format_y=format_y,
+                    inset_until=start if key == "psnr" else None,
+                )
             )
     return charts
 
 
-def _lines(
-    run: MeasuredRun, key: str, by_stage: bool, x_of: Callable[[MeasuredRun, dict[str, Any]], float]
-) -> list[list[tuple[float, float]]]:
+def _lines(run: MeasuredRun, key: str, by_stage: bool, x_of: Position) -> list[list[tuple[float, float]]]:
     """What the history says about `key`: one line, or one a stage where stages do not continue each other."""
     lines: dict[int, list[tuple[float, float]]] = {}
     for entry in run.archive.history():
@@ -181,7 +224,7 @@ def _lines(
     return list(lines.values())
 
 
-def _stage_marks(run: MeasuredRun, x_of: Callable[[MeasuredRun, dict[str, Any]], float]) -> list[Mark]:
+def _stage_marks(run: MeasuredRun, x_of: Position) -> list[Mark]:
     """Where each stage of a hierarchy begins; nothing for a single field."""
     begins: dict[int, float] = {}
     end = 0.0
@@ -191,23 +234,75 @@ def _stage_marks(run: MeasuredRun, x_of: Callable[[MeasuredRun, dict[str, Any]],
     return [Mark(x, f"level {level}") for level, x in begins.items()] if len(begins) > 1 else []
 
 
-def _count(value: float) -> str:
+def count_text(value: float) -> str:
     """A number short enough for an axis: 1.5k, 20k, 1.2M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
-            return f"{value / size:g}{suffix}"
+            return f"{value / size:.3g}{suffix}"
     return f"{value:g}"
 
 
-def _strips(runs: Sequence[MeasuredRun], renderers: Sequence[HierarchyRenderer], moved_to: Path | None) -> list[Strip]:
-    """The worst, the median and the best view of the run, in pictures."""
-    shown = _shown_views(runs[0].metrics)
+# What it took.
+
+
+def seconds_text(value: float) -> str:
+    """Seconds with three digits."""
+    return f"{value:.3g} s" if value < 1e3 else f"{value:,.0f} s"
+
+
+def _moves(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
+    """Time against Gaussians, an arrow from the baseline to the run."""
+    ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
+    return draw_moves(
+        "Optimization (s) against Gaussians",
+        "Gaussians, mean of levels by iterations",
+        [Move(RUN, "", *ends)],
+        format_x=count_text,
+        format_y=count_text,
+    )
+
+
+def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
+    """Where the time of iterations went, a bar for each level of each run that was broken down."""
+    bars = []
+    for run in runs:
+        for record in run.archive.manifest.records:
+            if record.breakdown_seconds:
+                what = f", level {record.level}" if run.archive.manifest.levels > 1 else ""
+                total = sum(record.breakdown_seconds.values())
+                label = f"{run.name}{what}: {1e3 * total / record.iterations:.3g} ms an iteration"
+                bars.append(Bar(label, list(record.breakdown_seconds.items())))
+    return draw_bars("Optimization", bars, format_value=seconds_text) if bars else None
+
+
+def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
+    """What was spent beside the optimization."""
+    bars = [Bar(run.name, list(run.metrics["overhead_seconds"].items())) for run in runs]
+    return draw_bars("Beside the optimization", bars, format_value=seconds_text) if any(b.parts for b in bars) else None
+
+
+# Views.
+
+
+def view_strips(run: MeasuredRun, renderers: Sequence[HierarchyRenderer], moved_to: Path | None) -> list[Strip]:
+    """The worst, the median and the best view of the run, in pictures of it and of its baseline.
+
+    Args:
+        run: by whose metrics views are chosen.
+        renderers: of the run, and of its baseline.
+        moved_to: where the scene is now; None when it did not move.
+
+    Raises:
+        RunFolderError: the scene is not where it was.
+    """
+    shown = _shown_views(run.metrics)
+    figures = {view["name"]: f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}" for view in run.metrics["views"]}
     with one_pool():
-        scene = run_scene(runs[0].archive, moved_to)
+        scene = run_scene(run.archive, moved_to)
         views = {view.name: view for view in (*scene.train, *scene.test)}
         with item_progress("views") as progress:
             return [
-                Strip(name, why, _view_figures(runs, name), _pictures(views[name], renderers))
+                make_strip(views[name], why, figures[name], renderers)
                 for name, why in progress.track(list(shown.items()), description="Rendering views for the report")
             ]
 
@@ -222,42 +317,27 @@ def _shown_views(metrics: Metrics) -> dict[str, str]:
     return reasons
 
 
-def _view_figures(runs: Sequence[MeasuredRun], name: str) -> str:
-    texts = []
-    for run, label in zip(runs, ("", "baseline "), strict=False):
-        texts += [
-            f"{label}{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"
-            for view in run.metrics["views"]
-            if view["name"] == name
-        ]
-    return "; ".join(texts)
+def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
+    """All views by the run's PSNR, the worst first; the columns' headings, and the rows.
 
-
-def _pictures(view: View, renderers: Sequence[HierarchyRenderer]) -> tuple[Picture, ...]:
-    renderer = renderers[0]
-    composition = renderer.render(view.camera)
-    pictures = [_picture(view.image, "Photo", "ground truth")]
-    if composition.residuals:
-        pictures.append(_picture(composition.base, "Base", f"level {renderer.levels - 1}"))
-    for level, residual in composition.residuals.items():
-        pictures.append(_picture(around_grey(residual), "Residual", f"level {level}, zero is grey"))
-    pictures.append(_picture(composition.composed[0], "Composition", "what the run renders"))
-    for baseline in renderers[1:]:
-        pictures.append(_picture(baseline.render(view.camera).composed[0], "Baseline", "what it renders"))
-    return tuple(pictures)
-
-
-def _picture(image: Tensor, caption: str, detail: str) -> Picture:
-    height, width = image.shape[-2:]
-    scale = min(1.0, IMAGE_SIDE / max(height, width))
-    small = resize_image(image.clamp(0.0, 1.0), (max(1, round(width * scale)), max(1, round(height * scale))))
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "picture.jpg"
-        write_image(file, small)
-        data = base64.b64encode(file.read_bytes()).decode()
-    return Picture(
-        caption, f"{detail}, {width}x{height}", small.shape[-1], small.shape[-2], f"data:image/jpeg;base64,{data}"
-    )
+    Args:
+        runs: the run, and its baseline if there is one.
+    """
+    views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
+    keys = {"psnr": "PSNR (dB)", "ssim": "SSIM"}
+    keys |= {
+        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})" for name in VARIANTS if LPIPS_KEY.format(name) in views[0]
+    }
+    others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]
+    rows = []
+    for view in views:
+        cells = [(view[key], f"{view[key]:.2f}" if key == "psnr" else f"{view[key]:.4f}") for key in keys]
+        for other in others:
+            # The baseline may have been measured on other views.
+            if (theirs := other.get(view["name"])) is not None:
+                cells += [(theirs, f"{theirs:.2f}"), (view["psnr"] - theirs, f"{view['psnr'] - theirs:+.2f}")]
+        rows.append(ViewRow(view["name"], tuple(cells)))
+    return [*keys.values(), *(["baseline PSNR", "gain"] if others else [])], rows
 
 
 def _settings(run: MeasuredRun) -> dict[str, str]:

@@ -23,7 +23,7 @@ from tests.cli.run_folder import write_run, write_scene
 app = typer.Typer()
 app.command()(report)
 
-VOID = {"meta", "img", "input", "line", "polyline", "circle"}
+VOID = {"meta", "img", "input", "line", "polyline", "circle", "rect", "path"}
 
 
 class Page(HTMLParser):
@@ -46,7 +46,7 @@ class Page(HTMLParser):
         if tag not in VOID:
             self._open.append(tag)
         self._row = given.get("data-metric", self._row) if tag == "tr" else self._row
-        if tag == "td" and "data-value" in given and self._row:
+        if tag == "td" and given.get("data-value") and self._row:
             self.figures.setdefault(self._row, []).append(float(given["data-value"]))
 
     def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
@@ -58,7 +58,7 @@ class Page(HTMLParser):
         self._row = "" if tag == "tr" else self._row
 
     def handle_data(self, data: str) -> None:
-        if "style" not in self._open:
+        if not {"style", "script"} & set(self._open):
             self.text += data
 
     def all(self, tag: str) -> list[dict[str, str]]:
@@ -93,12 +93,13 @@ def test_the_page_needs_nothing_else(run: Path, baseline: Path) -> None:
     text = (run / "report.html").read_text()
     page = Page(text)
     assert not re.search(r"https?:", text)
-    assert not page.all("script")
+    assert page.all("script") == [{}]  # its text is in the page
+    assert not re.search(r"fetch|XMLHttpRequest|WebSocket|import\b", text.partition("<script>")[2])
     assert not page.all("link")
-    assert "url(" not in text
+    assert set(re.findall(r"url\((.)", text)) == {"#"}  # the head of an arrow
     for _, attributes in page.tags:
         assert "href" not in attributes
-        assert attributes.get("src", "data:image/jpeg;base64,").startswith("data:image/jpeg;base64,")
+        assert re.match(r"data:image/(jpeg|png);base64,", attributes.get("src", "data:image/jpeg;base64,"))
     (meta,) = [attributes for attributes in page.all("meta") if attributes.get("name") == "viewport"]
     assert "width=device-width" in meta["content"]
     assert "prefers-color-scheme: dark" in text
@@ -106,7 +107,11 @@ def test_the_page_needs_nothing_else(run: Path, baseline: Path) -> None:
 
 def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
-    images = Page((run / "report.html").read_text()).all("img")
+    images = [image for image in Page((run / "report.html").read_text()).all("img") if "src" in image]
+    cutouts = [image for image in images if "enlarged" in image["alt"]]
+    kinds = Counter(image["alt"].split(" of ")[0] for image in cutouts)
+    assert kinds == dict.fromkeys(("Photo", "Base", "Residual", "Composition", "Baseline"), 2 * 2)
+    images = [image for image in images if image not in cutouts]
     kinds = Counter(image["alt"].split(" of ")[0] for image in images)
     assert kinds == dict.fromkeys(("Photo", "Base", "Residual", "Composition", "Baseline"), 2)  # two views are held out
     for image in images:
@@ -117,6 +122,12 @@ def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) ->
     decoded = cv2.imdecode(np.frombuffer(base64.b64decode(photo["src"].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
     original = cv2.imread(str(Path(RunArchive.open(run).manifest.scene.path) / "photos" / "08.png"))
     assert np.abs(decoded.astype(int) - original).mean() < 3.0  # JPEG of stripes; 1.8 seen
+    cutout = next(image for image in cutouts if image["alt"] == "Photo of photos/08.png, enlarged 1")
+    part = cv2.imdecode(np.frombuffer(base64.b64decode(cutout["src"].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    assert part.shape == (16, 16, 3)
+    # Found again pixel by pixel, and nowhere else.
+    distances = cv2.matchTemplate(original, part, cv2.TM_SQDIFF)
+    assert distances.min() < 1.0
 
 
 def test_figures_are_those_of_metrics_json(run: Path, baseline: Path) -> None:
@@ -140,14 +151,58 @@ def test_figures_are_those_of_metrics_json(run: Path, baseline: Path) -> None:
 def test_charts_show_both_runs_over_time_and_iterations(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
     page = Page((run / "report.html").read_text())
-    labels = [svg["aria-label"] for svg in page.all("svg")]
+    labels = [svg["aria-label"] for svg in page.all("svg") if " over " in svg.get("aria-label", "")]
     titles = ("Loss", "Held-out PSNR (dB)", "Gaussians in training")
     assert labels == [
-        f"{title} over {x}" for x in ("seconds of optimization", "iterations, all stages") for title in titles
+        *(f"{title} over {x}" for x in ("seconds of optimization", "iterations, all stages") for title in titles),
+        "Optimization (s) against Gaussians over Gaussians, mean of levels by iterations",
     ]
-    # Loss and Gaussians have a line a stage, PSNR one a run; all twice.
+    # Loss and Gaussians have a line a stage, PSNR one a run; all twice. PSNR was measured too rarely for an inset.
     assert Counter(line["class"] for line in page.all("polyline")) == {"line-run": 2 * 5, "line-baseline": 2 * 3}
     assert page.text.count("level 1") >= 6
+
+
+def test_bars_show_what_training_took(run: Path, baseline: Path) -> None:
+    lapgs_report(run, "--baseline", baseline)
+    page = Page((run / "report.html").read_text())
+    bars = Counter(bar["class"] for bar in page.all("rect") if bar.get("class", "").startswith("part-"))
+    recorded = {"part-forward": 3, "part-loss": 3, "part-backward": 3, "part-other": 3}  # three stages of two runs
+    beside = {"part-pyramid": 2, "part-cache": 1, "part-archive": 2}
+    assert bars == {**recorded, **beside}
+    assert "hierarchy, level 1: 35 ms an iteration" in page.text
+    assert "plain: 41.2 ms an iteration" in page.text
+    widths = [float(bar["width"]) for bar in page.all("rect") if bar.get("class") == "part-backward"]
+    assert widths[0] / widths[1] == pytest.approx(1.75 / 3.25, rel=0.01)
+
+
+def test_views_are_listed_worst_first_beside_the_baseline(run: Path, baseline: Path) -> None:
+    lapgs_report(run, "--baseline", baseline)
+    text = (run / "report.html").read_text()
+    table = text.partition('<table id="views"')[2].partition("</table>")[0]
+    rows = [re.findall(r'<th>(.*?)</th>|data-value="(.*?)"', row) for row in table.split("<tr>")[2:]]
+    found = [(row[0][0], *(float(value) for _, value in row[1:])) for row in rows]
+    metrics = [json.loads((folder / "metrics.json").read_text())["views"] for folder in (run, baseline)]
+    theirs = {view["name"]: view["psnr"] for view in metrics[1]}
+    expected = [
+        (v["name"], v["psnr"], v["ssim"], theirs[v["name"]], v["psnr"] - theirs[v["name"]])
+        for v in sorted(metrics[0], key=lambda view: view["psnr"])
+    ]
+    assert found == expected
+    assert re.findall(r"<th>([^<]*)</th>", table)[:5] == ["view", "PSNR (dB)", "SSIM", "baseline PSNR", "gain"]
+
+
+def test_what_is_noted_after_a_stage_lies_at_its_end(run: Path) -> None:
+    history = run / "history.jsonl"
+    entries = [json.loads(line) for line in history.read_text().splitlines()]
+    kept = [{key: value for key, value in entry.items() if key != "psnr"} for entry in entries]
+    # As `lapgs run` notes it: without a time.
+    kept.append({"level": 0, "iteration": 200, "psnr": 21.5})
+    history.write_text("".join(json.dumps(entry) + "\n" for entry in kept))
+    lapgs_report(run)
+    page = Page((run / "report.html").read_text())
+    assert [svg.get("aria-label") for svg in page.all("svg")].count(
+        "Held-out PSNR (dB) over seconds of optimization"
+    ) == 1
 
 
 def test_a_run_alone_is_measured_first_and_has_no_second_column(run: Path) -> None:
@@ -169,8 +224,9 @@ def test_a_single_field_without_held_out_views_or_history(scene: Path, tmp_path:
     page = Page((run / "report.html").read_text())
     assert "No views were held out" in page.text
     assert "a single field" in page.text
-    assert not page.all("svg")
-    assert len(page.all("img")) == 3 * 2  # worst, median and best; photo and composition
+    assert not page.all("polyline")
+    # Worst, median and best; photo and composition, each with two cut-outs, and the two that the script fills.
+    assert len(page.all("img")) == 3 * (2 + 2 * 2 + 2)
 
 
 def test_runs_that_were_not_trained_alike_are_pointed_out(run: Path, scene: Path, tmp_path: Path) -> None:
@@ -202,5 +258,7 @@ def test_an_unfinished_run_is_refused(run: Path, scene: Path, tmp_path: Path) ->
 
 def test_foreign_metrics_are_refused(run: Path) -> None:
     (run / "metrics.json").write_text('{"psnr": 20.0}')
-    with pytest.raises(RunFolderError, match=r"lacks levels, num_gaussians, .*; write it again with `lapgs eval`"):
+    with pytest.raises(
+        RunFolderError, match=r"lacks breakdown_seconds, fps, levels, .*; write it again with `lapgs eval`"
+    ):
         lapgs_report(run)

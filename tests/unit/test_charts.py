@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.evaluation.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Mark, Series, draw
+from lapgs_plugin.evaluation.charts import INSET, WHOLE, Bar, Frame, Mark, Move, Series, draw, draw_bars, draw_moves
+
+LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
+WIDTH, HEIGHT = WHOLE.width, WHOLE.height
 
 values = st.floats(-1e7, 1e7, allow_nan=False).map(lambda value: round(value, 3))
 
@@ -57,3 +61,75 @@ def test_flat_and_single_points_are_drawn(points: list[tuple[float, float]], fro
         x, y = map(float, pair.split(","))
         assert LEFT <= x <= WIDTH - RIGHT
         assert TOP - 0.1 <= y <= HEIGHT - BOTTOM + 0.1
+
+
+def plotted(points: str) -> list[tuple[float, float]]:
+    return [(float(x), float(y)) for x, y in (pair.split(",") for pair in points.split())]
+
+
+def in_data(point: tuple[float, float], right: float, bottom: float, top: float, frame: Frame) -> tuple[float, float]:
+    """From chart units back to data units."""
+    x, y = point
+    return (
+        right * (x - frame.left) / (frame.width - frame.left - frame.right),
+        bottom + (top - bottom) * (frame.height - frame.bottom - y) / (frame.height - frame.top - frame.bottom),
+    )
+
+
+def test_an_inset_holds_the_start_and_nothing_else() -> None:
+    rising = [(float(x), 30.0 - 20.0 / (1 + x)) for x in range(0, 101, 2)]
+    chart = draw("t", "x", [Series("run", rising), Series("late", [(50, 10), (90, 20)])], inset_until=10.0)
+    assert len(chart.lines) == 2
+    assert chart.inset is not None
+    (line,) = chart.inset.lines
+    ticks = [float(tick.label) for tick in chart.inset.y_ticks]
+    found = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in plotted(line.points)]
+    assert found == [pytest.approx(point, abs=0.1) for point in rising[:6]]
+    assert chart.inset.inset is None
+    assert draw("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
+
+
+coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
+
+
+@settings(deadline=None)
+@given(ends=st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=6))
+def test_arrows_begin_and_point_where_the_axes_say(
+    ends: list[tuple[tuple[float, float], tuple[float, float]]],
+) -> None:
+    chart = draw_moves("t", "x", [Move("run", "m", *each) for each in ends], format_x=repr, format_y=repr, head=4.0)
+    right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
+    top = float(chart.y_ticks[-1].label)
+    for arrow, (start, end) in zip(chart.arrows, ends, strict=True):
+        begins, points_at = (
+            (WHOLE.left + (WIDTH - LEFT - RIGHT) * x / right, HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * y / top)
+            for x, y in (start, end)
+        )
+        assert arrow.start == pytest.approx(begins, abs=0.06)
+        length = math.dist(begins, points_at)
+        short = math.dist(arrow.end, points_at)
+        assert short == pytest.approx(min(4.0, length), abs=0.3)
+        assert math.dist(begins, arrow.end) == pytest.approx(max(0.0, length - 4.0), abs=0.3)  # on the way to it
+
+
+amounts = st.lists(st.tuples(st.sampled_from("abcdef"), st.floats(0.0, 1e5)), max_size=6, unique_by=lambda p: p[0])
+
+
+@settings(deadline=None)
+@given(bars=st.lists(amounts, min_size=1, max_size=5))
+def test_bars_share_a_scale_and_their_parts_lie_end_to_end(bars: list[list[tuple[str, float]]]) -> None:
+    chart = draw_bars("t", [Bar(f"bar {i}", parts) for i, parts in enumerate(bars)], format_value=repr)
+    longest = max(math.fsum(value for _, value in parts) for parts in bars) or 1.0
+    width = chart.frame.width - chart.frame.right
+    assert [bar.label for bar in chart.bars] == [f"bar {i}" for i in range(len(bars))]
+    for bar, parts in zip(chart.bars, bars, strict=True):
+        at = 0.0
+        for segment, (name, value) in zip(bar.segments, parts, strict=True):
+            assert (segment.name, segment.text) == (name, repr(value))
+            assert segment.x == pytest.approx(at, abs=0.06)
+            assert segment.width == pytest.approx(width * value / longest, abs=0.06)
+            assert segment.shown in ("", segment.text)
+            at += width * value / longest
+        assert bar.end == pytest.approx(at, abs=0.06)
+        assert 0 < bar.y < chart.frame.height
+    assert set(chart.names) == {name for parts in bars for name, _ in parts}
