@@ -5,7 +5,7 @@
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
-    RUN/metrics.json, RUN/renders/, RUN/report.html   what is made of it later
+    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/report.html   what is made of it later
 
 Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
 after its PLY is on the disk: a run killed at any moment is a run that opens, with the levels that were finished.
@@ -41,7 +41,7 @@ from lapgs_plugin.plan import Stage
 FORMAT_VERSION = 1
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
-RENDERS, REPORT, CACHE = "renders", "report.html", "cache"
+RENDERS, REPORT, STABILITY, CACHE = "renders", "report.html", "stability.json", "cache"
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 
 
@@ -470,6 +470,10 @@ class RunArchive:
         """Replace the run's metrics: JSON with finite numbers. Needs no hold of the folder."""
         self._write_json(METRICS, metrics)
 
+    def write_stability(self, figures: dict[str, Any]) -> None:
+        """Replace the run's figures of flicker: JSON with finite numbers. Needs no hold of the folder."""
+        self._write_json(STABILITY, figures)
+
     def metrics(self) -> dict[str, Any] | None:
         """The run's metrics, None when they were never measured.
 
@@ -595,7 +599,7 @@ def _is_run(folder: Path) -> bool:
 def _remove_results(folder: Path) -> None:
     """Remove what a former run left, and nothing that a run does not write."""
     _remove_scratch(folder)
-    for name in (HISTORY, METRICS, REPORT):
+    for name in (HISTORY, METRICS, STABILITY, REPORT):
         (folder / name).unlink(missing_ok=True)
     if (folder / RENDERS).is_dir():
         shutil.rmtree(folder / RENDERS)

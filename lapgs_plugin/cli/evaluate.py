@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, refuse, show_log
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+FLICKER_FRAMES = 120
 
 SHOWN_VIEWS = 12
 """How many views the terminal shows; metrics.json and the report hold all."""
@@ -38,6 +40,20 @@ def evaluate(
             "Default: what torchvision downloaded at some time. Nothing is ever downloaded here."
         ),
     ] = None,
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            help="Measure flicker along a camera path instead of the views: orbit, spline or a JSON file of cameras, "
+            "as `lapgs render` takes them."
+        ),
+    ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="With --trajectory: a single field of the scene, to compare with.")
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(min=2, help=f"Frames of the path. Default: {FLICKER_FRAMES}, or each camera of a file once."),
+    ] = None,
     device: DeviceOption = "auto",
     rasterizer: RasterizerOption = "auto",
 ) -> None:
@@ -47,7 +63,17 @@ def evaluate(
     weights of its networks; without them its column says so. Without held-out views (`lapgs train --eval`) the training
     views are measured, which flatters. Times are those of training: the optimization, and everything around it beside
     it. Frames a second are those of the composed image.
+
+    With --trajectory: how much the composition, and each band, changes from frame to frame along a path besides the
+    camera's motion, which is undone by rendered depth where nothing hides a pixel; written to RUN/stability.json.
     """
+    if trajectory is not None:
+        refuse(
+            {"--lpips": lpips, "--lpips-weights": lpips_weights}, "does not go with --trajectory, which has no photos"
+        )
+        _stability(run, baseline, trajectory, frames, scene, device, rasterizer)
+        return
+    refuse({"--baseline": baseline, "--frames": frames}, "needs --trajectory")
     from lapgs_plugin.archive import METRICS, RunArchive
     from lapgs_plugin.evaluation.figures import evaluate_run
     from lapgs_plugin.evaluation.lpips import LpipsRequest
@@ -58,6 +84,42 @@ def evaluate(
     metrics = evaluate_run(archive, scene, device=device, rasterizer=rasterizer, lpips=wanted)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
+
+
+def _stability(
+    run: Path,
+    baseline: Path | None,
+    trajectory: str,
+    frames: int | None,
+    scene: Path | None,
+    device: str,
+    rasterizer: str,
+) -> None:
+    """Measure flicker along a path, print it and write it down."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from lapgs_plugin.archive import STABILITY, RunArchive
+    from lapgs_plugin.evaluation.stability import evaluate_stability
+    from lapgs_plugin.rendering.paths import path_cameras
+
+    archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)
+    show_log()
+    cameras = path_cameras(archive, trajectory, frames, FLICKER_FRAMES, scene)
+    figures = evaluate_stability(archive, other, trajectory, cameras, device=device, rasterizer=rasterizer)
+    table = Table("", "mean difference", "PSNR (dB)", box=box.SIMPLE_HEAD)
+    for name, each in figures["flicker"].items():
+        table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")
+    console = Console()
+    width, height = figures["size"]
+    console.print(
+        f"[bold]Flicker[/bold] along {trajectory}: {figures['frames']} frames of {width}x{height}, each against the "
+        f"one before, where both show the same surface ({100 * figures['compared']:.0f} % of the pixels)",
+        table,
+        highlight=False,
+    )
+    print(f"{archive.path(STABILITY)} holds these figures")
 
 
 def _print(metrics: dict[str, Any]) -> None:

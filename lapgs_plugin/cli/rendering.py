@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from lapgs_plugin.errors import UserInputError
+
 DeviceOption = Annotated[
     str, typer.Option(help="Where to render: cuda, cpu, or auto, which takes CUDA where there is any.")
 ]
@@ -23,3 +25,18 @@ def show_log() -> None:
     """Let what renders a run, and why, appear on stderr."""
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
+
+
+def refuse(options: dict[str, object], why: str) -> None:
+    """Say that options would have no effect.
+
+    Args:
+        options: by name; None for one that was not given.
+        why: after the name.
+
+    Raises:
+        UserInputError: one was given.
+    """
+    for option, value in options.items():
+        if value is not None:
+            raise UserInputError(f"{option} {why}; leave it out")

@@ -31,11 +31,11 @@ from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_PERCENT, MOST_PERCENT = 2.0, 50.0
+DEFAULT_PERCENT, MOST_PERCENT = 1.5, 50.0
 """Of the time of training that pictures may take."""
 
 LIVE_SECONDS = PictureSeconds(moving=0.02, still=0.06)
-"""What a picture takes: at 2 % that is one a second while somebody moves, and one in three seconds otherwise."""
+"""What a picture takes: at 1.5 % that is one every 1.3 s while somebody moves, and every 4 s otherwise."""
 
 PAUSE_PATIENCE = 0.1
 

@@ -1,0 +1,49 @@
+"""How far away the things are that a field shows, by any rasterizer: it renders depths as colours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.raster import Rasterizer
+
+SH_CONSTANT = math.sqrt(1.0 / (4.0 * math.pi))
+"""What the first SH coefficient is multiplied by."""
+
+SMALLEST_COVER = 1e-6
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """Depth of a view.
+
+    Attributes:
+        depth: (h, w) along the optical axis, in world units: the mean of the Gaussians' own, weighted as their colours
+            are. Meaningless where nothing covers a pixel.
+        cover: (h, w) sum of these weights, in [0, 1].
+    """
+
+    depth: Tensor
+    cover: Tensor
+
+
+@torch.no_grad()
+def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> DepthImage:
+    """Depth of a field from a camera.
+
+    Args:
+        rasterizer: any; it renders the field with each Gaussian's depth as its (signed) red, and one as its green.
+        field: a base; what a residual adds and takes away has no depth.
+        camera: on the field's device or the CPU.
+    """
+    pose = camera.world_to_camera.to(field.means)
+    along = field.means @ pose[2, :3] + pose[2, 3]  # (n,)
+    colors = torch.stack([along, torch.ones_like(along), torch.zeros_like(along)], dim=1)  # (n, 3)
+    asking = replace(field.with_parameters({"sh": colors[:, None] / SH_CONSTANT}), signed=True)
+    weighted, cover, _ = rasterizer(asking, camera, background=torch.zeros(3).to(field.means), sh_degree=0).image
+    return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)

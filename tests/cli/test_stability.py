@@ -1,0 +1,80 @@
+"""`lapgs eval --trajectory`: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.rendering.trajectory import trajectory_json
+from tests.cli.run_folder import write_run, write_scene
+
+app = typer.Typer()
+app.command("eval")(evaluate)
+
+
+def lapgs_eval(*arguments: object) -> str:
+    result = CliRunner(env={"COLUMNS": "120"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def test_a_camera_that_stands_still_sees_no_flicker(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    single = write_run(tmp_path / "single", scene, levels=1)
+    camera = next(iter(run_cameras(RunArchive.open(run))[0].values()))
+    (tmp_path / "still.json").write_text(json.dumps(trajectory_json([camera] * 3)))
+    output = lapgs_eval(run, "--trajectory", tmp_path / "still.json", "--baseline", single)
+    figures = json.loads((run / "stability.json").read_text())
+    assert figures["frames"] == 3
+    assert figures["size"] == [camera.width, camera.height]
+    assert figures["baseline"] == str(single)
+    assert list(figures["flicker"]) == ["composition", "band 1", "band 0", "single field"]
+    assert all(each["mean"] < 1e-5 and each["psnr"] > 90 for each in figures["flicker"].values())  # 1e-7, 100 seen
+    for name in figures["flicker"]:
+        assert name in output
+    assert "stability.json holds these figures" in output
+
+
+def test_an_orbit_moves_what_is_not_fixed(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    lapgs_eval(run, "--trajectory", "orbit", "--frames", 90)
+    figures = json.loads((run / "stability.json").read_text())
+    assert figures["baseline"] is None
+    assert list(figures["flicker"]) == ["composition", "band 1", "band 0"]
+    assert 0 < figures["compared"] < 1
+    assert figures["flicker"]["composition"]["mean"] > 1e-4
+
+
+def test_what_goes_together_and_what_does_not(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    with pytest.raises(UserInputError, match="--baseline needs --trajectory"):
+        lapgs_eval(run, "--baseline", run)
+    with pytest.raises(UserInputError, match="--lpips does not go with --trajectory"):
+        lapgs_eval(run, "--trajectory", "orbit", "--lpips", "vgg")
+    with pytest.raises(UserInputError, match="has 2 levels, expected a single field"):
+        lapgs_eval(run, "--trajectory", "orbit", "--frames", 3, "--baseline", run)
+    with pytest.raises(UserInputError, match="cannot be read"):
+        lapgs_eval(run, "--trajectory", tmp_path / "nowhere.json")
+    (tmp_path / "bad.json").write_text(
+        '{"w": 8, "h": 8, "fl_x": 9, "frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}'
+    )
+    with pytest.raises(UserInputError, match="the camera of frame 0 is not usable"):
+        lapgs_eval(run, "--trajectory", tmp_path / "bad.json")
+    with pytest.raises(RunFolderError, match="only 1 of 2 levels"):
+        lapgs_eval(write_run(tmp_path / "half", scene, finished=1), "--trajectory", "orbit")
+    assert not (run / "stability.json").exists()
