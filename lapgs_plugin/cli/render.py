@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, refuse, show_log
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lapgs_plugin.archive import RunArchive
     from lapgs_plugin.camera import Camera
     from lapgs_plugin.rendering.compose import HierarchyRenderer
     from lapgs_plugin.scenes import Scene, View
@@ -102,23 +101,26 @@ def render(
         lapgs render runs/garden --trajectory spline --panels --format exr --out frames/
     """
     if trajectory is None:
-        _refuse({"--frames": frames, "--frame-rate": frame_rate, "--panels": panels or None}, "needs --trajectory")
-        _refuse({"--size": None if fps else size}, "needs --trajectory or --fps")
+        refuse({"--frames": frames, "--frame-rate": frame_rate, "--panels": panels or None}, "needs --trajectory")
+        refuse({"--size": None if fps else size}, "needs --trajectory or --fps")
     else:
-        _refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
+        refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
     from lapgs_plugin.archive import RENDERS, RunArchive
     from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.rendering.paths import path_cameras
     from lapgs_plugin.rendering.run import run_renderer, run_scene
 
     _require_one_of("--views", views, (None, *SPLITS))
     _require_one_of("--format", image_format, FORMATS)
     archive = RunArchive.open(run)
     show_log()
-    renderer = run_renderer(archive, device, rasterizer)
+    # A damaged field is no obstacle to rendering coarser levels.
+    wanted = level if level in archive.available_levels else None
+    renderer = run_renderer(archive, device, rasterizer, finest=wanted or 0)
     level = renderer.finest if level is None else level
     renderer.require_level(level)
     if fps:
-        _refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
+        refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
         with one_pool():
             splits = _choose(run_scene(archive, scene), views).values()
             _print_speeds(renderer, [view.camera for split in splits for view in split], level, size)
@@ -126,7 +128,7 @@ def render(
     if trajectory is not None:
         clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
         with one_pool():
-            cameras = _path_cameras(archive, trajectory, frames, scene)
+            cameras = path_cameras(archive, trajectory, frames, DEFAULT_FRAMES, scene)
             _write_clip(
                 renderer, cameras, clip, level, size, frame_rate=frame_rate, panels=panels, image_format=image_format
             )
@@ -138,27 +140,6 @@ def render(
         for split, chosen in _choose(loaded, views).items():
             _write_views(renderer, chosen, level, folder=folder / split, image_format=image_format, compare=compare)
     print(f"{folder} holds the images")
-
-
-def _refuse(options: dict[str, object], why: str) -> None:
-    """Say that an option would have no effect."""
-    for option, value in options.items():
-        if value is not None:
-            raise UserInputError(f"{option} {why}; leave it out")
-
-
-def _path_cameras(archive: RunArchive, trajectory: str, frames: int | None, scene: Path | None) -> list[Camera]:
-    """The cameras of a path, one a frame."""
-    from lapgs_plugin.rendering.rig import Rig
-    from lapgs_plugin.rendering.run import run_cameras
-    from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
-
-    if trajectory not in ("orbit", "spline"):
-        cameras = read_trajectory(Path(trajectory))
-        return cameras if frames is None else spline(cameras, frames)
-    train = list(run_cameras(archive, scene)[0].values())
-    count = DEFAULT_FRAMES if frames is None else frames
-    return orbit(Rig.of(train), count) if trajectory == "orbit" else spline(walking_order(train), count)
 
 
 def _write_clip(
@@ -179,7 +160,7 @@ def _write_clip(
     if out.suffix == VIDEO and image_format != "png":
         raise UserInputError(f"--format {image_format}: a video has 8 bits; give --out a folder")
     if out.suffix != VIDEO:
-        _refuse({"--frame-rate": frame_rate}, f"needs an {VIDEO} file as --out")
+        refuse({"--frame-rate": frame_rate}, f"needs an {VIDEO} file as --out")
     wanted = None if size is None else parse_size(size)
     render_clip(
         renderer,
