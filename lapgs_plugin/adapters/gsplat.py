@@ -126,7 +126,9 @@ class GsplatRasterizer:
             _hand_over_gradients(found, means2d, absgrad2d)
         with torch.no_grad():
             radii = self._describe(found, means2d)
-        return RenderResult(images[0].permute(2, 0, 1), 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
+        # What follows in training reads it plane by plane beside others that lie so: turned once instead of in each.
+        image = images[0].permute(2, 0, 1).contiguous()
+        return RenderResult(image, 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:

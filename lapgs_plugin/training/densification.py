@@ -80,13 +80,22 @@ class Densifier:
         """See `DensityControl`."""
         if iteration >= self._schedule.densify_until:
             return False
+        if _refines(self._schedule, iteration):
+            info = self._info(result, camera)
+            self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
+        else:
+            self._accumulate(result, camera)
+        reset = iteration % self._schedule.reset_every == 0
+        if reset:
+            # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
+            reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
+        return reset or _refines(self._schedule, iteration)
+
+    def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
+        """A render as gsplat's strategies look at it."""
         means2d: Any = result.means2d.detach()[None]  # (1, n, 2)
-        assert result.means2d.grad is not None
-        means2d.grad = result.means2d.grad[None]
-        if self._strategy.absgrad:
-            assert result.absgrad2d is not None, "the rasterizer offers no absolute gradients"
-            means2d.absgrad = result.absgrad2d[None]
-        info = {
+        means2d.grad = means2d.absgrad = self._gradient(result)[None]
+        return {
             "means2d": means2d,
             "radii": result.radii[None, :, None].expand(1, -1, 2),  # (1, n, 2)
             "width": camera.width,
@@ -94,12 +103,24 @@ class Densifier:
             "n_cameras": 1,
             "gaussian_ids": None,
         }
-        self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
-        reset = iteration % self._schedule.reset_every == 0
-        if reset:
-            # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
-            reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
-        return reset or _refines(self._schedule, iteration)
+
+    def _accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """What gsplat's strategy does between two refinements, for all Gaussians: it selects visible ones, and to learn
+        how many there are the processor waits for a GPU."""
+        gradient = self._gradient(result).clone()  # (n, 2)
+        gradient[:, 0] *= camera.width / 2.0
+        gradient[:, 1] *= camera.height / 2.0
+        shown = result.radii > 0
+        if self.state["grad2d"] is None:
+            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
+        self.state["grad2d"] += torch.where(shown, gradient.norm(dim=-1), 0.0)
+        self.state["count"] += shown
+
+    def _gradient(self, result: RenderResult) -> Tensor:
+        """(n, 2), by the centres on the image, absolute where so asked."""
+        gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
+        assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
+        return gradient
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """None: nothing is added to the loss."""

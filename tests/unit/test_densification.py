@@ -1,0 +1,63 @@
+"""Density control between refinements, against gsplat's own strategy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from gsplat.strategy import DefaultStrategy
+
+from lapgs_plugin.plan import StagePlan
+from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from tests.training_scene import blob_field, ring_camera
+
+EXTENT = 2.0
+
+
+def rendered(n: int, seed: int) -> RenderResult:
+    """What a render of n Gaussians might have left after `backward()`; every third one was culled."""
+    generator = torch.Generator().manual_seed(seed)
+    means2d = torch.zeros(n, 2, requires_grad=True)
+    means2d.grad = 1e-4 * torch.randn(n, 2, generator=generator)
+    radii = torch.randint(1, 9, (n,), generator=generator, dtype=torch.int32)
+    radii[::3] = 0
+    means2d.grad[::3] = 0
+    image = torch.zeros(3, 4, 4)
+    return RenderResult(image, image[0], radii, means2d, 2 * means2d.grad.abs())
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
+    settings = TrainSettings(
+        iterations=100, densification=Densification(start=2, until=60, every=10, reset_every=1000, absgrad=absgrad)
+    )
+    (stage,) = StagePlan.create((64, 48), 100, 1)
+    schedule = StageSchedule.create(settings, stage)
+    fields = [TrainableField.create(blob_field(200), settings.learning_rates, EXTENT) for _ in range(2)]
+    ours = Densifier(schedule, settings.densification, EXTENT)
+    theirs = DefaultStrategy(
+        refine_start_iter=2, refine_stop_iter=60, refine_every=10, reset_every=1000, absgrad=absgrad
+    )
+    state = theirs.initialize_state(scene_scale=EXTENT)
+    camera = replace(ring_camera(0.0), width=64, height=48)
+    for iteration in range(1, 11):
+        result = rendered(200, iteration)
+        torch.manual_seed(iteration)
+        edited = ours.after_step(fields[0], iteration, result, camera)
+        assert edited == (iteration == 10)
+        means2d: Any = torch.zeros(1, 200, 2)
+        means2d.grad, means2d.absgrad = result.means2d.grad[None], result.absgrad2d[None]
+        info = {"means2d": means2d, "width": 64, "height": 48, "n_cameras": 1, "gaussian_ids": None}
+        info["radii"] = result.radii[None, :, None].expand(1, -1, 2)
+        torch.manual_seed(iteration)
+        theirs.step_post_backward(fields[1].params, fields[1].optimizers, state, iteration, info)
+        for name in ("grad2d", "count"):
+            assert torch.equal(ours.state[name], state[name]), (name, iteration)
+    assert len(fields[0]) == len(fields[1]) != 200
+    for name, value in fields[0].params.items():
+        assert torch.equal(value, fields[1].params[name]), name
