@@ -22,7 +22,7 @@ from lapgs_plugin.adapters.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import StageRendering
 from lapgs_plugin.adapters.stage_images import StageImages
 from lapgs_plugin.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
-from lapgs_plugin.errors import TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import ImageStore
@@ -223,11 +223,11 @@ class ActiveStage:
             if path.is_file():
                 shutil.copy(path, target)
 
-    def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> UserInputError:
+    def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """One line that says what filled the GPU and what helps."""
         images = self._images.bytes_on_device
         help_ = "--images-on memory takes them off the GPU" if images else "a larger threshold for densification helps"
-        return UserInputError(
+        return DeviceMemoryError(
             f"out of GPU memory at level {self.stage.level} with {self._peak:,} Gaussians; images held on the GPU: "
             f"{images / 2**30:.2f} GiB; {help_}, more --levels or a smaller resolution too; "
             f"finished levels ({self._finished_levels()}) are kept, --resume continues after them "

@@ -21,7 +21,7 @@ from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.adapters.script import loaded_script, require_script
 from lapgs_plugin.archive import CACHE, RunArchive
 from lapgs_plugin.cli import app
-from lapgs_plugin.errors import LapgsError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import Stage
 from tests.contract.stub_runs import (
@@ -308,7 +308,7 @@ class FillsTheGpu(StageHook):
 
 def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    with pytest.raises(UserInputError) as caught:
+    with pytest.raises(DeviceMemoryError) as caught:
         run_hierarchy(STUBS["graphdeco"], scene, folder, hooks=(FillsTheGpu(),))
     message = one_line(caught.value)
     for part in ("out of GPU memory at level 0", "finished levels (1) are kept", "--resume", "images", "2.00 GiB"):
