@@ -6,9 +6,7 @@ Needs playwright and a Chromium that is installed anyway (LAPGS_CHROMIUM names a
 from __future__ import annotations
 
 import math
-import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -26,17 +24,15 @@ from numpy.typing import NDArray
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.rendering.trajectory import read_trajectory
 from tests.cli.run_folder import write_run, write_scene
+from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
 from tests.training_scene import ring_camera
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
-CHROMIUM = os.environ.get("LAPGS_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
-)
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium or Chrome (set LAPGS_CHROMIUM)"),
+    pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
 WIDTH, HEIGHT = 800, 600
@@ -91,13 +87,8 @@ def sharpen_residual(run: Path) -> None:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM,
-            args=["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-        )
+    with headless_chromium(*SOFTWARE_3D) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

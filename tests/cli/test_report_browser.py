@@ -1,0 +1,155 @@
+"""report.html as a person meets it: a real browser without a window and without a network, a mouse and a keyboard."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.report import report
+from tests.cli.run_folder import write_run, write_scene
+from tests.headless import CHROMIUM, NO_CHROMIUM, headless_chromium
+
+pytest.importorskip("playwright.sync_api", reason="needs playwright")
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+
+PHONE, DESKTOP = (390, 844), (1280, 900)
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Of the page of a hierarchy beside a single field, whose pictures differ a lot."""
+    folder = tmp_path_factory.mktemp("report")
+    scene = write_scene(folder / "scene")
+    run, baseline = write_run(folder / "run", scene), write_run(folder / "baseline", scene, levels=1, seed=5)
+    app = typer.Typer()
+    app.command()(report)
+    result = CliRunner().invoke(app, [str(run), "--baseline", str(baseline)])
+    assert result.exit_code == 0, result.output
+    return (run / "report.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with headless_chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(params=[PHONE, DESKTOP], ids=["phone", "desktop"])
+def page(request: pytest.FixtureRequest, browser: Any, address: str) -> Iterator[Any]:
+    """The page, which asked for nothing and reported no mistake by the end of the test."""
+    width, height = request.param
+    troubles: list[str] = []
+    page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=1)
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("console", lambda message: troubles.append(message.text))
+    page.on(
+        "request", lambda request: troubles.append(request.url[:80]) if request.url[:5] not in ("file:", "data:") else 0
+    )
+    page.goto(address)
+    yield page
+    assert troubles == []
+    page.close()
+
+
+def pixels(element: Any) -> NDArray[np.float64]:
+    """(h, w, 3) what is seen of an element."""
+    return cv2.imdecode(np.frombuffer(element.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(np.float64)
+
+
+def difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float(np.abs(one - other).mean())
+
+
+def choose(strip: Any, side: str, caption: str) -> None:
+    strip.locator(f'select[data-side="{side}"]').select_option(label=caption)
+
+
+def test_the_page_fits_and_shows_what_it_should(page: Any) -> None:
+    widths = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
+    assert widths[0] <= widths[1]  # nothing has to be scrolled sideways but tables inside their own boxes
+    for heading in ("Figures", "Training", "Time", "Views", "Settings"):
+        assert page.get_by_role("heading", name=heading, exact=True).is_visible()
+    charts = page.locator(".charts svg[role=img]")
+    shown = [chart for chart in charts.all() if chart.is_visible()]
+    assert len(shown) == 3 + 3  # over time; and time against Gaussians, breakdown, overhead
+    for chart in shown:
+        box = chart.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= widths[1]
+        assert box["width"] > 250
+        for text in chart.locator("text").all():
+            assert float(text.evaluate("node => node.getBoundingClientRect().height")) >= 9  # pixels: can be read
+    page.get_by_text("over iterations").click()
+    assert [chart.is_visible() for chart in charts.all()] == [False] * 3 + [True] * 6
+    images = page.locator("img").all()
+    assert all(image.evaluate("node => node.complete && node.naturalWidth > 0") for image in images)
+
+
+def test_the_divider_is_dragged(page: Any) -> None:
+    strip = page.locator(".strip").first
+    pair, divider = strip.locator(".pair"), strip.get_by_role("slider")
+    pair.evaluate("node => node.querySelectorAll('.box').forEach(box => box.remove())")
+    divider.press("Home")  # out of the way
+    whole = {}
+    for caption in ("Photo", "Composition"):
+        choose(strip, "left", caption)
+        choose(strip, "right", caption)
+        whole[caption] = pixels(pair)
+    assert difference(whole["Photo"], whole["Composition"]) > 20
+    choose(strip, "left", "Photo")
+    box = pair.bounding_box()
+    y = box["y"] + box["height"] * 0.75
+    page.mouse.move(box["x"] + box["width"] * 0.5, y)
+    page.mouse.down()
+    for share in (0.2, 0.8, 0.3):
+        page.mouse.move(box["x"] + box["width"] * share, y, steps=4)
+        assert float(divider.get_attribute("aria-valuenow")) == pytest.approx(100 * share, abs=1.0)
+        seen = pixels(pair)
+        at, margin = round(share * seen.shape[1]), 24  # pixels around the line and its handle
+        assert difference(seen[:, margin : at - margin], whole["Photo"][:, margin : at - margin]) < 0.5
+        assert difference(seen[:, at + margin :], whole["Composition"][:, at + margin :]) < 0.5
+    page.mouse.up()
+    page.mouse.move(box["x"] + box["width"] * 0.9, y)
+    assert divider.get_attribute("aria-valuenow") == "30"  # let go
+
+
+def test_the_divider_obeys_the_keyboard(page: Any) -> None:
+    strip = page.locator(".strip").nth(1)
+    divider = strip.get_by_role("slider")
+    for key, value in (("ArrowLeft", "48"), ("ArrowRight", "50"), ("End", "100"), ("ArrowRight", "100"), ("Home", "0")):
+        divider.press(key)
+        assert divider.get_attribute("aria-valuenow") == value
+    assert page.locator(".strip").first.get_by_role("slider").get_attribute("aria-valuenow") == "50"  # its own
+
+
+def test_any_two_pictures_can_be_compared(page: Any) -> None:
+    strip = page.locator(".strip").first
+    options = strip.locator('select[data-side="left"] option').all_inner_texts()
+    assert [option.partition(",")[0] for option in options] == ["Photo", "Base", "Residual", "Composition", "Baseline"]
+    assert strip.locator("select").evaluate_all("nodes => nodes.map(node => node.selectedOptions[0].text)") == [
+        "Baseline",
+        "Composition",
+    ]
+    for caption in options:
+        choose(strip, "right", caption)
+        shown, small = (
+            strip.locator(path).get_attribute("src")
+            for path in (".pair .right", f'.zoom img[alt^="{caption.partition(",")[0]} of"]')
+        )
+        assert shown == small
+
+
+def test_a_small_picture_is_enlarged_and_put_back(page: Any) -> None:
+    image = page.locator(".zoom img").first
+    before = image.bounding_box()
+    image.click()
+    assert image.bounding_box()["width"] == page.viewport_size["width"]
+    image.click()
+    assert image.bounding_box()["width"] == before["width"]
