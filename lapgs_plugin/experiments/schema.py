@@ -225,8 +225,9 @@ def nearest(name: str, known: Set[str]) -> str:
 
 
 def _first_problem(error: ValidationError) -> str:
-    """The first of pydantic's complaints as one line."""
-    problem = error.errors(include_url=False)[0]
+    """One of pydantic's complaints as one line: an unknown key before one that is missing, which it may be."""
+    problems = error.errors(include_url=False)
+    problem = next((each for each in problems if each["type"] == "extra_forbidden"), problems[0])
     place = [str(part) for part in problem["loc"]]
     where = ".".join(place)
     if problem["type"] == "extra_forbidden":

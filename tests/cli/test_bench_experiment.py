@@ -1,0 +1,161 @@
+"""`lapgs bench EXPERIMENT.toml` as a user runs it: to the end, again, with mistakes, and side by side."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
+from lapgs_plugin.scenes.sample import make_sample_scene
+
+EXPERIMENT = """
+name = "tiny"
+title = "Tiny"
+iterations = 20
+[[scenes]]
+name = "mine"
+path = "scene"
+[backbones.cpu]
+rasterizer = "cpu"
+[[variants]]
+name = "one field"
+method = "bare"
+[[variants]]
+name = "too many levels"
+options = { levels = 9 }
+[table]
+columns = ["train_seconds", "psnr"]
+"""
+LAPGS = [sys.executable, "-m", "lapgs_plugin", "bench"]
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    make_sample_scene(tmp_path / "scene", width=48, height=32, views=8, points=100, progress=False)
+    path = tmp_path / "tiny.toml"
+    path.write_text(EXPERIMENT)
+    return path
+
+
+def bench(experiment: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    command = [*LAPGS, str(experiment), "--out", "out", *more]
+    return subprocess.run(command, cwd=experiment.parent, capture_output=True, text=True, check=False, timeout=300)
+
+
+def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experiment: Path) -> None:
+    first = bench(experiment)
+    assert first.returncode == 1
+    assert "1 of 2 runs failed" in first.stderr
+    assert "levels" in first.stderr, "the end of the log says why"
+    assert "Traceback" not in first.stderr
+    out = experiment.parent / "out"
+    with (out / "results.csv").open(newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    assert (row["variant"], row["scene"], row["method"], row["iterations"]) == ("one field", "mine", "bare", "20")
+    assert float(row["psnr"]) > 5.0
+    assert Path(row["folder"], "manifest.json").is_file()
+    assert "| one field |" in (out / "tables.md").read_text()
+    written = Path(row["folder"], "manifest.json").stat().st_mtime_ns
+    outcomes = ResultStore(out / "results.sqlite").outcomes()
+    assert [outcome.state for outcome in outcomes] == [DONE, FAILED]
+
+    experiment.write_text(EXPERIMENT.replace("levels = 9", "levels = 2"))
+    second = bench(experiment, "--no-eval")
+    assert second.returncode == 0, second.stderr
+    assert "1 of 2 runs are done already" in second.stderr
+    assert Path(row["folder"], "manifest.json").stat().st_mtime_ns == written
+    with (out / "results.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(each["variant"], each["measured_by"]) for each in rows] == [
+        ("one field", "lapgs eval"),
+        ("too many levels", "training"),
+    ]
+
+
+def test_killed_in_the_middle_another_one_goes_on(experiment: Path) -> None:
+    experiment.write_text(
+        EXPERIMENT.replace("levels = 9", "levels = 2").replace("iterations = 20", "iterations = 3000")
+    )
+    out = experiment.parent / "out"
+    options = ("--no-eval", "--variant", "too many levels")
+    command = [*LAPGS, str(experiment), "--out", "out", *options]
+    doomed = subprocess.Popen(command, cwd=experiment.parent, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    end = time.monotonic() + 120
+    while not list((out / "runs").glob("*/manifest.json")):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    doomed.send_signal(signal.SIGKILL)
+    doomed.wait()
+    # The next one gets a store that says "running" for a process that is gone.
+    again = bench(experiment, *options, "--iterations", "20")
+    assert again.returncode == 0, again.stderr
+    store = ResultStore(out / "results.sqlite")
+    assert len([outcome for outcome in store.outcomes() if outcome.state == DONE]) == 1
+    assert store.has_free([outcome.run_id for outcome in store.outcomes()]), "what was killed is free again"
+
+
+def invoke(*words: str | Path) -> BaseException | None:
+    return CliRunner().invoke(bench_app, [str(word) for word in words]).exception
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--launcher", "cloud"), "--launcher cloud: expected local, slurm, ray"),
+        (("--launcher", "slurm"), "no sbatch on this machine"),
+        (("--launcher-option", "partition"), "--launcher-option partition: expected NAME=VALUE"),
+        (("--launcher-option", "partition=gpu"), "the local launcher has none"),
+        (("--launcher", "slurm", "--gpus", "0"), "slurm deals out GPUs itself"),
+        (("--path", "mine"), "--path mine: expected NAME=VALUE"),
+        (("--path", "mine=nowhere"), "scene mine: nowhere is not a folder"),
+        (("--scene", "yours"), "--scene yours: not in the experiment; "),
+        (("--seeds", "1;2"), "--seeds 1;2: expected whole numbers"),
+    ],
+)
+def test_mistakes_on_the_command_line(
+    experiment: Path, words: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(experiment.parent)
+    error = invoke(experiment, *words)
+    assert isinstance(error, UserInputError)
+    assert message in str(error)
+    assert "\n" not in str(error)
+
+
+def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path) -> None:
+    text = EXPERIMENT.replace('rasterizer = "cpu"', 'checkout = "fastgs"').replace("levels = 9", "levels = 2")
+    experiment.write_text(text)
+    os.environ.pop("LAPGS_FASTGS", None)
+    error = invoke(experiment, "--out", experiment.parent / "out")
+    assert isinstance(error, UserInputError)
+    assert "checkout fastgs: nothing says where it is; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
+    assert not (experiment.parent / "out").exists()
+
+
+def test_tables_of_nothing(experiment: Path) -> None:
+    error = invoke(experiment, "--out", experiment.parent / "out", "--tables-only")
+    assert isinstance(error, RunFolderError)
+    assert "does not exist" in str(error)
+
+
+def test_a_dry_run_prints_commands_and_writes_nothing(experiment: Path) -> None:
+    result = CliRunner().invoke(bench_app, [str(experiment), "--dry-run", "--out", str(experiment.parent / "out")])
+    assert result.exit_code == 0
+    assert "lapgs_plugin train" in result.output
+    assert "lapgs_plugin eval" in result.output
+    assert not (experiment.parent / "out").exists()
+
+
+def test_subcommands_are_still_found() -> None:
+    assert "Time whole training iterations" in CliRunner().invoke(bench_app, ["raster", "--help"]).output
+    assert "EXPERIMENT" in CliRunner().invoke(bench_app, ["--help"]).output

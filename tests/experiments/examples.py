@@ -1,0 +1,105 @@
+"""Small experiments, and jobs whose training is the copy of a run folder."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
+from lapgs_plugin.experiments.commands import Step
+from lapgs_plugin.experiments.expansion import RunSpec
+from lapgs_plugin.experiments.store import Job
+from lapgs_plugin.field import GaussianField
+
+SMALL: dict[str, Any] = {
+    "name": "small",
+    "title": "Small",
+    "iterations": 40,
+    "seeds": [0, 1],
+    "scenes": [{"name": "a", "path": "a"}, {"name": "b", "path": "b"}],
+    "backbones": {"cpu": {"rasterizer": "cpu"}, "fast": {"checkout": "fastgs", "preset": "fastgs.big"}},
+    "variants": [
+        {"name": "bare", "method": "bare", "baseline": True},
+        {"name": "two levels", "options": {"levels": 2}},
+        {"name": "fast alone", "backbones": ["fast"], "options": {"levels": 3}, "arguments": ["--dense", "0.1"]},
+    ],
+}
+
+START = "import pathlib, shutil, sys, time; out, started, source, seconds = sys.argv[1:]; "
+COPY = (
+    START + "stream = open(started, 'a'); stream.write(pathlib.Path(out).name + '\\n'); stream.close(); "
+    "time.sleep(float(seconds)); shutil.copytree(source, out)"
+)
+"""Trains by copying: out, a file that gets a line for every start, the folder to copy, seconds that it takes."""
+
+
+def run_spec(number: int = 0, **changes: Any) -> RunSpec:
+    values: dict[str, Any] = {
+        **{"scene": "a", "dataset": "", "images": "images", "resolution": "full", "backbone": "cpu"},
+        **{"rasterizer": "cpu", "checkout": None, "method": "hierarchy", "iterations": 10, "seed": number},
+        **{"options": {"levels": 2}, "arguments": []},
+    }
+    return RunSpec(**{**values, **changes})
+
+
+def tiny_run(folder: Path, psnr: float = 20.0) -> Path:
+    """A complete, measured run folder of two levels with a few Gaussians."""
+    scene = SceneReference("/nowhere", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene, 2, "camera", "reconstructed", "geometry", 0, "cpu", 0, {})
+    with RunArchive.create(folder, manifest) as archive:
+        for level, count in ((1, 3), (0, 5)):
+            record = LevelRecord(
+                level=level,
+                signed=level == 0,
+                iterations=10 * (2 - level),
+                num_gaussians=count,
+                peak_gaussians=count + 1,
+                train_seconds=6.0,
+                overhead_seconds={"pyramid": 0.5},
+                image_size=(8 // (level + 1), 8 // (level + 1)),
+                memory_bytes={"peak": 100 * count, "images": 10 * count},
+                mean_gaussians=float(count),
+                breakdown_seconds={"forward": 1.0, "backward": 2.0},
+            )
+            archive.finish_level(record, _field(count, signed=level == 0))
+        archive.write_metrics({"psnr": psnr, "ssim": 0.5, "views": [], "lpips_missing": {"vgg": "no weights"}})
+    return folder
+
+
+def _field(count: int, signed: bool) -> GaussianField:
+    return GaussianField(
+        means=torch.rand(count, 3),
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        log_scales=torch.zeros(count, 3),
+        opacity_logits=torch.zeros(count),
+        sh=torch.zeros(count, 1, 3),
+        signed=signed,
+    )
+
+
+def copying_jobs(folder: Path, count: int, seconds: float = 0.0, code: str = COPY) -> list[Job]:
+    """Jobs that copy a tiny run; `folder`/started has a line for every start of one."""
+    source = folder / "source"
+    if not source.exists():
+        tiny_run(source)
+    return [
+        _job(folder, run_spec(number), (*_python(code), *_paths(folder, number, seconds))) for number in range(count)
+    ]
+
+
+def _job(folder: Path, spec: RunSpec, command: Sequence[str]) -> Job:
+    own, log = folder / "runs" / spec.run_id, folder / "logs" / f"{spec.run_id}.log"
+    return Job(spec.run_id, spec, str(own), str(log), (Step(tuple(command), str(folder)),), True)
+
+
+def _python(code: str) -> tuple[str, ...]:
+    return sys.executable, "-c", code
+
+
+def _paths(folder: Path, number: int, seconds: float) -> tuple[str, ...]:
+    own = folder / "runs" / run_spec(number).run_id
+    return str(own), str(folder / "started"), str(folder / "source"), str(seconds)

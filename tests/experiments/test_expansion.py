@@ -1,0 +1,175 @@
+"""Runs of an experiment: all of them, once, in an order that is fair; and the commands they become."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.commands import Places, run_steps
+from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+from lapgs_plugin.experiments.schema import Experiment
+from tests.experiments.examples import SMALL, run_spec
+
+
+def experiment(**changes: Any) -> Experiment:
+    return Experiment.model_validate({**SMALL, **changes})
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    scenes=st.integers(1, 4),
+    variants=st.integers(1, 4),
+    backbones=st.integers(1, 3),
+    seeds=st.lists(st.integers(0, 99), min_size=1, max_size=3, unique=True),
+)
+def test_every_combination_once_and_variants_in_turn(
+    scenes: int, variants: int, backbones: int, seeds: list[int]
+) -> None:
+    built = experiment(
+        seeds=seeds,
+        scenes=[{"name": f"s{i}", "path": "x"} for i in range(scenes)],
+        backbones={f"b{i}": {"rasterizer": f"r{i}"} for i in range(backbones)},
+        variants=[{"name": f"v{i}", "options": {"levels": i}} for i in range(variants)],
+    )
+    planned = plan_runs(built, Selection())
+    found = [(run.spec.seed, run.spec.scene, run.variant, run.spec.backbone) for run in planned]
+    wanted = set(
+        product(
+            seeds,
+            (f"s{i}" for i in range(scenes)),
+            (f"v{i}" for i in range(variants)),
+            (f"b{i}" for i in range(backbones)),
+        )
+    )
+    assert len(found) == len(wanted)
+    assert set(found) == wanted
+    assert len({run.spec.run_id for run in planned}) == len(wanted)
+    # Before anything is run a second time in the same place, everything else was run there once.
+    pairs = variants * backbones
+    for start in range(0, len(found), pairs):
+        block = found[start : start + pairs]
+        assert len({(seed, scene) for seed, scene, _, _ in block}) == 1
+    order = [(variant, backbone) for _, _, variant, backbone in found[:pairs]]
+    beginnings = [(variant, backbone) for _, _, variant, backbone in found[::pairs]]
+    assert beginnings == [order[i % pairs] for i in range(len(beginnings))]
+
+
+def test_variants_trained_alike_share_their_runs_and_a_new_name_repeats_none() -> None:
+    alike = [
+        {"name": "xyz", "options": {"inherit": "xyz"}},
+        {"name": "rho = 1", "options": {"inherit": "xyz"}},
+        {"name": "other", "options": {"inherit": "full"}},
+    ]
+    ids = {
+        run.variant: run.spec.run_id
+        for run in plan_runs(experiment(variants=alike), Selection(scenes=["a"], seeds=[0], backbones=["cpu"]))
+    }
+    assert ids["xyz"] == ids["rho = 1"] != ids["other"]
+
+
+def test_what_is_selected_is_what_is_run() -> None:
+    selection = Selection(scenes=["b"], backbones=["fast"], variants=["bare"], seeds=[7], iterations=9)
+    (run,) = plan_runs(experiment(), selection)
+    spec = run.spec
+    assert (spec.scene, spec.backbone, spec.seed, spec.iterations) == ("b", "fast", 7, 9)
+    assert spec.options == {}, "options of `lapgs run` mean nothing to a script by itself"
+    assert spec.arguments[:2] == ["--densification_interval", "100"]
+    with pytest.raises(UserInputError, match="--scene c: not in the experiment"):
+        plan_runs(experiment(), Selection(scenes=["c"]))
+    with pytest.raises(UserInputError, match="no run is left"):
+        plan_runs(experiment(), Selection(backbones=["cpu"], variants=["fast alone"]))
+
+
+def test_data_sets_know_their_scenes_and_image_folders() -> None:
+    built = experiment(scenes=[{"dataset": "mipnerf360", "only": ["garden", "room"], "images": "downscaled"}])
+    assert [(scene.name, scene.images) for scene in scenes_of(built, Selection())] == [
+        ("garden", "images_4"),
+        ("room", "images_2"),
+    ]
+
+
+def words_after(command: tuple[str, ...], *options: str) -> list[str]:
+    return [command[command.index(option) + 1] for option in options]
+
+
+def test_commands_of_the_built_in_trainer(tmp_path: Path) -> None:
+    hierarchy, measuring = run_steps(run_spec(3), tmp_path, None, tmp_path / "r", ["--lpips", "none"])
+    assert words_after(hierarchy.command, "--levels", "--seed", "--iterations") == ["2", "3", "10"]
+    assert measuring.command[-4:] == ("eval", str(tmp_path / "r"), "--lpips", "none")
+    (bare,) = run_steps(run_spec(method="bare"), tmp_path, None, tmp_path / "r", None)
+    assert words_after(bare.command, "--levels") == ["1"]
+
+
+def test_commands_of_a_checkout(tmp_path: Path) -> None:
+    spec = run_spec(checkout="fastgs", rasterizer=None, iterations=7000, arguments=["--mult", "0.7", "--dense", "0.1"])
+    (scene := tmp_path / "scene" / "images").mkdir(parents=True)
+    Image.new("RGB", (640, 480)).save(scene / "0.jpg")
+    place = scene.parent
+    (step, _) = run_steps(spec, place, tmp_path, tmp_path / "r", [])
+    script = step.command.index(str(tmp_path / "train.py"))
+    before, after = step.command[:script], step.command[script:]
+    assert "--levels" in before
+    assert "--levels" not in after
+    assert words_after(after, "--iterations", "--position_lr_max_steps", "--densify_until_iter") == [
+        "7000",
+        "7000",
+        "3500",
+    ]
+    assert after.index("--dense") > after.index("--densify_until_iter"), "the experiment's own words win"
+
+    training, importing, _ = run_steps(
+        run_spec(checkout="fastgs", rasterizer=None, method="bare", arguments=["--mult", "0.7"], iterations=30_000),
+        *(place, tmp_path, tmp_path / "r", []),
+    )
+    assert training.command[3:6] == ("run", "--off", "--record")
+    assert "--iterations" not in training.command, "30,000 is what the script does by itself"
+    assert words_after(importing.command, "--set", "--out") == ["mult=0.7", str(tmp_path / "r" / "lapgs")]
+
+
+@pytest.mark.parametrize(
+    ("resolution", "width", "expected"),
+    [
+        *(("1k", 4000, "1600"), ("1k", 800, "1"), ("2k", 4000, "2800"), ("4k", 4000, "1"), ("full", 4000, "1")),
+        *(("1/4", 4000, "4"), ("800", 4000, "800"), ("3dgs:-1", 4000, "-1")),
+    ],
+)
+def test_resolutions_as_scripts_take_them(tmp_path: Path, resolution: str, width: int, expected: str) -> None:
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (width, 8)).save(tmp_path / "images" / "0.png")
+    spec = run_spec(checkout="fastgs", rasterizer=None, resolution=resolution)
+    (step,) = run_steps(spec, tmp_path, tmp_path, tmp_path / "r", None)
+    assert words_after(step.command, "-r") == [expected]
+
+
+def test_a_fraction_that_no_script_knows(tmp_path: Path) -> None:
+    spec = run_spec(checkout="fastgs", rasterizer=None, resolution="1/3")
+    with pytest.raises(UserInputError, match="resolution '1/3'"):
+        run_steps(spec, tmp_path, tmp_path, tmp_path / "r", None)
+
+
+def test_where_things_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built = experiment(scenes=[{"dataset": "mipnerf360", "only": ["garden"]}])
+    (garden,) = scenes_of(built, Selection())
+    for name in ("GARDEN", "MIPNERF360", "FASTGS"):
+        monkeypatch.delenv(f"LAPGS_{name}", raising=False)
+    with pytest.raises(
+        UserInputError, match=r"scene garden.*--path garden=FOLDER \(LAPGS_GARDEN\) or --path mipnerf360"
+    ):
+        Places({}, tmp_path).scene(garden)
+    (tmp_path / "360" / "garden").mkdir(parents=True)
+    monkeypatch.setenv("LAPGS_MIPNERF360", str(tmp_path / "360"))
+    with pytest.raises(UserInputError, match="garden has no image folder images"):
+        Places({}, tmp_path).scene(garden)
+    (tmp_path / "360" / "garden" / "images").mkdir()
+    assert Places({}, tmp_path).scene(garden) == tmp_path / "360" / "garden"
+    with pytest.raises(UserInputError, match="nowhere is not a folder"):
+        Places({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
+    with pytest.raises(UserInputError, match=r"has no train\.py"):
+        Places({"fastgs": tmp_path}, tmp_path).checkout("fastgs")

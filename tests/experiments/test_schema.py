@@ -1,0 +1,123 @@
+"""Experiment files: what is read is what was written, and every mistake is one line that names it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.cli.bench_experiment import _option_names
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.aggregate import check_table
+from lapgs_plugin.experiments.expansion import Selection, plan_runs
+from lapgs_plugin.experiments.schema import load_experiment
+
+BENCHMARKS = sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml"))
+
+GOOD = """
+name = "x"
+title = "X"
+[[scenes]]
+name = "a"
+path = "a"
+[backbones.cpu]
+rasterizer = "cpu"
+[backbones.fast]
+checkout = "fastgs"
+[[variants]]
+name = "one"
+options = { levels = 1 }
+"""
+
+
+def load(tmp_path: Path, text: str) -> Any:
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+    return load_experiment(path, _option_names())
+
+
+def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
+    experiment = load(tmp_path, GOOD)
+    assert (experiment.iterations, experiment.seeds) == (30_000, [0])
+    assert experiment.table.columns == ["minutes", "psnr", "ssim", "lpips", "gaussians_millions", "fps"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('title = "X"', 'titel = "X"', ("unknown key titel", "did you mean title?")),
+        ("options = {", "option = {", ("variants.0.option", "did you mean options?")),
+        ('rasterizer = "cpu"', 'rasteriser = "cpu"', ("backbones.cpu.rasteriser", "did you mean rasterizer?")),
+        ("levels = 1", "levles = 1", ("levles", "lapgs train", "did you mean levels?")),
+        ("levels = 1", "residual_color_rate = 1", ("residual_color_rate", "lapgs train")),
+        ("levels = 1", "seed = 1", ("sets seed", "the experiment sets itself")),
+        ('title = "X"', 'title = "X"\niterations = "many"', ("iterations", "'many'", "integer")),
+        ('title = "X"', 'title = "X"\niterations = 0', ("iterations", "greater than or equal to 1")),
+        ('title = "X"', 'title = "X"\nseeds = []', ("seeds",)),
+        ('title = "X"', "", ("title is missing",)),
+        ('path = "a"', 'path = "a"\ndataset = "mipnerf360"', ("either dataset or name",)),
+        ('name = "a"\npath = "a"', 'dataset = "mipnerf"', ("'mipnerf' is not known", "mipnerf360")),
+        ('name = "a"\npath = "a"', 'dataset = "mipnerf360"\nonly = ["gardn"]', ("gardn", "garden")),
+        ('checkout = "fastgs"', 'checkout = "fastgs"\npreset = "fastgs.huge"', ("fastgs.huge", "fastgs.big")),
+        ('checkout = "fastgs"', "", ("either rasterizer", "checkout")),
+        ('name = "one"', 'name = "one"\nbackbones = ["slow"]', ("backbone 'slow'", "cpu, fast")),
+        ('name = "one"', 'name = "one"\nmethod = "naked"', ("method", "'naked'")),
+        ("levels = 1 }", 'levels = 1 }\n[[variants]]\nname = "one"', ("two variants are called 'one'",)),
+        ('name = "x"', 'name = "x y"', ("name", "'x y'")),
+        ('name = "x"', "name = x", ("is not TOML",)),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_it(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+    assert old in GOOD
+    with pytest.raises(UserInputError) as caught:
+        load(tmp_path, GOOD.replace(old, new, 1))
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in ("x.toml", *words):
+        assert word in message
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match=r"none\.toml: No such file"):
+        load_experiment(tmp_path / "none.toml", _option_names())
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('columns = ["psrn"]', ("'psrn' is not known", "did you mean psnr?")),
+        ('paper = "main_8k"', ("main_8k", "main_4k")),
+    ],
+)
+def test_what_is_wrong_with_a_table(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
+    experiment = load(tmp_path, f"{GOOD}[table]\n{table}\n")
+    with pytest.raises(UserInputError) as caught:
+        check_table(experiment)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_a_row_that_the_paper_does_not_have(tmp_path: Path) -> None:
+    text = GOOD.replace('name = "one"', 'name = "one"\npaper = "Ours(FastGS"')
+    with pytest.raises(UserInputError, match=r"no row 'Ours\(FastGS'; did you mean Ours\(FastGS\)\?"):
+        check_table(load(tmp_path, text + '[table]\npaper = "main_1k"\n'))
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
+def test_the_shipped_experiments(path: Path) -> None:
+    experiment = load_experiment(path, _option_names())
+    paper = check_table(experiment)
+    assert experiment.name == path.stem
+    assert f"lapgs bench benchmarks/{path.name}" in path.read_text()
+    planned = plan_runs(experiment, Selection())
+    if path.stem == "smoke":
+        assert len(planned) == 6, "three variants, two seeds"
+        return
+    assert paper is not None
+    with_figures = [variant for variant in experiment.variants if variant.paper_row("fastgs")]
+    assert len(with_figures) >= 2, "most rows stand beside the paper's"
+
+
+def test_there_is_an_experiment_for_every_table() -> None:
+    wanted = {"main_1k", "main_2k", "main_4k", "split", "levels", "loss", "inheritance", "inheritance_ratio", "peak"}
+    assert {path.stem for path in BENCHMARKS} == wanted | {"breakdown", "smoke"}

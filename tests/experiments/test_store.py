@@ -1,0 +1,229 @@
+"""The store: no run lost and none doubled, whoever dies, and whatever wrote the file before."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.experiments import store as store_module
+from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MOST_CLAIMS, PENDING, RUNNING, ResultStore
+from lapgs_plugin.experiments.worker import work
+from tests.experiments.examples import COPY, START, copying_jobs
+
+WORKER = "import sys; from pathlib import Path; from lapgs_plugin.experiments.worker import work; "
+WORKER += "print(work(Path(sys.argv[1]), sys.argv[2:]))"
+
+
+def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", WORKER, str(store), *run_ids], stdout=subprocess.DEVNULL)
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.05)
+
+
+def starts(folder: Path) -> Counter[str]:
+    """How often each run was started."""
+    path = folder / "started"
+    return Counter(path.read_text().split()) if path.exists() else Counter()
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> tuple[ResultStore, list[str]]:
+    jobs = copying_jobs(tmp_path, 8)
+    store = ResultStore.create(tmp_path / "results.sqlite")
+    store.plan(jobs)
+    return store, [job.run_id for job in jobs]
+
+
+def test_workers_share_the_runs(planned: tuple[ResultStore, list[str]], tmp_path: Path) -> None:
+    store, run_ids = planned
+    workers = [start_worker(tmp_path / "results.sqlite", run_ids) for _ in range(2)]
+    assert [worker.wait(timeout=60) for worker in workers] == [0, 0]
+    outcomes = store.outcomes(run_ids)
+    assert [outcome.state for outcome in outcomes] == [DONE] * len(run_ids)
+    assert [outcome.run_id for outcome in outcomes] == run_ids
+    assert starts(tmp_path) == dict.fromkeys(run_ids, 1)
+
+
+def test_a_killed_worker_costs_one_run_its_first_attempt(tmp_path: Path) -> None:
+    jobs = copying_jobs(
+        tmp_path,
+        4,
+        seconds=1.0,
+        code=COPY.replace(START, START + "import os; open(started + '-pid', 'w').write(str(os.getpid())); "),
+    )
+    path, run_ids = tmp_path / "results.sqlite", [job.run_id for job in jobs]
+    store = ResultStore.create(path)
+    store.plan(jobs)
+    doomed = start_worker(path, run_ids)
+    wait_until(lambda: (tmp_path / "started-pid").exists() and (tmp_path / "started-pid").read_text() != "")
+    child = int((tmp_path / "started-pid").read_text())
+    doomed.send_signal(signal.SIGKILL)
+    doomed.wait()
+    wait_until(lambda: not Path(f"/proc/{child}").exists() if sys.platform == "linux" else True)
+    assert work(path, run_ids) == len(run_ids), "what the dead worker held is taken over"
+    assert [outcome.state for outcome in store.outcomes(run_ids)] == [DONE] * len(run_ids)
+    first, *others = run_ids
+    assert starts(tmp_path) == {first: 2, **dict.fromkeys(others, 1)}
+    assert store.outcomes([first])[0].record is not None
+    assert (store.outcomes([first])[0].record or {})["attempt"] == 2
+
+
+def test_a_worker_that_slept_through_its_lease_records_nothing(
+    planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, run_ids = planned
+    slept = store.claim(run_ids[:1])
+    assert slept is not None
+    assert store.claim(run_ids[:1]) is None, "it is running"
+    assert not store.has_free(run_ids[:1])
+    now = time.time()
+    monkeypatch.setattr(store_module.time, "time", lambda: now + LEASE + 1)
+    assert store.has_free(run_ids[:1])
+    other = store.claim(run_ids[:1])
+    assert other is not None
+    assert (slept.number, other.number) == (1, 2)
+    assert not store.renew(slept)
+    assert not store.record(slept, {"psnr": 1.0})
+    assert store.record(other, {"psnr": 2.0})
+    assert not store.fail(slept, "late")
+    (outcome,) = store.outcomes(run_ids[:1])
+    assert (outcome.state, outcome.record) == (DONE, {"psnr": 2.0})
+
+
+def test_a_lease_that_is_renewed_holds(planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    store, run_ids = planned
+    claim = store.claim(run_ids[:1])
+    assert claim is not None
+    now = time.time()
+    for later in (0.9, 1.8, 2.7):
+        monkeypatch.setattr(store_module.time, "time", lambda later=later: now + later * LEASE)
+        assert store.claim(run_ids[:1]) is None
+        assert store.renew(claim)
+
+
+def test_a_run_that_kills_its_workers_fails_in_the_end(
+    planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, run_ids = planned
+    now = time.time()
+    for death in range(MOST_CLAIMS):
+        monkeypatch.setattr(store_module.time, "time", lambda death=death: now + death * (LEASE + 1))
+        assert store.claim(run_ids[:1]) is not None
+    monkeypatch.setattr(store_module.time, "time", lambda: now + MOST_CLAIMS * (LEASE + 1))
+    assert store.claim(run_ids[:1]) is None
+    (outcome,) = store.outcomes(run_ids[:1])
+    assert (outcome.state, outcome.error) == (FAILED, f"the worker that ran it died {MOST_CLAIMS} times")
+
+
+def test_what_is_done_stays_done_and_what_failed_gets_another_chance(
+    planned: tuple[ResultStore, list[str]], tmp_path: Path
+) -> None:
+    store, run_ids = planned
+    done, failed = store.claim(run_ids), store.claim(run_ids)
+    assert done is not None
+    assert failed is not None
+    store.record(done, {"psnr": 1.0})
+    store.fail(failed, "why")
+    assert [outcome.state for outcome in store.outcomes(run_ids[:2])] == [DONE, FAILED]
+    store.plan(copying_jobs(tmp_path, 8))
+    assert [outcome.state for outcome in store.outcomes(run_ids[:2])] == [DONE, PENDING]
+    released = store.claim(run_ids)
+    assert released is not None
+    assert (released.job.run_id, released.number) == (run_ids[1], 1)
+    store.release(released)
+    assert store.outcomes([run_ids[1]])[0].state == PENDING
+
+
+def test_a_command_that_fails_is_reported_with_the_end_of_its_log(tmp_path: Path) -> None:
+    lines = "".join(f"print('line {i}'); " for i in range(30)) + "sys.exit(3)"
+    jobs = [*copying_jobs(tmp_path, 1, code=START + lines), *copying_jobs(tmp_path, 2)[1:]]
+    path, run_ids = tmp_path / "results.sqlite", [job.run_id for job in jobs]
+    store = ResultStore.create(path)
+    store.plan(jobs)
+    assert work(path, run_ids) == 2
+    failed, done = store.outcomes(run_ids)
+    assert (failed.state, done.state) == (FAILED, DONE), "the rest goes on"
+    assert "exit code 3" in failed.error
+    assert failed.error.splitlines()[-1] == "line 29"
+    assert "line 17" not in failed.error
+
+
+def test_a_command_that_writes_no_run_is_a_failure(tmp_path: Path) -> None:
+    jobs = copying_jobs(tmp_path, 1, code=START)
+    store = ResultStore.create(tmp_path / "results.sqlite")
+    store.plan(jobs)
+    work(tmp_path / "results.sqlite", [jobs[0].run_id])
+    (outcome,) = store.outcomes()
+    assert outcome.state == FAILED
+    assert "is not a run" in outcome.error
+
+
+def test_stopping_kills_the_run_and_gives_it_back(tmp_path: Path) -> None:
+    jobs = copying_jobs(tmp_path, 1, seconds=60.0)
+    path, run_ids = tmp_path / "results.sqlite", [jobs[0].run_id]
+    store = ResultStore.create(path)
+    store.plan(jobs)
+    stop = threading.Event()
+    thread = threading.Thread(target=work, args=(path, run_ids, None, stop))
+    thread.start()
+    wait_until(lambda: bool(starts(tmp_path)))
+    stop.set()
+    thread.join(timeout=10)
+    assert not thread.is_alive()
+    assert store.outcomes(run_ids)[0].state == PENDING
+
+
+def test_a_store_of_another_version(tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    ResultStore.create(path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE about SET value = '7' WHERE key = 'format'")
+        connection.execute("UPDATE about SET value = 'lapgs_plugin 9.0' WHERE key = 'created_by'")
+    connection.close()
+    with pytest.raises(RunFolderError, match=r"written by lapgs_plugin 9\.0 in format 7, expected 1"):
+        ResultStore(path)
+    path.write_bytes(b"not a database at all" * 100)
+    with pytest.raises(RunFolderError, match="is no store of results"):
+        ResultStore(path)
+    with pytest.raises(RunFolderError, match="does not exist"):
+        ResultStore(tmp_path / "none.sqlite")
+
+
+def test_many_processes_make_one_store(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "results.sqlite"
+    code = "import sys; from pathlib import Path; from lapgs_plugin.experiments.store import ResultStore; "
+    code += "ResultStore.create(Path(sys.argv[1]))"
+    makers = [subprocess.Popen([sys.executable, "-c", code, str(path)]) for _ in range(4)]
+    assert [maker.wait(timeout=60) for maker in makers] == [0] * 4
+    assert sorted(each.name for each in path.parent.iterdir()) == ["results.sqlite"]
+
+
+def test_a_transaction_that_is_killed_leaves_the_store_as_it_was(
+    planned: tuple[ResultStore, list[str]], tmp_path: Path
+) -> None:
+    store, run_ids = planned
+    path = tmp_path / "results.sqlite"
+    code = (
+        "import os, sqlite3, sys; c = sqlite3.connect(sys.argv[1], isolation_level=None); "
+        "c.execute('BEGIN IMMEDIATE'); c.execute(\"UPDATE runs SET state = 'done'\"); os.kill(os.getpid(), 9)"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, str(path)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert {outcome.state for outcome in store.outcomes(run_ids)} == {PENDING}
+    assert store.claim(run_ids) is not None
+    assert Counter(outcome.state for outcome in store.outcomes(run_ids)) == {PENDING: 7, RUNNING: 1}

@@ -1,0 +1,202 @@
+"""From rows to tables: means and spreads against arithmetic done by hand, and pages against what they should say."""
+
+from __future__ import annotations
+
+import csv
+import json
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.experiments import exports
+from lapgs_plugin.experiments.aggregate import Cell, ResultTable, make_table
+from lapgs_plugin.experiments.expansion import PlannedRun, Selection, plan_runs
+from lapgs_plugin.experiments.rows import result_row
+from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.experiments.tables import latex, markdown
+from tests.experiments.examples import copying_jobs, tiny_run
+
+SCENES = ("bonsai", "counter")
+
+
+def paper_experiment(**changes: Any) -> Experiment:
+    values = {
+        "name": "main",
+        "title": "Main_comparison",
+        "seeds": [0, 1],
+        "scenes": [{"dataset": "mipnerf360", "only": list(SCENES)}],
+        "backbones": {"fastgs": {"checkout": "fastgs"}},
+        "variants": [
+            {"name": "bare", "method": "bare", "baseline": True, "paper": "FastGS"},
+            {"name": "two", "options": {"levels": 2}, "paper": "Ours(FastGS)"},
+        ],
+        "table": {"paper": "main_1k", "columns": ["minutes", "psnr", "gaussians_millions"]},
+    }
+    return Experiment.model_validate({**values, **changes})
+
+
+def record(run: PlannedRun) -> dict[str, Any]:
+    """Figures that differ for every run, and are easy to add up."""
+    spec = run.spec
+    scene = SCENES.index(spec.scene) if spec.scene in SCENES else 0
+    seconds = (300.0 if spec.method == "bare" else 240.0) + 60.0 * scene + 6.0 * spec.seed
+    row = {"train_seconds": seconds, "psnr": 30.0 - scene - 0.5 * (spec.method != "bare") + 0.1 * spec.seed}
+    if spec.method == "bare":
+        return {**row, "gaussians": 800_000, "gaussians_level_0": 800_000}
+    return {**row, "gaussians": 900_000, "gaussians_level_0": 500_000, "gaussians_level_1": 400_000}
+
+
+def table_of(experiment: Experiment, missing: int | None = None) -> ResultTable:
+    planned = plan_runs(experiment, Selection())
+    records = {run.spec.run_id: record(run) for i, run in enumerate(planned) if i != missing}
+    return make_table(experiment, planned, records)
+
+
+def cell(table: ResultTable, row: int, column: str) -> Cell:
+    return table.groups[0].rows[row].cells[column]
+
+
+def test_means_over_scenes_and_deviations_over_seeds() -> None:
+    table = table_of(paper_experiment())
+    minutes = cell(table, 0, "minutes")
+    # Scenes take 5 and 6 minutes with seed 0, a tenth more with seed 1.
+    assert minutes.values == (pytest.approx(5.55),)
+    assert minutes.deviation == pytest.approx(statistics.stdev([5.5, 5.6]))
+    assert minutes.seeds == 2
+    assert cell(table, 1, "gaussians_millions").values == (pytest.approx(0.4), pytest.approx(0.5)), "coarsest first"
+    two = table.groups[0].rows[1]
+    assert two.speedup.measured == pytest.approx(5.55 / 4.55)
+    assert two.psnr_gain.measured == pytest.approx(-0.5)
+    assert table.groups[0].rows[0].is_baseline
+
+
+def test_the_papers_figures_are_of_the_same_scenes() -> None:
+    two = table_of(paper_experiment()).groups[0].rows[1]
+    assert two.cells["minutes"].paper is not None
+    assert two.cells["minutes"].paper.value == pytest.approx((3.58 + 3.23) / 2)
+    assert two.speedup.paper == pytest.approx((4.19 + 3.56) / (3.58 + 3.23))
+    assert two.psnr_gain.paper == pytest.approx((32.43 + 29.43 - 33.08 - 29.60) / 2)
+
+
+def test_a_missing_run_leaves_no_unfair_mean() -> None:
+    experiment = paper_experiment()
+    planned = plan_runs(experiment, Selection())
+    lost = next(
+        i for i, run in enumerate(planned) if (run.spec.scene, run.spec.seed, run.variant) == ("counter", 1, "two")
+    )
+    table = table_of(experiment, lost)
+    (group,) = table.groups
+    assert cell(table, 1, "minutes").values == (pytest.approx(4.5),), "seed 0 alone has both scenes"
+    assert cell(table, 1, "minutes").deviation is None
+    assert group.notes == ("1 of 8 runs are missing.",)
+
+    both = [i for i, run in enumerate(planned) if (run.spec.scene, run.variant) == ("counter", "two")]
+    records = {run.spec.run_id: record(run) for i, run in enumerate(planned) if i not in both}
+    (group,) = make_table(experiment, planned, records).groups
+    assert group.rows[0].cells["minutes"].values == (pytest.approx(5.05),), "bonsai alone, in every row"
+    assert "Means over bonsai, the scenes that every row has." in group.notes
+
+
+def test_figures_of_a_whole_data_set_are_said_to_be_such() -> None:
+    experiment = paper_experiment(
+        variants=[{"name": "1/3", "options": {"split": "1/3,2/3"}, "paper": "(10000, 20000)"}],
+        table={"paper": "split", "columns": ["minutes"]},
+    )
+    (group,) = table_of(experiment).groups
+    assert group.notes == ("The paper's figures are means over all 9 scenes of Mip-NeRF 360.",)
+    assert "[3.96]" in markdown(table_of(experiment))
+
+
+def test_markdown() -> None:
+    lines = markdown(table_of(paper_experiment())).splitlines()
+    assert lines[0] == "# Main_comparison"
+    assert "## Mip-NeRF 360 (bonsai, counter)" in lines
+    assert "| bare | 5.55 ±0.07 [3.88] | 29.55 ±0.07 [31.34] | 0.80 ±0.00 [0.66] |  |  |" in lines
+    two = "| two | 4.55 ±0.07 [3.41] | 29.05 ±0.07 [30.93] | 0.40/0.50 ±0.00 [0.56/0.41] "
+    assert two + "| 1.22x [1.14x] | -0.50 [-0.41] |" in lines
+    assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
+
+
+def test_latex() -> None:
+    text = latex(
+        table_of(paper_experiment(table={"paper": "main_1k", "columns": ["minutes", "psnr"], "by_scene": True}))
+    )
+    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 2, "the data set, and its scenes"
+    assert r"\caption{Main\_comparison.}" in text
+    assert r"bare & 5.55 $\pm$0.07\paper{3.88} & 29.55 $\pm$0.07\paper{31.34} &  &  \\" in text
+    assert r"\multicolumn{4}{c}{\textbf{bonsai}} & \multicolumn{4}{c}{\textbf{counter}} \\" in text
+    for table in text.split(r"\begin{tabular}{l")[1:]:
+        columns = len(table.partition("}")[0]) + 1
+        rows = [line for line in table.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+        assert {line.count(" & ") + 1 for line in rows} == {columns}
+
+
+def test_transposed_tables_have_a_column_for_each_variant() -> None:
+    table = table_of(paper_experiment(table={"columns": ["psnr", "minutes"], "transposed": True}))
+    assert "|  | bare | two |" in markdown(table)
+    assert "| PSNR | 29.55 ±0.07 | 29.05 ±0.07 |" in markdown(table)
+    assert r"PSNR & 29.55 $\pm$0.07 & 29.05 $\pm$0.07 \\" in latex(table)
+
+
+def test_the_row_of_a_run(tmp_path: Path) -> None:
+    (job,) = copying_jobs(tmp_path, 1)
+    tiny_run(Path(job.folder), psnr=21.5)
+    row = result_row(job)
+    assert (row["psnr"], row["ssim"], row["measured_by"]) == (21.5, 0.5, "lapgs eval")
+    assert (row["gaussians"], row["gaussians_level_1"], row["peak_gaussians"]) == (8, 3, 6)
+    assert row["mean_gaussians"] == pytest.approx((3 * 10 + 5 * 20) / 30), "by iterations"
+    assert (row["train_seconds"], row["overhead_pyramid_seconds"]) == (12.0, 1.0)
+    assert (row["peak_memory_bytes"], row["peak_memory_without_images_bytes"]) == (500, 450)
+    assert row["forward_ms"] == pytest.approx(1000 * 2.0 / 30)
+    assert row["iteration_ms"] == pytest.approx(1000 * 6.0 / 30)
+    assert not any(isinstance(value, (dict, list)) for value in row.values()), "flat"
+    assert json.loads(row["options"]) == {"levels": 2}
+
+
+def test_csv_is_tidy(tmp_path: Path) -> None:
+    rows = [{"run": "a", "psnr": 30.25, "note": 'x,"y'}, {"run": "b", "ssim": 0.5}]
+    exports.write_csv(tmp_path / "r.csv", rows)
+    with (tmp_path / "r.csv").open(newline="") as stream:
+        found = list(csv.DictReader(stream))
+    assert found == [
+        {"run": "a", "psnr": "30.25", "note": 'x,"y', "ssim": ""},
+        {"run": "b", "psnr": "", "note": "", "ssim": "0.5"},
+    ]
+
+
+def test_parquet_has_types_and_nulls(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    exports.write_parquet(tmp_path / "r.parquet", [{"run": "a", "psnr": 30.25}, {"run": "b", "gaussians": 7}])
+    found = parquet.read_table(tmp_path / "r.parquet")
+    assert found.to_pylist() == [
+        {"run": "a", "psnr": 30.25, "gaussians": None},
+        {"run": "b", "psnr": None, "gaussians": 7},
+    ]
+    assert str(found.schema.field("gaussians").type) == "int64"
+
+
+def test_without_pyarrow_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[parquet\]"):
+        exports.write_parquet(tmp_path / "r.parquet", [{"run": "a"}])
+    assert not list(tmp_path.iterdir())
+
+
+def test_ten_thousand_rows_in_two_seconds() -> None:
+    experiment = paper_experiment(
+        seeds=list(range(500)),
+        variants=[{"name": f"v{i}", "options": {"levels": 2, "seed": i}} for i in range(10)],
+        table={"columns": ["minutes", "psnr", "gaussians_millions"], "by_scene": True},
+    )
+    planned = plan_runs(experiment, Selection())
+    assert len(planned) == 10_000
+    records = {run.spec.run_id: record(run) for run in planned}
+    start = time.perf_counter()
+    text = markdown(make_table(experiment, planned, records))
+    assert time.perf_counter() - start < 2.0  # worst seen: 0.6 s beside four other jobs on two cores
+    assert "500 seeds" in text
