@@ -112,9 +112,9 @@ def render(
 
     _require_one_of("--views", views, (None, *SPLITS))
     _require_one_of("--format", image_format, FORMATS)
-    archive = RunArchive.open(run)
-    show_log()
     # A damaged field is no obstacle to rendering coarser levels.
+    archive = RunArchive.open(run, check=False)
+    show_log()
     wanted = level if level in archive.available_levels else None
     renderer = run_renderer(archive, device, rasterizer, finest=wanted or 0)
     level = renderer.finest if level is None else level

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lapgs_plugin.archive import Manifest, RunArchive
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
@@ -226,6 +226,7 @@ class HierarchyRenderer:
 
         Raises:
             UserInputError: that level is not there, or a gain is out of range or for a level that is not there.
+            DeviceMemoryError: the GPU is full.
         """
         return self.render_batch([camera], level, gains).view(0)
 
@@ -341,8 +342,15 @@ class HierarchyRenderer:
         """A field's own renders times its gain, (b, 3, h, w) at the size of `at_level`."""
         if gain == 0.0:
             return self._black.new_zeros(len(at_level), 3, at_level[0].height, at_level[0].width)
-        field = self.field(level)
-        images = render_images(self.rasterizer, field, at_level, self.behind(level))
+        try:
+            field = self.field(level)
+            images = render_images(self.rasterizer, field, at_level, self.behind(level))
+        except torch.cuda.OutOfMemoryError as error:
+            size = f"{at_level[0].width}x{at_level[0].height}"
+            raise DeviceMemoryError(
+                f"the GPU has no memory left to render level {level}, {len(self.fields[level]):,} Gaussians at {size}; "
+                "render a coarser --level, a smaller size, or with --device cpu"
+            ) from error
         if self.clamped:
             images = images.clamp(-1.0 if field.signed else 0.0, 1.0)
         return images if gain == 1.0 else gain * images

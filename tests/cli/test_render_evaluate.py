@@ -252,6 +252,24 @@ def test_an_interruption_leaves_only_whole_images(run: Path, monkeypatch: pytest
         assert cv2.imread(str(run / "renders" / name)) is not None
 
 
+@pytest.mark.parametrize("damage", ["cut short", "missing"])
+def test_what_is_left_of_a_damaged_run_can_be_rendered(run: Path, damage: str) -> None:
+    finest = run / "level_0" / "point_cloud.ply"
+    contents = finest.read_bytes()
+    finest.unlink()
+    if damage == "cut short":
+        finest.write_bytes(contents[:-5])
+    with pytest.raises(RunFolderError, match=rf"level 0 of .*{damage}.*before it is whole: `lapgs render --level 1`"):
+        lapgs("render", run)
+    assert not (run / "renders").exists()
+    lapgs("render", run, "--level", "1")
+    assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
+    (run / "level_1" / "point_cloud.ply").unlink()
+    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing") as caught:
+        lapgs("render", run, "--level", "1")
+    assert "whole" not in str(caught.value)
+
+
 def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:
     before = files_in(run)
     printed = lapgs("render", run, "--fps")

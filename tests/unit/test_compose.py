@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import RenderResult
@@ -220,6 +220,16 @@ def test_fields_come_to_the_device_when_they_are_rendered(monkeypatch: pytest.Mo
         bases = {id(field) for field in asked if not field.signed}
         assert len(bases) == (1 if keep else 3)
     assert Residence(torch.device("cpu")).bring(0, fields[0]) is fields[0]
+
+
+def test_a_full_gpu_is_one_line() -> None:
+    class Full(Constant):
+        def __call__(self, *args: Any, **options: Any) -> RenderResult:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+    renderer = HierarchyRenderer({0: blobs(0, False)}, 1, Pyramid(), Full())
+    with pytest.raises(DeviceMemoryError, match="left to render level 0, 40 Gaussians at 45x30; render a coarser"):
+        renderer.render(CAMERA)
 
 
 def test_a_gain_of_a_level_that_is_not_there_is_refused() -> None:
