@@ -1,0 +1,116 @@
+"""Launchers: workers that are really started, by the engines behind them, and die now and then."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments import launchers
+from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
+from lapgs_plugin.experiments.runner import execute
+from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
+from tests.experiments.examples import COPY, START, copying_jobs
+
+NOTE_ENVIRONMENT = START + (
+    "import os; stream = open(started + '-gpus', 'a'); "
+    "stream.write(os.environ.get('CUDA_VISIBLE_DEVICES', 'none') + '\\n'); stream.close(); "
+)
+
+
+def order(
+    tmp_path: Path, count: int, workers: int, code: str = COPY, seconds: float = 0.0, **changes: object
+) -> WorkOrder:
+    jobs = copying_jobs(tmp_path, count, seconds, code)
+    store = ResultStore.create(tmp_path / "results.sqlite")
+    store.plan(jobs)
+    values = {"gpus": None, "options": {}, **changes}
+    return WorkOrder(
+        tmp_path / "results.sqlite", [job.run_id for job in jobs], workers, logs=tmp_path / "logs" / "workers", **values
+    )
+
+
+def run_all(order: WorkOrder, start: Callable[[], Launcher]) -> list[Outcome]:
+    said: list[Outcome] = []
+    outcomes = execute(ResultStore(order.store), order.run_ids, start, said.append)
+    assert sorted(each.run_id for each in said) == sorted(order.run_ids), "each is told of once"
+    return outcomes
+
+
+def starts(tmp_path: Path) -> Counter[str]:
+    return Counter((tmp_path / "started").read_text().split())
+
+
+def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
+    code = COPY.replace(START, NOTE_ENVIRONMENT)
+    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus=["3", "5"])
+    outcomes = run_all(work_order, lambda: launch("local", work_order))
+    assert [outcome.state for outcome in outcomes] == [DONE] * 6
+    assert set((tmp_path / "started-gpus").read_text().split()) == {"3", "5"}
+    assert starts(tmp_path) == dict.fromkeys(work_order.run_ids, 1)
+
+
+def test_visible_gpus_are_those_that_are_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,7")
+    assert launchers.visible_gpus() == ["2", "7"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert launchers.visible_gpus() == []
+
+
+def test_workers_that_do_nothing_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> int:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(launchers, "work", broken)
+    work_order = order(tmp_path, 1, 1)
+    with pytest.raises(UserInputError, match=r"workers end without finishing a run: .*no space left"):
+        run_all(work_order, lambda: launch("local", work_order))
+
+
+def test_jobs_through_submitit(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    work_order = order(tmp_path, 3, 2, options={"cluster": "local"})
+    outcomes = run_all(work_order, lambda: launch("slurm", work_order))
+    assert [outcome.state for outcome in outcomes] == [DONE] * 3
+    assert starts(tmp_path) == dict.fromkeys(work_order.run_ids, 1)
+    assert list((tmp_path / "logs" / "workers").glob("*_log.out")), "what the workers said"
+
+
+def test_an_option_that_submitit_does_not_know(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    with pytest.raises(UserInputError, match=r"--launcher-option: .*slurm_partiton"):
+        launch("slurm", order(tmp_path, 1, 1, options={"cluster": "local", "slurm_partiton": "gpu"}))
+
+
+@pytest.mark.slow
+def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -> None:
+    """Needs Ray: pip install 'lapgs_plugin[ray]'."""
+    ray = pytest.importorskip("ray")
+    killing = "import os; open(started + '-worker', 'w').write(str(os.getppid())); "
+    work_order = order(tmp_path, 6, 2, COPY.replace(START, START + killing), seconds=1.0, options={"num_cpus": 1})
+    killed = []
+
+    def say(outcome: Outcome) -> None:
+        if not killed:
+            # The parent of the command is its leash, whose parent is the worker: a process of Ray's.
+            leash = int((tmp_path / "started-worker").read_text())
+            status = Path(f"/proc/{leash}/status").read_text()
+            worker = int(next(line for line in status.splitlines() if line.startswith("PPid:")).split()[1])
+            os.kill(worker, signal.SIGKILL)
+            killed.append(worker)
+
+    try:
+        ray.init(num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False)
+        outcomes = execute(ResultStore(work_order.store), work_order.run_ids, lambda: launch("ray", work_order), say)
+    finally:
+        ray.shutdown()
+    assert killed
+    assert [outcome.state for outcome in outcomes] == [DONE] * 6
+    found = starts(tmp_path)
+    assert set(found) == set(work_order.run_ids)
+    assert sum(found.values()) == 7, "the killed one's run was started twice, no other"
