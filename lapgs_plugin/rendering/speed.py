@@ -15,8 +15,10 @@ from lapgs_plugin.raster import render_images
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
 
 ROUNDS = 5
+BATCH = 8
+"""Views that are rendered at once, on a GPU, where there are as many of one size."""
 
-Frame = Callable[[Camera], object]
+Frame = Callable[[Sequence[Camera]], object]
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Speed:
         what: the kind.
         size: (width, height) of a frame of the first camera.
         gaussians: of all fields that are rendered for it.
-        milliseconds: median, over cameras and rounds, from the end of one frame to the end of the next.
+        milliseconds: median, over cameras and rounds, from the end of one frame to the end of the next; of a batch its
+            share.
     """
 
     what: str
@@ -53,7 +56,9 @@ def measure_speed(
         level: the finest to add.
         rounds: over all cameras.
     """
-    return [_measured(renderer, kind, cameras, rounds) for kind in _kinds(renderer, level)]
+    one_size = len({(camera.width, camera.height) for camera in cameras}) == 1
+    batches = renderer.device.type == "cuda" and one_size and len(cameras) >= BATCH
+    return [_measured(renderer, kind, cameras, rounds) for kind in _kinds(renderer, level, batches)]
 
 
 def composed_speed(renderer: HierarchyRenderer, cameras: Sequence[Camera], rounds: int = ROUNDS) -> Speed:
@@ -64,22 +69,31 @@ def composed_speed(renderer: HierarchyRenderer, cameras: Sequence[Camera], round
 
 @dataclass(frozen=True)
 class _Kind:
-    """What is measured: its name, what makes a frame, the levels whose fields are rendered, and that of the size."""
+    """What is measured.
+
+    Attributes:
+        what: its name.
+        frame: renders `views` cameras.
+        fields: levels whose fields are rendered.
+        size_level: level whose size a frame has.
+    """
 
     what: str
     frame: Frame
     fields: Sequence[int]
     size_level: int
+    views: int = 1
 
 
 def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera], rounds: int) -> Speed:
     shown = level_camera(cameras[0], kind.size_level)
-    milliseconds = _median_milliseconds(kind.frame, [*cameras] * (rounds + 1), len(cameras), renderer.device)
+    frames = [cameras[i : i + kind.views] for i in range(0, len(cameras) - kind.views + 1, kind.views)]
+    milliseconds = _median_milliseconds(kind.frame, frames * (rounds + 1), len(frames), renderer.device) / kind.views
     gaussians = sum(len(renderer.fields[each]) for each in kind.fields)
     return Speed(kind.what, (shown.width, shown.height), gaussians, milliseconds)
 
 
-def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[_Kind]:
+def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> Iterator[_Kind]:
     in_turn = replace(renderer, concurrent=False)
     coarsest = renderer.levels - 1
     for finest in range(level, coarsest):
@@ -88,6 +102,9 @@ def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[_Kind]:
         if renderer.device.type == "cuda":
             together = replace(renderer, concurrent=True)
             yield _Kind(f"{what}, beside each other", _composing(together, finest), fields, finest)
+    if batches:
+        fields, what = range(level, renderer.levels), "all" if coarsest > level else "field"
+        yield _Kind(f"{what}, {BATCH} views at once", _composing(renderer, level), fields, level, views=BATCH)
     yield _Kind("base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest)
     if coarsest > level:
         # What it would cost to render it as large as it is shown, instead of bringing it up.
@@ -97,29 +114,31 @@ def _kinds(renderer: HierarchyRenderer, level: int) -> Iterator[_Kind]:
 
 
 def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
-    return lambda camera: renderer.render(camera, level).composed[level].clamp(0.0, 1.0)
+    return lambda cameras: renderer.render_batch(cameras, level).composed[level].clamp(0.0, 1.0)
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
     field, behind = renderer.field(level), renderer.behind(level)
-    return lambda camera: render_images(renderer.rasterizer, field, [level_camera(camera, size_level)], behind)
+    return lambda cameras: render_images(
+        renderer.rasterizer, field, [level_camera(camera, size_level) for camera in cameras], behind
+    )
 
 
 @torch.no_grad()
-def _median_milliseconds(frame: Frame, cameras: Sequence[Camera], warm: int, device: torch.device) -> float:
+def _median_milliseconds(frame: Frame, frames: Sequence[Sequence[Camera]], warm: int, device: torch.device) -> float:
     """Median time of a frame; the first `warm` ones only compile kernels and fill PyTorch's caches."""
-    for camera in cameras[:warm]:
-        frame(camera)
+    for cameras in frames[:warm]:
+        frame(cameras)
     if device.type != "cuda":
         ends = [time.perf_counter()]
-        for camera in cameras[warm:]:
-            frame(camera)
+        for cameras in frames[warm:]:
+            frame(cameras)
             ends.append(time.perf_counter())
         return 1000.0 * median(after - before for before, after in pairwise(ends))
     torch.cuda.synchronize(device)
     events = [_recorded(device)]
-    for camera in cameras[warm:]:
-        frame(camera)
+    for cameras in frames[warm:]:
+        frame(cameras)
         events.append(_recorded(device))
     events[-1].synchronize()
     return median(float(before.elapsed_time(after)) for before, after in pairwise(events))
