@@ -5,7 +5,7 @@
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
-    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/report.html   what is made of it later
+    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   what is made of it later
 
 Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
 after its PLY is on the disk: a run killed at any moment is a run that opens, with the levels that were finished.
@@ -41,7 +41,7 @@ from lapgs_plugin.plan import Stage
 FORMAT_VERSION = 1
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
-RENDERS, REPORT, STABILITY, CACHE = "renders", "report.html", "stability.json", "cache"
+RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 
 
@@ -601,8 +601,9 @@ def _remove_results(folder: Path) -> None:
     _remove_scratch(folder)
     for name in (HISTORY, METRICS, STABILITY, REPORT):
         (folder / name).unlink(missing_ok=True)
-    if (folder / RENDERS).is_dir():
-        shutil.rmtree(folder / RENDERS)
+    for name in (RENDERS, EXPORT):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
     for level in folder.glob("level_*/"):
         (level / PLY).unlink(missing_ok=True)
         (level / OPTIMIZER).unlink(missing_ok=True)

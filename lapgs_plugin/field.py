@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -93,10 +93,14 @@ class GaussianField:
                     "expected finite numbers"
                 )
 
-    def save_ply(self, path: Path | str) -> None:
+    def save_ply(self, path: Path | str, comments: Sequence[str] = ()) -> None:
         """Write the field as a standard 3DGS PLY, little endian, float32, that other viewers read.
 
         float32 parameters come back from `load_ply` with the same bits. The file appears whole or not at all.
+
+        Args:
+            path: of the file.
+            comments: for the header, one line each; non-ASCII characters are written as question marks.
 
         Raises:
             OSError: the folder cannot be written, or the disk is full.
@@ -115,8 +119,9 @@ class GaussianField:
             columns = _as_columns(tensor).to("cpu", torch.float32).numpy()
             for column, name in zip(columns.T, names[attribute], strict=True):
                 rows[name] = column
-        comments = [SIGNED_COMMENT] if self.signed else []
-        ply = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
+        lines = [SIGNED_COMMENT] if self.signed else []
+        lines += [comment.encode("ascii", errors="replace").decode() for comment in comments]
+        ply = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=lines)
         with atomic_write(Path(path)) as stream:
             ply.write(stream)
 

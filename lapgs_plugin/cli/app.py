@@ -13,6 +13,7 @@ from lapgs_plugin.cli.bench import bench_app
 from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.export import export
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
@@ -59,6 +60,7 @@ app.command("eval")(evaluate)
 app.command("render")(render)
 app.command("report")(report)
 app.command("view")(view)
+app.command("export")(export)
 app.command("import-run")(import_run)
 app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)
