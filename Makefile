@@ -4,9 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
+SMOKE := runs/smoke
 DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
-.PHONY: demo test check clean
+.PHONY: demo test smoke check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
@@ -19,6 +20,11 @@ demo: $(VENV)/.installed
 
 test: check
 	$(BIN)/pytest
+	$(MAKE) smoke
+
+smoke: $(VENV)/.installed
+	rm -rf $(SMOKE)
+	$(BIN)/lapgs bench benchmarks/smoke.toml --out $(SMOKE)
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -31,4 +37,4 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(DEMO) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(DEMO) $(SMOKE) .mypy_cache .pytest_cache .ruff_cache
