@@ -13,8 +13,6 @@ HEADROOM = 1.04
 INSET_POINTS = 3
 """Points that a line must have at the start for an inset to show more than the chart does."""
 BAR_HEIGHT, BAR_STEP = 20.0, 30.0
-LABEL_FROM = 0.09
-"""Share of a chart's width from which a part of a bar has room for its figure."""
 
 
 @dataclass(frozen=True)
@@ -332,7 +330,7 @@ def draw_bars(title: str, bars: Sequence[Bar], *, format_value: Callable[[float]
         for name, value in bar.parts:
             width = frame.plot_width * value / longest
             text = format_value(value)
-            shown = text if width > LABEL_FROM * frame.width else ""
+            shown = text if width > CHARACTER_WIDTH * len(text) else ""
             segments.append(Segment(name, frame.x(before / longest), round(width, 1), text, shown))
             before += value
         y = step * row + LINE_HEIGHT + 4

@@ -142,13 +142,15 @@ def write_page(path: Path, page: str) -> Path:
 # What was recorded during training.
 
 
-def training_charts(runs: Sequence[MeasuredRun], kinds: Sequence[str], marked: MeasuredRun) -> dict[str, list[Chart]]:
+def training_charts(
+    runs: Sequence[MeasuredRun], kinds: Sequence[str], marked: MeasuredRun | None = None
+) -> dict[str, list[Chart]]:
     """Loss, held-out PSNR and number of Gaussians, over seconds and over iterations; without what was not recorded.
 
     Args:
         runs: whose lines are drawn, the first on top.
         kinds: style of each one's lines.
-        marked: whose stages are marked.
+        marked: whose stages are marked; None marks nothing.
     """
     longest = max(run.metrics["train_seconds"] for run in runs)
     unit, scale = ("minutes", 60.0) if longest >= MINUTES_FROM else ("seconds", 1.0)
@@ -182,12 +184,12 @@ Position = Callable[[MeasuredRun, dict[str, Any]], float]
 def _chart_row(
     runs: Sequence[MeasuredRun],
     kinds: Sequence[str],
-    marked: MeasuredRun,
+    marked: MeasuredRun | None,
     x_label: str,
     x_of: Position,
     start: float | None,
 ) -> list[Chart]:
-    marks = _stage_marks(marked, x_of)
+    marks = [] if marked is None else _stage_marks(marked, x_of)
     charts = []
     for key, title, from_zero, by_stage, format_y in (
         ("loss", "Loss", True, True, "{:g}".format),
@@ -284,18 +286,21 @@ def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
 # Views.
 
 
-def view_strips(run: MeasuredRun, renderers: Sequence[HierarchyRenderer], moved_to: Path | None) -> list[Strip]:
+def view_strips(
+    run: MeasuredRun, renderers: Sequence[HierarchyRenderer], moved_to: Path | None, most: int = 3
+) -> list[Strip]:
     """The worst, the median and the best view of the run, in pictures of it and of its baseline.
 
     Args:
         run: by whose metrics views are chosen.
         renderers: of the run, and of its baseline.
         moved_to: where the scene is now; None when it did not move.
+        most: of these views, from the worst on.
 
     Raises:
         RunFolderError: the scene is not where it was.
     """
-    shown = _shown_views(run.metrics)
+    shown = dict(list(_shown_views(run.metrics).items())[:most])
     figures = {view["name"]: f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}" for view in run.metrics["views"]}
     with one_pool():
         scene = run_scene(run.archive, moved_to)

@@ -178,7 +178,7 @@ def test_bars_show_what_training_took(run: Path, baseline: Path) -> None:
 def test_views_are_listed_worst_first_beside_the_baseline(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
     text = (run / "report.html").read_text()
-    table = text.partition('<table id="views"')[2].partition("</table>")[0]
+    table = text.partition('<table class="numbers views"')[2].partition("</table>")[0]
     rows = [re.findall(r'<th>(.*?)</th>|data-value="(.*?)"', row) for row in table.split("<tr>")[2:]]
     found = [(row[0][0], *(float(value) for _, value in row[1:])) for row in rows]
     metrics = [json.loads((folder / "metrics.json").read_text())["views"] for folder in (run, baseline)]

@@ -1,0 +1,298 @@
+"""report.html of an experiment: its tables, what training took and how views look, as one page that needs no network.
+
+It is made of the files that `lapgs bench` leaves: results.csv, tables.md and run folders, some of which may be gone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markdown_it import MarkdownIt
+
+from lapgs_plugin.archive import REPORT, RunArchive
+from lapgs_plugin.breakdown import PARTS
+from lapgs_plugin.errors import LapgsError, RunFolderError
+from lapgs_plugin.evaluation.charts import Bar, BarChart, Chart, Move, draw_bars, draw_moves
+from lapgs_plugin.evaluation.pictures import Strip
+from lapgs_plugin.evaluation.report import (
+    MeasuredRun,
+    ViewRow,
+    count_text,
+    render_page,
+    seconds_text,
+    training_charts,
+    view_strips,
+    view_table,
+    write_page,
+)
+from lapgs_plugin.experiments.commands import IMPORTED
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
+from lapgs_plugin.experiments.runner import RUNS
+from lapgs_plugin.rendering.run import run_renderer
+
+TEMPLATE = "experiment.html.jinja"
+COLORS = 8
+"""Styles of lines and arrows; later variants share them."""
+COUNTS = {
+    "weighted_gaussians": "Gaussians, mean of levels by iterations",
+    "mean_gaussians": "Gaussians at once, mean of iterations",
+    "gaussians": "Gaussians, all levels",
+}
+"""Columns that say how many Gaussians there were: the first that all rows have is charted."""
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One scene on one backbone.
+
+    Attributes:
+        title: of both.
+        charts: what training recorded, see `report.training_charts`.
+        names: of variants, by the style of their lines.
+        strips: views of a variant beside the baseline.
+        view_columns, view_rows: see `report.view_table`.
+        compared: whose views these are, in words.
+        notes: what could not be shown, and why.
+    """
+
+    title: str
+    charts: dict[str, list[Chart]]
+    names: dict[str, str]
+    strips: list[Strip]
+    view_columns: list[str]
+    view_rows: list[ViewRow]
+    compared: str
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Results:
+    """What an experiment left.
+
+    Attributes:
+        folder: of the experiment.
+        rows: of results.csv, in its order.
+    """
+
+    folder: Path
+    rows: Sequence[Row]
+
+    @classmethod
+    def read(cls, folder: Path) -> Results:
+        """The results in a folder of `lapgs bench`.
+
+        Raises:
+            RunFolderError: there are none, or they cannot be read.
+        """
+        path = folder / CSV
+        try:
+            rows = read_csv(path)
+            missing = {"variant", "run", "scene", "backbone", "train_seconds", "gaussians"} - set(
+                rows[0] if rows else ()
+            )
+        except (OSError, ValueError) as error:
+            raise RunFolderError(f"{path} cannot be read ({error}); expected what `lapgs bench` writes") from error
+        if missing:
+            raise RunFolderError(
+                f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
+            )
+        return cls(folder, rows)
+
+    @property
+    def variants(self) -> list[str]:
+        """In the experiment's order."""
+        return list(dict.fromkeys(row["variant"] for row in self.rows))
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Scene and backbone of all rows."""
+        return list(dict.fromkeys((row["scene"], row["backbone"]) for row in self.rows))
+
+    def of(self, scene: str, backbone: str, variant: str) -> list[Row]:
+        """All seeds of a variant."""
+        wanted = (scene, backbone, variant)
+        return [row for row in self.rows if (row["scene"], row["backbone"], row["variant"]) == wanted]
+
+    def baseline(self, backbone: str) -> str:
+        """What the others are compared with on a backbone: what is trained bare, or else what comes first."""
+        rows = [row for row in self.rows if row["backbone"] == backbone]
+        return str(next((row for row in rows if row.get("method") == "bare"), rows[0])["variant"])
+
+    def style(self, variant: str) -> str:
+        """Of its lines and arrows."""
+        return f"variant-{self.variants.index(variant) % COLORS}"
+
+    def title(self, scene: str, backbone: str) -> str:
+        several = len({row["backbone"] for row in self.rows}) > 1
+        return f"{scene}, {backbone}" if several else scene
+
+
+def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: str = "auto") -> Path:
+    """Write FOLDER/report.html.
+
+    Args:
+        folder: of an experiment that was run by `lapgs bench`.
+        device, rasterizer: what renders the pictures, see `rendering.run.run_renderer`.
+
+    Returns:
+        The file.
+
+    Raises:
+        RunFolderError: there are no results, or the file cannot be written.
+    """
+    results = Results.read(folder)
+    title, tables = _tables(folder / MARKDOWN)
+    page = render_page(
+        TEMPLATE,
+        title=title or str(results.rows[0].get("experiment", folder.name)),
+        tables=tables,
+        variants={name: results.style(name) for name in results.variants},
+        num_runs=len({row["run"] for row in results.rows}),
+        moves=_moves(results),
+        breakdown=_breakdown(results),
+        overhead=_overhead(results),
+        parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
+        machines=_machines(results),
+    )
+    return write_page(folder / REPORT, page)
+
+
+def _tables(path: Path) -> tuple[str, str]:
+    """The experiment's title, and its tables as HTML."""
+    if not path.is_file():
+        return "", ""
+    first, _, rest = path.read_text(encoding="utf-8").partition("\n")
+    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(rest)
+    return first.removeprefix("# "), html.replace("<table>", '<div class="scroll"><table>').replace(
+        "</table>", "</table></div>"
+    )
+
+
+def _machines(results: Results) -> list[str]:
+    """Where it was measured and with what."""
+    found = {
+        ", ".join(str(row[name]) for name in ("gpu", "processor") if row.get(name))
+        + f": lapgs_plugin {row.get('lapgs_version', '?')}, PyTorch {row.get('torch', '?')}"
+        for row in results.rows
+    }
+    return sorted(found)
+
+
+# All scenes and backbones together.
+
+
+def _moves(results: Results) -> Chart | None:
+    """Time against Gaussians: arrows from every baseline to every other variant, means over the seeds."""
+    column = next(name for name in COUNTS if all(name in row for row in results.rows))
+    moves = []
+    for scene, backbone in results.pairs:
+        base = results.baseline(backbone)
+        start = _point(results.of(scene, backbone, base), column)
+        for variant in results.variants:
+            end = _point(results.of(scene, backbone, variant), column)
+            if variant != base and start is not None and end is not None:
+                label = f"{results.title(scene, backbone)}: {base} to {variant}"
+                moves.append(Move(results.style(variant), label, start, end))
+    if not moves:
+        return None
+    return draw_moves(
+        "Optimization (s) against Gaussians", COUNTS[column], moves, format_x=count_text, format_y=count_text
+    )
+
+
+def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
+    if not rows:
+        return None
+    return _mean(row[column] for row in rows), _mean(row["train_seconds"] for row in rows)
+
+
+def _breakdown(results: Results) -> BarChart | None:
+    """Milliseconds an iteration by part, means over scenes and seeds."""
+    names = {f"{part}_ms": part for part in PARTS}
+    return _bars(results, "An iteration", names, lambda value: f"{value:.3g} ms")
+
+
+def _overhead(results: Results) -> BarChart | None:
+    """Seconds beside the optimization, means over scenes and seeds."""
+    columns = dict.fromkeys(name for row in results.rows for name in row)
+    names = {
+        column: column.removeprefix("overhead_").removesuffix("_seconds")
+        for column in columns
+        if column.startswith("overhead_") and column != "overhead_seconds"
+    }
+    return _bars(results, "Beside the optimization", names, seconds_text)
+
+
+def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable[[float], str]) -> BarChart | None:
+    """A bar for each variant on each backbone that has any of these columns."""
+    bars = []
+    for backbone in dict.fromkeys(row["backbone"] for row in results.rows):
+        for variant in results.variants:
+            rows = [row for row in results.rows if (row["backbone"], row["variant"]) == (backbone, variant)]
+            parts = [
+                (name, _mean(row.get(column, 0.0) for row in rows))
+                for column, name in names.items()
+                if any(column in row for row in rows)
+            ]
+            if parts:
+                bars.append(Bar(results.title(variant, backbone), parts))
+    return draw_bars(title, bars, format_value=text) if bars else None
+
+
+def _mean(values: Iterator[float]) -> float:
+    listed = list(values)
+    return math.fsum(listed) / len(listed)
+
+
+# One scene on one backbone.
+
+
+def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> Part:
+    """The first seed of every variant."""
+    runs: dict[str, MeasuredRun] = {}
+    notes = []
+    for variant in results.variants:
+        for row in results.of(scene, backbone, variant)[:1]:
+            try:
+                runs[variant] = _open(results.folder, row)
+            except LapgsError as error:
+                notes.append(f"{variant} is not shown: {error}")
+    base = results.baseline(backbone)
+    charts = {}
+    if runs:
+        kinds = [results.style(variant) for variant in runs]
+        charts = training_charts(list(runs.values()), kinds)
+    names = {results.style(variant): variant for variant in runs}
+    measured = [name for name in runs if "views" in runs[name].metrics]
+    shown = next((name for name in measured if name != base), base)
+    strips: list[Strip] = []
+    columns: list[str] = []
+    rows: list[ViewRow] = []
+    compared = ""
+    if shown in measured:
+        pair = [runs[name] for name in dict.fromkeys((shown, base)) if name in measured]
+        columns, rows = view_table(pair)
+        compared = shown if len(pair) == 1 else f"{shown}, beside {base}"
+        try:
+            renderers = [run_renderer(run.archive, device, rasterizer) for run in pair]
+            strips = view_strips(pair[0], renderers, None, most=1)
+        except LapgsError as error:
+            notes.append(f"no pictures: {error}")
+    return Part(results.title(scene, backbone), charts, names, strips, columns, rows, compared, notes)
+
+
+def _open(folder: Path, row: Row) -> MeasuredRun:
+    """A run's folder, inside that of the experiment wherever that is now.
+
+    Raises:
+        RunFolderError: it is gone or damaged.
+    """
+    path = folder / RUNS / str(row["run"])
+    archive = RunArchive.open(path / IMPORTED if (path / IMPORTED).is_dir() else path)
+    return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})
