@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,18 +43,27 @@ def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
 def _on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     from lapgs_plugin.reference_raster.raising import add_raised_cpu
 
-    height, width = fine.shape[-2:]
-    first_row, row_weights = _numpy_taps(pyramid.grid, height, fine.dtype)
-    first_column, column_weights = _numpy_taps(pyramid.grid, width, fine.dtype)
+    rows, columns = (_numpy_taps(pyramid.grid, size, fine.dtype) for size in fine.shape[-2:])
     below, above = (image.reshape(-1, *image.shape[-2:]).contiguous().numpy() for image in (coarse, fine))
-    result = add_raised_cpu(below, above, first_row, row_weights, first_column, column_weights)
+    result = add_raised_cpu(below, above, rows.first, rows.weights, columns.across)
     return torch.from_numpy(result).view(fine.shape)
 
 
+class _NumpyTaps(NamedTuple):
+    """`Pyramid.up_taps` of a side, and as the CPU's kernel wants them across."""
+
+    first: NDArray[np.int64]
+    weights: NDArray[np.floating[Any]]
+    across: NDArray[np.floating[Any]]
+
+
 @lru_cache(maxsize=64)
-def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
+def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> _NumpyTaps:
+    from lapgs_plugin.reference_raster.raising import across_weights
+
     first, weights = Pyramid(grid).up_taps(size)
-    return first.numpy(), weights.to(dtype).numpy()
+    values = weights.to(dtype).numpy()
+    return _NumpyTaps(first.numpy(), values, across_weights(first.numpy(), values))
 
 
 @lru_cache(maxsize=1)
