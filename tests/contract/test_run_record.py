@@ -1,0 +1,78 @@
+"""`lapgs run --off --record` changes nothing in a script's own run, and says what it took."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lapgs_plugin.adapters.imported import import_run, read_foreign_run
+from lapgs_plugin.adapters.witness import Witness
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.evaluation.figures import evaluate_run
+from lapgs_plugin.field import count_gaussians
+from lapgs_plugin.files import BARE_RECORD
+from tests.contract.stub_runs import ITERATIONS, NAMES, STUBS, Result, arguments, captured, loaded, run_bare
+
+SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
+
+
+def record(name: str, scene: Path, folder: Path) -> Result:
+    results: list[Result] = []
+    with captured(folder, results), loaded(STUBS[name], scene, folder, *SAVING) as adapter:
+        Witness(adapter, "cpu").run()
+    return results[0]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    found = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != BARE_RECORD)
+    name = str(folder).encode()
+    return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recorded_run_is_the_bare_run_to_the_bit(name: str, scene: Path, tmp_path: Path) -> None:
+    bare = run_bare(STUBS[name], scene, tmp_path / "bare", *SAVING)
+    start = time.perf_counter()
+    recorded = record(name, scene, tmp_path / "recorded")
+    wall = time.perf_counter() - start
+    assert recorded.losses == bare.losses
+    assert files(recorded.folder) == files(bare.folder)
+
+    values = json.loads((recorded.folder / BARE_RECORD).read_text())
+    last = recorded.folder / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
+    assert values["num_gaussians"] == count_gaussians(last)
+    assert values["iterations"] == ITERATIONS
+    assert [entry["iteration"] for entry in values["timeline"]] == list(range(1, ITERATIONS + 1))
+    counts = [entry["num_gaussians"] for entry in values["timeline"]]
+    assert values["mean_gaussians"] == pytest.approx(sum(counts) / ITERATIONS)
+    assert values["peak_gaussians"] >= max(*counts, values["num_gaussians"])
+    assert values["saving_seconds"] > 0
+    assert values["train_seconds"] + values["saving_seconds"] < wall
+    assert values["timeline"][-1]["elapsed"] <= values["train_seconds"]
+
+
+def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) -> None:
+    recorded = record("graphdeco", scene, tmp_path / "recorded")
+    values = json.loads((recorded.folder / BARE_RECORD).read_text())
+    foreign = read_foreign_run(recorded.folder)
+    assert foreign.times_are_known
+    archive = import_run(foreign, tmp_path / "imported", codebase="graphdeco")
+    (level,) = archive.manifest.records
+    assert (level.train_seconds, level.mean_gaussians) == (values["train_seconds"], values["mean_gaussians"])
+    assert level.overhead_seconds["saving"] == values["saving_seconds"]
+    assert len(archive.history()) == ITERATIONS
+    # The script's own render against our rasterizer over the saved field: rounding alone, worst seen 7e-8 dB.
+    assert evaluate_run(archive)["psnr"] == pytest.approx(values["psnr"], abs=1e-4)
+
+
+def test_record_without_off(scene: Path, tmp_path: Path) -> None:
+    stub = STUBS["fastgs"]
+    words = ["run", "--record", "--device", "cpu", str(stub.script), *arguments(stub, scene, tmp_path / "out")]
+    error = CliRunner().invoke(app, words).exception
+    assert isinstance(error, UserInputError)
+    assert "--record is for --off" in str(error)
