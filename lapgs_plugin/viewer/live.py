@@ -26,7 +26,7 @@ from lapgs_plugin.viewer.navigation import start_at, start_outside
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import ShownRun
 from lapgs_plugin.viewer.server import Viewer
-from lapgs_plugin.viewer.session import Exhibit, PictureSeconds
+from lapgs_plugin.viewer.session import Exhibit, Pace
 from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_PERCENT, MOST_PERCENT = 1.5, 50.0
 """Of the time of training that pictures may take."""
 
-LIVE_SECONDS = PictureSeconds(moving=0.02, still=0.06)
+LIVE_PACE = Pace(moving=0.02, still=0.06, ahead=False)
 """What a picture takes: at 1.5 % that is one every 1.3 s while somebody moves, and every 4 s otherwise."""
 
 PAUSE_PATIENCE = 0.1
@@ -50,7 +50,7 @@ class LiveView(Watcher):
 
     def __init__(self, page: Page, device: str = "auto") -> None:
         self._page, self._device = page, device
-        self._viewer = Viewer(page, LIVE_SECONDS)
+        self._viewer = Viewer(page, LIVE_PACE)
         self._failed = False
         self._archive: RunArchive | None = None
         self._placed: PlacedRasterizer | None = None

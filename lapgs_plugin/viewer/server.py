@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import viser
 
 from lapgs_plugin.rendering.rig import Vector
 from lapgs_plugin.viewer.navigation import Start
-from lapgs_plugin.viewer.pacing import TARGET_SECONDS
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.session import Exhibit, PictureSeconds, Session
+from lapgs_plugin.viewer.session import Exhibit, Pace, Session
 
 logger = logging.getLogger(__name__)
 
@@ -22,11 +22,12 @@ class Viewer:
 
     Args:
         page: that they load; clients may have loaded it already.
-        seconds: what a picture may take.
+        pace: of their pictures.
     """
 
-    def __init__(self, page: Page, seconds: PictureSeconds | None = None) -> None:
-        self._page, self._seconds = page, seconds or PictureSeconds(TARGET_SECONDS)
+    def __init__(self, page: Page, pace: Pace | None = None) -> None:
+        self._page, self._pace = page, pace or Pace()
+        self._sender = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lapgs-jpeg")
         self._exhibit: Exhibit | None = None
         self._start: Start | None = None
         self._sessions: dict[int, Session] = {}
@@ -103,7 +104,7 @@ class Viewer:
                 self._awake.wait(min(due, deadline) - now)
 
     def _connect(self, client: viser.ClientHandle) -> None:
-        session = Session(client, self._seconds, self._wake)
+        session = Session(client, self._pace, self._sender, self._wake)
         with self._awake:
             self._sessions[client.client_id] = session
             if self._exhibit is not None:
