@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
@@ -61,7 +62,7 @@ class RunSpec:
     options: Mapping[str, Any]
     arguments: Sequence[str]
 
-    @property
+    @cached_property
     def run_id(self) -> str:
         """Readable, and another one for every difference. Variants that are trained alike share their runs."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]

@@ -196,7 +196,7 @@ def test_ten_thousand_rows_in_two_seconds() -> None:
     planned = plan_runs(experiment, Selection())
     assert len(planned) == 10_000
     records = {run.spec.run_id: record(run) for run in planned}
-    start = time.perf_counter()
+    start = time.process_time()  # other work on the machine does not count
     text = markdown(make_table(experiment, planned, records))
-    assert time.perf_counter() - start < 2.0  # worst seen: 0.6 s beside four other jobs on two cores
+    assert time.process_time() - start < 2.0  # worst seen: 0.9 s beside four other jobs on two cores
     assert "500 seeds" in text
