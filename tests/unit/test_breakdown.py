@@ -152,3 +152,35 @@ def test_measuring_nothing() -> None:
 def test_an_unknown_part_is_our_own_mistake() -> None:
     with pytest.raises(AssertionError, match="rendering"):
         breakdown_on(torch.device("cpu")).mark("rendering")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_is_timed_without_waiting_for_it() -> None:
+    def spin(milliseconds: float) -> None:
+        torch.cuda._sleep(round(milliseconds * cycles))
+
+    def seconds(milliseconds: float) -> float:
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        spin(milliseconds)
+        torch.cuda.synchronize()
+        return time.perf_counter() - start
+
+    cycles = 1e6
+    seconds(10.0)
+    cycles *= 0.1 / seconds(100.0)  # of the GPU's clock in a millisecond
+    breakdown = breakdown_on(torch.device("cuda"))
+    start = time.perf_counter()
+    for _ in range(10 * UNREAD_EVENTS // 3):
+        for part, length in (("forward", 0.2), ("backward", 0.4), ("optimizer", 0.1)):
+            breakdown.mark(part)
+            spin(length)
+    breakdown.pause()
+    told = time.perf_counter() - start
+    found = breakdown.seconds()
+    rounds = 10 * UNREAD_EVENTS // 3
+    assert told < 0.5 * sum(found.values())  # the processor was through long before the GPU
+    for part, length in (("forward", 0.2), ("backward", 0.4), ("optimizer", 0.1)):
+        assert found[part] == pytest.approx(1e-3 * length * rounds, rel=0.1), part
+    assert found["loss"] == found["densification"] == found["other"] == 0.0
