@@ -71,6 +71,7 @@ def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, dev
     viewer, stop = Viewer(page), threading.Event()
     following = Following(viewer, page, shown, other, scene, say=lambda line: print(line, flush=True))
     following.begin()
+    following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)
     watching.start()
     try:

@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
@@ -15,9 +17,9 @@ from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
-from lapgs_plugin.viewer.navigation import Start, start_at, start_outside
+from lapgs_plugin.viewer.navigation import Pose, Start, start_at, start_outside
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.pictures import ShownRun
+from lapgs_plugin.viewer.pictures import PictureSettings, ShownRun, draw
 from lapgs_plugin.viewer.server import Viewer
 from lapgs_plugin.viewer.session import Exhibit
 
@@ -160,6 +162,15 @@ class Following:
             for run in self._runs:
                 run.place(self._rig)
         self._show()
+
+    def warm_up(self) -> None:
+        """Unless somebody waits for a picture: draw a small one that nobody sees, which loads what pictures need."""
+        shown = self._runs[0].shown
+        if shown is None or self._viewer.watched:
+            return
+        start = self._start(shown)
+        pose = Pose(np.array([1.0, 0.0, 0.0, 0.0]), start.position, start.fov)
+        draw(shown, None, pose.camera(32, 32), PictureSettings(), distance=1.0, zoom=1.0)
 
     def watch(self, stop: threading.Event) -> None:
         """Show what is new whenever there is something, until `stop` is set."""
