@@ -187,22 +187,26 @@ class GsplatRasterizer:
 
 def _on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU."""
-    kind = like.dtype
-    intrinsics = torch.tensor(
-        [[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0] for c in cameras], dtype=kind
-    )  # (b, 9)
-    poses = torch.stack([camera.world_to_camera for camera in cameras])  # (b, 4, 4)
-    positions = torch.stack([camera.position for camera in cameras])  # (b, 3)
-    if poses.device.type != "cpu":
-        return poses.to(like), _sent(intrinsics, like.device).view(-1, 3, 3), positions.to(like)
-    numbers = torch.cat([intrinsics, poses.to(kind).flatten(1), positions.to(kind)], dim=1)  # (b, 28)
-    numbers = _sent(numbers, like.device)
-    return numbers[:, 9:25].reshape(-1, 4, 4), numbers[:, :9].reshape(-1, 3, 3), numbers[:, 25:]
+    poses = [camera.world_to_camera for camera in cameras]
+    elsewhere = any(pose.device.type != "cpu" for pose in poses)
+    # Python's numbers in one tensor: each small tensor costs some microseconds of every frame.
+    rows = [[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0] for c in cameras]
+    if not elsewhere:
+        rows = [[*row, *_pose_numbers(pose)] for row, pose in zip(rows, poses, strict=True)]
+    # From page-locked memory, since a copy from any other is waited for.
+    numbers = torch.tensor(rows, dtype=like.dtype, pin_memory=like.device.type == "cuda")
+    numbers = numbers.to(like.device, non_blocking=True)  # (b, 28) or (b, 9)
+    intrinsics = numbers[:, :9].reshape(-1, 3, 3)
+    if elsewhere:
+        return torch.stack(poses).to(like), intrinsics, torch.stack([camera.position for camera in cameras]).to(like)
+    return numbers[:, 9:25].reshape(-1, 4, 4), intrinsics, numbers[:, 25:]
 
 
-def _sent(numbers: Tensor, device: torch.device) -> Tensor:
-    """Numbers on their way to a GPU: from page-locked memory, since a copy from any other is waited for."""
-    return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers
+def _pose_numbers(pose: Tensor) -> list[float]:
+    """The 16 numbers of a pose on the CPU, row by row, and the 3 of the camera's centre, -R^T t."""
+    rows: list[list[float]] = pose.tolist()
+    centre = [-sum(rows[j][i] * rows[j][3] for j in range(3)) for i in range(3)]
+    return [*rows[0], *rows[1], *rows[2], *rows[3], *centre]
 
 
 def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tensor | None) -> None:
