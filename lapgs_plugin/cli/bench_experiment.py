@@ -246,9 +246,10 @@ def _follow(
         def say(outcome: Outcome) -> None:
             progress.advance(task)
             if outcome.state == FAILED:
-                progress.console.print(f"[red]failed[/red] {outcome.run_id}", escape(outcome.error), sep="\n")
+                text = f"[red]failed[/red] {outcome.run_id}\n{escape(outcome.error)}"
             else:
-                progress.console.print(f"[green]done[/green]   {outcome.run_id}: {_summary(outcome.record or {})}")
+                text = f"[green]done[/green]   {outcome.run_id}: {_summary(outcome.record or {})}"
+            progress.console.print(text, soft_wrap=True, highlight=False)
 
         try:
             execute(store, run_ids, start, say)
@@ -265,19 +266,27 @@ def _write(
     experiment: Experiment, planned: Sequence[PlannedRun], store: ResultStore, folder: Folder, messages: Console
 ) -> None:
     """Files of everything that is done, the table on the terminal, and what failed."""
-    from rich.console import Console
-    from rich.markdown import Markdown
+    from rich.markup import escape
 
     from lapgs_plugin import __version__
     from lapgs_plugin.experiments import exports
-    from lapgs_plugin.experiments.aggregate import make_table
+    from lapgs_plugin.experiments.aggregate import baseline_of, make_table
     from lapgs_plugin.experiments.store import FAILED
     from lapgs_plugin.experiments.tables import latex, markdown
 
     outcomes = {o.run_id: o for o in store.outcomes({run.spec.run_id for run in planned})}
     records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}
+    names: dict[str, list[str]] = {}
+    for run in planned:
+        names.setdefault(run.spec.backbone, []).append(run.variant)
+    baselines = {backbone: baseline_of(experiment, own) for backbone, own in names.items()}
     rows = [
-        {"experiment": experiment.name, "variant": run.variant, **records[run.spec.run_id]}
+        {
+            "experiment": experiment.name,
+            "variant": run.variant,
+            "baseline": baselines[run.spec.backbone],
+            **records[run.spec.run_id],
+        }
         for run in planned
         if run.spec.run_id in records
     ]
@@ -289,8 +298,8 @@ def _write(
     try:
         exports.write_parquet(folder.path / exports.PARQUET, rows)
     except MissingExtraError as error:
-        messages.print(f"[yellow]{error}[/yellow]", highlight=False)
-    Console().print(Markdown(text))
+        messages.print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
+    print(text)
     others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
     if others:
         messages.print(

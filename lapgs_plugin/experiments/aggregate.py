@@ -150,6 +150,7 @@ class ResultTable:
     Attributes:
         title: of the experiment.
         label: its name.
+        measured: on what, with which versions and for how many iterations.
         columns: names of `COLUMNS`.
         transposed: columns are shown as rows.
         groups: data sets, in the experiment's order.
@@ -158,6 +159,7 @@ class ResultTable:
 
     title: str
     label: str
+    measured: str
     columns: tuple[str, ...]
     transposed: bool
     groups: tuple[Group, ...]
@@ -191,6 +193,13 @@ def check_table(experiment: Experiment) -> PaperTable | None:
     return paper
 
 
+def baseline_of(experiment: Experiment, names: Sequence[str]) -> str:
+    """Of variants on one backbone, in the experiment's order, the one that the others are compared with: the one marked
+    so, or the first."""
+    marked = {variant.name for variant in experiment.variants if variant.baseline}
+    return next((name for name in names if name in marked), names[0])
+
+
 def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> ResultTable:
     """The table of an experiment.
 
@@ -212,11 +221,30 @@ def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: M
     return ResultTable(
         title=experiment.title,
         label=experiment.name,
+        measured=_measured(planned, records),
         columns=tuple(experiment.table.columns),
         transposed=experiment.table.transposed,
         groups=tuple(groups),
         scenes=tuple(single) if experiment.table.by_scene and len(single) > len(groups) else (),
     )
+
+
+def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
+    """Where the runs' figures come from, in words."""
+    found = [(run.spec, records[run.spec.run_id]) for run in planned if run.spec.run_id in records]
+    if not found:
+        return "nothing yet"
+    iterations = sorted({spec.iterations for spec, _ in found})
+    parts = [f"{' and '.join(f'{count:,}' for count in iterations)} iterations"]
+    for words, name in (
+        ("", "gpu"),
+        ("torch ", "torch"),
+        ("lapgs_plugin ", "lapgs_version"),
+        ("images by ", "measured_by"),
+    ):
+        values = sorted({str(row[name]) for _, row in found if row.get(name)})
+        parts += [words + " and ".join(values)] if values else []
+    return ", ".join(parts)
 
 
 class _Part:
@@ -303,9 +331,8 @@ class _Part:
         return self._experiment.backbones[backbone].title or backbone
 
     def _baseline(self, backbone: str) -> RowKey:
-        """The row that rows of a backbone are compared with: the one marked so, or the first."""
-        own = [key for key in self._keys if key[0] == backbone]
-        return next((key for key in own if self._variants[key[1]].baseline), own[0])
+        """The row that rows of a backbone are compared with."""
+        return backbone, baseline_of(self._experiment, [name for own, name in self._keys if own == backbone])
 
     def _notes(self, cells: Mapping[RowKey, Mapping[str, Cell]]) -> list[str]:
         notes = []

@@ -66,7 +66,8 @@ class RunSpec:
     def run_id(self) -> str:
         """Readable, and another one for every difference. Variants that are trained alike share their runs."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
-        setting = "".join(f"-{name}{value}" for name, value in self.options.items())[:40]
+        last_first = list(self.options.items())[::-1]  # the variant's own stand last, and say most
+        setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
         words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
         return re.sub(r"[^A-Za-z0-9.-]+", "_", words) + f"-{digest}"
 

@@ -93,7 +93,7 @@ class Results:
         path = folder / CSV
         try:
             rows = read_csv(path)
-            missing = {"variant", "run", "scene", "backbone", "train_seconds", "gaussians"} - set(
+            missing = {"variant", "baseline", "run", "scene", "backbone", "train_seconds", "gaussians"} - set(
                 rows[0] if rows else ()
             )
         except (OSError, ValueError) as error:
@@ -120,9 +120,8 @@ class Results:
         return [row for row in self.rows if (row["scene"], row["backbone"], row["variant"]) == wanted]
 
     def baseline(self, backbone: str) -> str:
-        """What the others are compared with on a backbone: what is trained bare, or else what comes first."""
-        rows = [row for row in self.rows if row["backbone"] == backbone]
-        return str(next((row for row in rows if row.get("method") == "bare"), rows[0])["variant"])
+        """What the others are compared with on a backbone."""
+        return str(next(row["baseline"] for row in self.rows if row["backbone"] == backbone))
 
     def style(self, variant: str) -> str:
         """Of its lines and arrows."""

@@ -66,12 +66,12 @@ def prepare(
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
     """Make the sample scenes that are not there yet."""
-    from lapgs_plugin.scenes.sample import make_sample_scene
-
     for scene in scenes:
         path = _sample(scene, folder)
         if scene.sample is None or path.is_dir():
             continue
+        from lapgs_plugin.scenes.sample import make_sample_scene  # needs what reads scenes
+
         width, _, height = scene.sample.size.partition("x")
         if not (width.isdecimal() and height.isdecimal()):
             raise UserInputError(f"scene {scene.name}: size {scene.sample.size!r}, expected WIDTHxHEIGHT")

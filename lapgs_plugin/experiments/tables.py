@@ -12,6 +12,7 @@ ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
 SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
 NOTHING = "-"
+PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 2K and 4K"
 
 
 def markdown(table: ResultTable) -> str:
@@ -42,9 +43,10 @@ def _legend(table: ResultTable) -> str:
     seeds = max((cell.seeds for group in table.groups for row in group.rows for cell in row.cells.values()), default=0)
     spread = f"Means ± sample deviation over {seeds} seeds" if seeds > 1 else "One seed"
     has_paper = any(c.paper for group in table.groups for row in group.rows for c in row.cells.values())
-    paper = "; the paper's figures in brackets" if has_paper else ""
+    paper = f"; the paper's figures in brackets ({PAPER_CONDITIONS})" if has_paper else ""
     bases = {row.label for group in table.groups for row in group.rows if row.is_baseline}
-    return f"{spread}{paper}. Speed-up and change of PSNR are against {', '.join(sorted(bases))}."
+    against = f"Speed-up and change of PSNR are against {', '.join(sorted(bases))}."
+    return f"Measured: {table.measured}. {spread}{paper}. {against}"
 
 
 def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
@@ -106,7 +108,7 @@ def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label:
             lines += _latex_transposed(group, table.columns)
     else:
         lines += _latex_blocks(groups, table.columns)
-    notes = dict.fromkeys(note for group in groups for note in group.notes)
+    notes = dict.fromkeys([_legend(table), *(note for group in groups for note in group.notes)])
     return [*lines, *(rf"\par\footnotesize {_escaped(note)}" for note in notes), r"\end{table*}"]
 
 
