@@ -29,6 +29,7 @@ def row(scene: str, backbone: str, variant: str, seed: int) -> dict[str, Any]:
     return {
         "experiment": "trial",
         "variant": variant,
+        "baseline": "bare",
         "run": f"{SCENES.index(scene)}-{backbone}-{levels}-{seed}",
         "scene": scene,
         "backbone": backbone,
@@ -167,7 +168,7 @@ def test_mistakes(experiment: Path) -> None:
         lapgs_report(experiment, "--baseline", experiment / "runs" / "0-cpu-1-0")
     (experiment / "results.csv").write_text("name,value\na,1\n")
     with pytest.raises(
-        RunFolderError, match=r"results.csv lacks backbone, gaussians, run, .*expected what `lapgs bench`"
+        RunFolderError, match=r"results.csv lacks backbone, baseline, gaussians, run, .*expected what `lapgs bench`"
     ):
         lapgs_report(experiment)
     (experiment / "results.csv").write_bytes(b"\xff\xfe\x00")
