@@ -12,7 +12,9 @@ TICKS, INSET_TICKS = 5, 3
 HEADROOM = 1.04
 INSET_POINTS = 3
 """Points that a line must have at the start for an inset to show more than the chart does."""
-BAR_HEIGHT, BAR_STEP = 20.0, 30.0
+LEAST_SPAN = 0.02
+"""Of an axis, as a share of its largest value: a line that is all but flat needs no labels of six digits."""
+BAR_STEP = 30.0
 
 
 @dataclass(frozen=True)
@@ -358,7 +360,7 @@ def _x_ticks(right: float, count: int, text: Callable[[float], str], frame: Fram
 def _ticks(low: float, high: float, count: int) -> list[float]:
     """About `count` round numbers, steps of 1, 2 or 5 times a power of ten, the first at or below `low`, the last at
     or above `high`."""
-    span = max(high - low, 1e-9 * max(abs(high), 1.0))
+    span = max(high - low, LEAST_SPAN * max(abs(high), 1e-6))
     power = 10.0 ** math.floor(math.log10(span / count))
     step = next(factor * power for factor in (1, 2, 5, 10) if span / (factor * power) <= count)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
