@@ -7,7 +7,7 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.adapters.joint import FinishedStage, JointLevels
 from lapgs_plugin.adapters.level_views import AnnouncingViews, make_level_view
 from lapgs_plugin.adapters.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import StageRendering
@@ -46,7 +47,8 @@ class ActiveStage:
         scene: loaded once for all stages.
         archive: open for writing.
         window: which stage, and when.
-        before: what the stage before left; None for the base.
+        finished: the stages before, coarsest first.
+        before: what the last of them left; None for the base.
         path: how signed colour is evaluated.
     """
 
@@ -57,11 +59,12 @@ class ActiveStage:
         scene: LoadedScene,
         archive: RunArchive,
         window: StageWindow,
+        finished: Sequence[FinishedStage],
         before: Finished | None,
         path: ColorPath,
     ) -> None:
         self._context, self._whole_call, self._loaded = context, call, scene
-        self._archive, self.window, self._before = archive, window, before
+        self._archive, self.window, self._finished, self._before = archive, window, finished, before
         self._options, self._adapter, self._device = context.options, context.adapter, context.device
         self._hooks, self._pyramid = context.hooks, Pyramid(context.options.grid)
         self.stage = window.stage
@@ -73,6 +76,9 @@ class ActiveStage:
         self._gaussians: Any = None
         self._kept: Tensor | None = None  # which Gaussians of the level before are inherited
         self._views: dict[str, Any] = {}
+        self._path = path
+        self._joint: JointLevels | None = None
+        self._joint_from = self._options.joint_from(window.stage)
         self._call = self._adapter.stage_call(call, window, str(archive.path(f"level_{self.stage.level}")))
         predictions = None if before is None else before.predictions
         self._images = StageImages(
@@ -94,6 +100,11 @@ class ActiveStage:
         with self.overhead.timed("pyramid"):
             self._images.load()
         self._context.shim.stage = self._rendering
+
+    @property
+    def as_finished(self) -> FinishedStage:
+        """What the stages after this one have to know of it, once its field is in the archive."""
+        return FinishedStage(self.stage, self._call)
 
     # What the replaced symbols ask for.
 
@@ -125,7 +136,12 @@ class ActiveStage:
         if self._began is None:
             self._synchronize()
             self._began = time.perf_counter()
+        if self._context.watcher.wants_look():
+            with self.outside("view"):
+                self._context.watcher.look(self.stage, iteration - 1, lambda: self._fields(gaussians), lambda: False)
         self._context.parts.breakdown.mark("other")
+        if iteration == self._joint_from:
+            self._train_jointly(gaussians)
         self._iteration = iteration
         count = len(gaussians._xyz)
         self._peak = max(self._peak, count)
@@ -138,6 +154,17 @@ class ActiveStage:
             self._archive.append_history(
                 {"level": self.stage.level, "iteration": iteration, "elapsed": elapsed, "num_gaussians": count}
             )
+
+    def _train_jointly(self, gaussians: Any) -> None:
+        """From now on the finished fields learn as well."""
+        self._joint = JointLevels(self._context, self._finished, self._archive, self._images, self._path)
+        self._joint.follow(gaussians, self._options.residual_color_rate)
+        self._rendering.accumulated = self._joint
+
+    def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
+        """What is under training, by level."""
+        joint = {} if self._joint is None else self._joint.fields
+        return {**joint, self.stage.level: self._adapter.snapshot(gaussians, signed=self.stage.signed)}
 
     def densified(self, gaussians: Any) -> None:
         """Density control has run.
@@ -183,6 +210,7 @@ class ActiveStage:
         if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()
         self._context.parts.stage_begins()
+        self._context.watcher.stage_started(stage)
         self._call.run()
         self._context.parts.breakdown.pause()
         self._synchronize()
@@ -191,7 +219,10 @@ class ActiveStage:
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
         finished = self._finish(gaussians, field, self._adapter.carried_over(gaussians), self._moments(gaussians))
+        if self._joint is not None:
+            self._joint.archive_fields()  # before their residual: that one builds on what they are now
         self._archive_level(finished, seconds, memory)
+        self._context.watcher.stage_finished(stage, lambda: self._fields(gaussians))
         return finished
 
     def restore(self) -> Finished:
@@ -209,6 +240,7 @@ class ActiveStage:
     def close(self) -> None:
         """Let go of the stage's images, those that the next stage needs excepted."""
         self._context.shim.stage = None
+        self._joint, self._rendering.accumulated = None, None
         self._images.close()
         self._views.clear()
         self._gaussians = None

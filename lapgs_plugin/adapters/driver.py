@@ -31,6 +31,7 @@ from lapgs_plugin.adapters.extensions import CudaExtension
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.installed_rasterizer import require_matching_rasterizer
 from lapgs_plugin.adapters.iteration_parts import IterationParts
+from lapgs_plugin.adapters.joint import FinishedStage
 from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.run_state import Finished, HierarchyOptions, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import RasterizerShim
@@ -40,6 +41,7 @@ from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import StagePlan
 from lapgs_plugin.rendering.rasterizers import RASTER_SETTINGS
 from lapgs_plugin.signed_color import ColorPath, SignedColorRasterizer
+from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +56,7 @@ class HierarchyDriver:
         resume, overwrite: what to do with a run that is in the output folder already.
         hooks: run after those registered by entry point.
         breakdown: measure the parts of iterations.
+        watcher: may look at the fields between iterations; None for nobody.
     """
 
     def __init__(
@@ -66,13 +69,16 @@ class HierarchyDriver:
         overwrite: bool = False,
         hooks: Sequence[StageHook] = (),
         breakdown: bool = False,
+        watcher: Watcher | None = None,
     ) -> None:
         self._adapter, self._options = adapter, options
         self._resume, self._overwrite = resume, overwrite
         self._shim, self._album = RasterizerShim(), PhotoAlbum()
         place = torch.device(device)
         self._parts = IterationParts(place, breakdown)
-        self._context = RunContext(adapter, options, place, self._album, self._shim, HookCaller(hooks), self._parts)
+        self._context = RunContext(
+            *(adapter, options, place, self._album, self._shim, HookCaller(hooks), self._parts, watcher or Watcher())
+        )
         self._active: ActiveStage | None = None
 
     def run(self) -> None:
@@ -203,6 +209,7 @@ class HierarchyDriver:
                 self._album.smallest_size(), call.opt.iterations, self._options.levels, self._options.shares()
             )
             with self._open_archive(folder, self._manifest(call, plan)) as archive:
+                self._context.watcher.run_started(archive)
                 try:
                     self._run_stages(call, scene, plan, archive, path, Path(scratch))
                 finally:
@@ -220,10 +227,11 @@ class HierarchyDriver:
         files: Path,
     ) -> None:
         start = 0
+        finished: list[FinishedStage] = []
         before: Finished | None = None
         for stage in plan:
             window = StageWindow(stage, start, plan.iterations, plan.levels, self._options.residual_color_rate)
-            active = ActiveStage(self._context, call, scene, archive, window, before, path)
+            active = ActiveStage(self._context, call, scene, archive, window, tuple(finished), before, path)
             self._active = active
             try:
                 active.load_images()
@@ -237,6 +245,7 @@ class HierarchyDriver:
             finally:
                 self._active = None
                 active.close()
+            finished.append(active.as_finished)
             start += stage.iterations
 
     def _color_path(self) -> ColorPath:

@@ -59,31 +59,39 @@ class HookCaller:
     def iteration_begins(self, iteration: int) -> None:
         self._iteration = iteration
 
-    def on_image(self, key: str, image: Tensor) -> Tensor:
-        """(3, h, w) what a training view's render gives the loop, as hooks and their terms make it."""
+    def on_image(self, key: str, image: Tensor, below: Tensor | None) -> Tensor:
+        """(3, h, w) what a training view's render gives the loop, as hooks and their terms make it.
+
+        Args:
+            key: of the view.
+            image: (3, h, w) as it would be without hooks.
+            below: (3, h, w) what the finished levels gave to it; None where the image is a field's alone.
+        """
         assert self._hooks is not None
-        context = self._context = self._make_context(key)
-        assert self._rendering is not None
+        context = self._context = self._make_context(key, below)
         # Hooks see composed images; where the loop is to see the residual alone, it is taken apart again behind them.
-        below = None if key in self._rendering.composed else context.accumulated
-        if below is not None:
-            image = image + below
+        apart = context.accumulated if below is None else None
+        if apart is not None:
+            image = image + apart
         self._hooks.before_render(context)
         image = self._hooks.compose(context, image)
         term = self._hooks.extra_loss(context, image)
         result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
-        return result if below is None else result - below
+        return result if apart is None else result - apart
 
-    def _make_context(self, key: str) -> StageContext:
+    def _make_context(self, key: str, below: Tensor | None) -> StageContext:
         assert self._stage is not None
         assert self._rendering is not None
-        accumulated, coarse = self._rendering.accumulated, self._rendering.coarse
+        targets, accumulated, coarse = self._rendering.targets, self._rendering.accumulated, self._rendering.coarse
+        assert targets is not None, "a stage that is trained has something to be compared with"
+        if below is None and accumulated is not None:
+            below = accumulated.get(key)
         return StageContext(
             stage=self._stage,
             iteration=self._iteration,
             view=view_name(key),
-            target=self._rendering.targets.get(key),
-            accumulated=None if accumulated is None else accumulated.get(key),
+            target=targets.get(key),
+            accumulated=None if below is None else below.float(),
             coarse_target=None if coarse is None else coarse.get(key),
         )
 

@@ -19,9 +19,10 @@ from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore
-from lapgs_plugin.plan import parse_split
+from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, joint_from, parse_split
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.supervision import parse_supervision
+from lapgs_plugin.supervision import Supervision, parse_supervision
+from lapgs_plugin.watching import Watcher
 
 PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
 """10k and 20k of 30k iterations for two levels, as in the paper's main tables; more levels take `StagePlan`'s."""
@@ -36,6 +37,8 @@ class HierarchyOptions:
         split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
         grid: of the pyramid.
         supervision, inherit, inherit_ratio: see their modules.
+        joint: share of each residual stage, its last, in which the finished fields are trained along, 0 to 1. Ablations
+            that supervise residuals alone have no use for it: nothing is composed there.
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
         prediction_precision: what cached predictions are stored as, a key of `imagestore.PRECISIONS`.
@@ -52,6 +55,7 @@ class HierarchyOptions:
     supervision: str = "reconstructed"
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
+    joint: float = JOINT_SHARE
     residual_color_rate: float = 4.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
@@ -62,6 +66,7 @@ class HierarchyOptions:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         self.shares()
+        check_joint_share(self.joint)
         if self.residual_color_rate <= 0 or not math.isfinite(self.residual_color_rate):
             raise UserInputError(f"--residual-color-rate {self.residual_color_rate}: expected a positive factor")
         if self.images_on not in ("auto", *PLACES):
@@ -70,6 +75,12 @@ class HierarchyOptions:
             raise UserInputError(
                 f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
             )
+
+    def joint_from(self, stage: Stage) -> int | None:
+        """The iteration of a stage from which the finished fields are trained along; None when they never are."""
+        if not stage.signed or parse_supervision(self.supervision) is not Supervision.RECONSTRUCTED:
+            return None
+        return joint_from(stage.iterations, self.joint)
 
     def shares(self) -> tuple[Fraction, ...] | None:
         """Of the iterations for each stage, coarsest first; None leaves them to `StagePlan`."""
@@ -90,6 +101,7 @@ class RunContext:
         shim: between its render and its rasterizer.
         hooks: of the user.
         parts: told which part of an iteration begins.
+        watcher: may look at the fields between iterations.
     """
 
     adapter: BackboneAdapter
@@ -99,6 +111,7 @@ class RunContext:
     shim: RasterizerShim
     hooks: HookCaller
     parts: IterationParts
+    watcher: Watcher
 
 
 @dataclass(frozen=True)

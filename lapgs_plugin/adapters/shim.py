@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -21,6 +21,16 @@ GREY = 0.5
 """Around which a residual is shown to a camera that is no view of the scene, such as a viewer's."""
 
 
+class Predictions(Protocol):
+    """What the finished levels make of every view, by key: an `ImageStore` of it, or they themselves."""
+
+    def announce(self, key: str, /) -> None:
+        """Told of a view that will be asked for soon."""
+
+    def get(self, key: str, /, dtype: torch.dtype | None = ...) -> Tensor:
+        """(3, h, w) on the device; `dtype` None for whatever it is there."""
+
+
 @dataclass
 class StageRendering:
     """What has to be known of the running stage whenever something is rendered.
@@ -30,22 +40,23 @@ class StageRendering:
         path: how signed colour is evaluated.
         views: key of each view by the identity of its world-to-camera matrix, which level views share with the
             checkout's cameras.
-        targets: I^l by key.
+        targets: I^l by key; None where nothing is compared.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
         composed: keys of the views that composition is done for; of the others, a residual is compared with a residual.
-        on_image: called with key and composed image when gradients are recorded; what it returns takes its place.
+        on_image: called with key, composed image and what of it lies below when gradients are recorded; what it returns
+            takes the image's place.
         capture: keep what was composed last, before exposure or clamping, in `captured`.
     """
 
     signed: bool
     path: ColorPath
     views: Mapping[int, str]
-    targets: ImageStore
-    accumulated: ImageStore | None = None
+    targets: ImageStore | None = None
+    accumulated: Predictions | None = None
     coarse: ImageStore | None = None
     composed: frozenset[str] = frozenset()
-    on_image: Callable[[str, Tensor], Tensor] | None = None
+    on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
 
@@ -54,13 +65,15 @@ class StageRendering:
 
     def announce(self, key: str) -> None:
         """Bring a view's images while it is being rendered."""
-        self.targets.announce(key)
+        if self.targets is not None:
+            self.targets.announce(key)
         below = self.accumulated if key in self.composed else self._below_target
         if below is not None:
             below.announce(key)
 
     def target(self, key: str) -> Tensor:
         """(3, h, w) what `compose` is compared with: I^l, or what is missing of it."""
+        assert self.targets is not None, "there is something to compare with"
         target = self.targets.get(key)
         if key in self.composed or self._below_target is None:
             return target
@@ -70,14 +83,16 @@ class StageRendering:
         """(3, h, w) what a rasterizer made of a view -> what `render` returns of it."""
         if key is None:
             return image + GREY if self.signed else image
+        below = None
         if self.accumulated is not None and key in self.composed:
-            image = image + self.accumulated.get(key, dtype=None)
+            below = self.accumulated.get(key, dtype=None)
+            image = image + below
         if self.on_image is not None and torch.is_grad_enabled():
-            image = self.on_image(key, image)
+            image = self.on_image(key, image, below)
         return image
 
     @property
-    def _below_target(self) -> ImageStore | None:
+    def _below_target(self) -> Predictions | None:
         """What is taken from a target where a residual is supervised alone."""
         return self.accumulated if self.coarse is None else self.coarse
 

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import JOINT_SHARE
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
@@ -21,6 +23,7 @@ CONTEXT = {"allow_interspersed_args": False}
 
 
 def run(
+    context: typer.Context,
     script: Annotated[Path, typer.Argument(help="The training script of a checkout: its train.py.", metavar="SCRIPT")],
     arguments: Annotated[
         list[str] | None, typer.Argument(help="The script's own arguments, as without lapgs.", metavar="ARGUMENTS...")
@@ -74,6 +77,14 @@ def run(
             "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
         ),
     ] = "geometry",
+    joint: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Share of each residual stage, its last, in which the finished fields are trained along; 0 leaves "
+            "them as they are, as in the paper.",
+        ),
+    ] = JOINT_SHARE,
     grid: Annotated[
         str,
         typer.Option(
@@ -113,6 +124,8 @@ def run(
             help="Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
         ),
     ] = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = None,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Say which symbols are replaced, and who uses them.")
     ] = False,
@@ -152,6 +165,7 @@ def run(
         supervision=supervision,
         inherit=mode,
         inherit_ratio=ratio,
+        joint=joint,
         residual_color_rate=residual_color_rate,
         images_on=images_on,
         prediction_precision=prediction_precision,
@@ -167,6 +181,9 @@ def run(
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
     checkout, words = require_script(script).parent, arguments or []
+    if off and view:
+        raise UserInputError("--view with --off: nothing is replaced, so nothing can be watched; leave one out")
+    watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
     kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
     on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
     try:
@@ -178,7 +195,13 @@ def run(
                 loaded.run_main()
                 return
             driver = HierarchyDriver(
-                kind(loaded), options, device=chosen, resume=resume, overwrite=overwrite, breakdown=breakdown
+                kind(loaded),
+                options,
+                device=chosen,
+                resume=resume,
+                overwrite=overwrite,
+                breakdown=breakdown,
+                watcher=watcher,
             )
             driver.run()
     except ImportError as error:

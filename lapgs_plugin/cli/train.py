@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import JOINT_SHARE
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.archive import RunArchive, SceneReference
     from lapgs_plugin.scenes import Scene
     from lapgs_plugin.training.settings import TrainSettings
+    from lapgs_plugin.watching import Watcher
 
 HIERARCHY = "Hierarchy"
 SCHEDULE = "Schedule"
@@ -65,6 +68,14 @@ def train(
             "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
         ),
     ] = "geometry",
+    joint: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Share of each residual stage, its last, in which the finished fields are trained along; 0 leaves "
+            "them as they are, as in the paper.",
+        ),
+    ] = JOINT_SHARE,
     grid: Annotated[
         str,
         typer.Option(
@@ -155,6 +166,8 @@ def train(
         bool, typer.Option("--resume", help="Continue the run in --out where it stopped, with its settings.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = None,
 ) -> None:
     """Train SCENE as a Laplacian frequency hierarchy, one small field a stage, into the run folder --out.
 
@@ -176,6 +189,7 @@ def train(
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
     mode, ratio = parse_inheritance(inherit)
+    watcher = context.with_resource(watching(view, view_port, out.absolute().name))
     settings = TrainSettings(
         iterations=iterations,
         levels=levels,
@@ -184,6 +198,7 @@ def train(
         supervision=supervision,
         inherit=mode,
         inherit_ratio=ratio,
+        joint=joint,
         sh_degree=sh_degree,
         seed=seed,
         cache=cache,
@@ -221,6 +236,7 @@ def train(
             breakdown=breakdown,
             checkpoint_every=checkpoint_every,
             resume=resume,
+            watcher=watcher,
         )
     console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
 
@@ -265,7 +281,7 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         **{
             name: getattr(settings, name)
             for name in (
-                *("iterations", "levels", "split", "supervision", "grid", "sh_degree", "seed"),
+                *("iterations", "levels", "split", "supervision", "grid", "joint", "sh_degree", "seed"),
                 *("packed", "sparse_adam"),
             )
         },
@@ -336,6 +352,7 @@ def _run(
     breakdown: bool,
     checkpoint_every: int,
     resume: bool,
+    watcher: Watcher,
 ) -> None:
     """Train with a progress display."""
     import torch
@@ -362,5 +379,6 @@ def _run(
             checkpoint_every=checkpoint_every,
             test_every=test_every,
             breakdown=breakdown,
+            watcher=watcher,
         )
         trainer.run(resume)

@@ -8,9 +8,9 @@ from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, joint_from
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.supervision import parse_supervision
+from lapgs_plugin.supervision import Supervision, parse_supervision
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
@@ -68,6 +68,7 @@ class TrainSettings:
     supervision: str = "reconstructed"
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
+    joint: float = JOINT_SHARE  # share of a residual stage, its last, in which finished fields are trained along
     sh_degree: int = 3
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
@@ -91,8 +92,18 @@ class TrainSettings:
             raise UserInputError(
                 f"--inherit {self.inherit_ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)"
             )
+        check_joint_share(self.joint)
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+
+    def joint_from(self, stage: Stage) -> int | None:
+        """The iteration of a stage from which the finished fields are trained along; None when they never are.
+
+        Ablations that supervise residuals alone have no use for it: nothing is composed there.
+        """
+        if not stage.signed or parse_supervision(self.supervision) is not Supervision.RECONSTRUCTED:
+            return None
+        return joint_from(stage.iterations, self.joint)
 
     def for_manifest(self) -> dict[str, Any]:
         """The settings as keyword arguments of `Manifest`: those it names itself, and the rest under "settings"."""
@@ -106,8 +117,8 @@ class TrainSettings:
         Raises:
             RunFolderError: they hold a key this version does not know or lack one.
         """
-        # Runs of the first weeks do not know what came with gsplat.
-        later = {f.name: f.default for f in fields(cls) if f.name in ("packed", "sparse_adam")}
+        # Runs of the first weeks know neither what came with gsplat nor joint training.
+        later = {"packed": False, "sparse_adam": False, "joint": 0.0}
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(

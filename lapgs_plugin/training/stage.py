@@ -18,6 +18,7 @@ from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.raster import Rasterizer, RenderResult
 from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import StageSchedule, TrainSettings
 from lapgs_plugin.training.views import LevelImages, LevelView, view_index
@@ -62,6 +63,9 @@ class StageRun:
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
+        joint_from: the iteration from which the finished fields are trained along; None when they never are.
+        thaw: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
+        joint: they, once it has come to that.
         breakdown: told which part of an iteration begins.
 
     The field, the images and the background are on one device, where the stage is trained.
@@ -79,6 +83,9 @@ class StageRun:
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
+    joint_from: int | None = None
+    thaw: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
+    joint: JointFields | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     progress: StageProgress = field(default_factory=StageProgress)
     _unread: list[Tensor] = field(default_factory=list)
@@ -129,6 +136,9 @@ class StageRun:
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
     def _iterate(self, iteration: int) -> None:
+        if iteration == self.joint_from:
+            assert self.thaw is not None, "a stage that trains finished fields can have them"
+            self.joint = self.thaw(None)
         view = self._view(iteration)
         target, coarse_target = self.images.get(view.name)
         context = StageContext(
@@ -156,7 +166,10 @@ class StageRun:
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
         visible = result.radii > 0 if self.model.sparse else None
-        self.model.step(self.schedule.means_learning_rate(iteration) * self.extent, (degree + 1) ** 2, visible)
+        means_rate = self.schedule.means_learning_rate(iteration) * self.extent
+        self.model.step(means_rate, (degree + 1) ** 2, visible)
+        if self.joint is not None:
+            self.joint.step(means_rate)
         self.breakdown.mark("densification")
         self._densify(context, result, view)
         self.breakdown.mark("other")
@@ -168,6 +181,9 @@ class StageRun:
 
     def _prediction(self, view: LevelView) -> Tensor | None:
         """What the finished levels predict for a view."""
+        if self.joint is not None:
+            self.breakdown.mark("forward")
+            return self.joint.predict(view.name)
         return None if self.accumulated is None else self.accumulated.get(view.name)
 
     def _announce_next(self, iteration: int) -> None:
@@ -176,7 +192,7 @@ class StageRun:
             return
         name = self._view(iteration + 1).name
         self.images.announce(name)
-        if self.accumulated is not None:
+        if self.accumulated is not None and self.joint is None:
             self.accumulated.announce(name)
 
     def _densify(self, context: StageContext, result: RenderResult, view: LevelView) -> None:
@@ -219,6 +235,7 @@ class StageRun:
             "breakdown": self.breakdown.seconds(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
+            "joint": None if self.joint is None else self.joint.state(),
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -234,6 +251,9 @@ class StageRun:
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()
         }
+        if (joint := state.get("joint")) is not None:
+            assert self.thaw is not None
+            self.joint = self.thaw(joint)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)

@@ -15,6 +15,7 @@ from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
@@ -27,11 +28,13 @@ from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
 from lapgs_plugin.training.densification import density_control, mcmc_start
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
+from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import AUTO, StageSchedule, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
+from lapgs_plugin.watching import Watcher
 
 LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
@@ -85,6 +88,7 @@ class Trainer:
         checkpoint_every: iterations between two checkpoints; one is also written when a run is asked to stop.
         test_every: iterations between two measurements of held-out PSNR; None measures it once at the end of a stage.
         breakdown: measure the parts of iterations.
+        watcher: may look at the fields between iterations.
     """
 
     scene: Scene
@@ -97,6 +101,7 @@ class Trainer:
     checkpoint_every: int = 1000
     test_every: int | None = None
     breakdown: bool = False
+    watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
         self.plan = make_plan(self.scene, self.settings)
@@ -124,6 +129,7 @@ class Trainer:
         with stop_request() as stop:
             try:
                 warm_up(self.rasterizer, self.device, self.settings.sparse_adam)
+                self.watcher.run_started(self.archive)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
                         continue
@@ -150,6 +156,7 @@ class Trainer:
         self.monitor.stage_started(stage, run.progress.iteration + 1)
         self._last_tick = (run.progress.seconds, run.progress.iteration)
         run.hooks.on_stage_start(stage)
+        self.watcher.stage_started(stage)
 
         def after_iteration(run: StageRun) -> None:
             self._after_iteration(run, stop)
@@ -207,7 +214,26 @@ class Trainer:
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
             densifier=density_control(schedule, self.settings.densification, self.scene.extent),
+            joint_from=self.settings.joint_from(stage),
+            thaw=self._thaw,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
+        )
+
+    def _thaw(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
+        """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived."""
+        rates, extent, sparse = self.settings.learning_rates, self.scene.extent, self.settings.sparse_adam
+
+        def model(level: int) -> TrainableField:
+            if states is not None:
+                return TrainableField.from_state(states[level], rates, extent, device=self.device, sparse=sparse)
+            return TrainableField.create(self.archive.field(level).to(self.device), rates, extent, sparse=sparse)
+
+        return JointFields(
+            models={level: model(level) for level in self.archive.available_levels},
+            cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test)},
+            rasterizer=self.rasterizer,
+            background=torch.tensor(self.scene.background).to(self.device),
+            pyramid=self._pyramid,
         )
 
     def _fill_caches(self, stage: Stage) -> None:
@@ -267,6 +293,10 @@ class Trainer:
         psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
         if psnr is not None or due_tick:
             self._tick(run, psnr)
+        if self.watcher.wants_look():
+            run.settle()
+            with self._overhead.timed("view"):
+                self.watcher.look(run.stage, iteration, lambda: _fields(run), lambda: stop.requested)
         if stop.requested or iteration % self.checkpoint_every == 0:
             self._save_checkpoint(run)
         if stop.requested:
@@ -300,7 +330,9 @@ class Trainer:
             for view in self.scene.test:
                 camera = level_camera(view.camera, run.stage.level)
                 image = self.rasterizer(run.model.field, camera, background=run.background).image
-                if self._test_cache is not None:
+                if run.joint is not None:
+                    image = image + run.joint.predict(view.name)
+                elif self._test_cache is not None:
                     image = image + self._test_cache.get(view.name)
                 whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
                 values.append(psnr(whole, view.image.to(self.device)))
@@ -325,8 +357,11 @@ class Trainer:
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
         )
+        for level, thawed in ({} if run.joint is None else run.joint.fields).items():
+            self.archive.replace_field(level, thawed)
         heir_wants_it = self.settings.inherit == "full" and run.stage.level > 0
         self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)
+        self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     def _memory(self, run: StageRun) -> dict[str, int]:
         """What the stage took of a GPU, in bytes."""
@@ -334,3 +369,9 @@ class Trainer:
             return {}
         kept = run.images.bytes_on_device + (0 if run.accumulated is None else run.accumulated.bytes_on_device)
         return {"peak": torch.cuda.max_memory_allocated(self.device), "images": kept}
+
+
+def _fields(run: StageRun) -> dict[int, GaussianField]:
+    """What is under training, by level, without gradients."""
+    joint = {} if run.joint is None else run.joint.fields
+    return {**joint, run.stage.level: run.model.field.detach()}

@@ -37,14 +37,15 @@ Run = tuple[RunArchive, Result]
 
 @pytest.fixture(scope="module")
 def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Run]:
-    """The two-level run of a stub, made once; the checkout saves and reports when a stage ends."""
+    """The two-level run of a stub, made once; the checkout saves and reports when a stage ends, and nothing more is
+    learned by a finished field."""
     made: dict[str, Run] = {}
 
     def run(name: str) -> Run:
         if name not in made:
             folder = tmp_path_factory.mktemp(name) / "run"
             more = ("--test_iterations", ITERATIONS, "--save_iterations", 30)
-            made[name] = run_hierarchy(STUBS[name], scene, folder, *more)
+            made[name] = run_hierarchy(STUBS[name], scene, folder, *more, joint=0.0)
         return made[name]
 
     return run
@@ -110,7 +111,7 @@ def recorded(big: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunAr
     recorder = Recorder()
     folder = tmp_path_factory.mktemp("recorded") / "run"
     more = ("--densify_until_iter", 0, "--iterations", 12)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], big, folder, *more, levels=3, hooks=(recorder,))
+    archive, _ = run_hierarchy(STUBS["graphdeco"], big, folder, *more, levels=3, hooks=(recorder,), joint=0.0)
     return archive, recorder
 
 
@@ -227,7 +228,7 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
             original(self, training_args)
 
         model.training_setup = spy
-        drive(adapter, inherit=inherit)
+        drive(adapter, inherit=inherit, joint=0.0)
     archive = RunArchive.open(tmp_path / "run")
     field = archive.field(1)
     started = at_start[1]
@@ -248,11 +249,11 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
 def test_a_run_stopped_between_stages_goes_on(name: str, scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS[name], scene, folder, hooks=(StopAt(0),))
+        run_hierarchy(STUBS[name], scene, folder, hooks=(StopAt(0),), joint=0.0)
     stopped = RunArchive.open(folder)
     assert stopped.available_levels == (1,)
     base = stopped.field_path(1).read_bytes()
-    archive, result = run_hierarchy(STUBS[name], scene, folder, resume=True)
+    archive, result = run_hierarchy(STUBS[name], scene, folder, resume=True, joint=0.0)
     assert archive.available_levels == (1, 0)
     assert archive.field_path(1).read_bytes() == base
     assert result.output.count("Number of points at initialisation") == 1, "only the second stage was trained"

@@ -86,7 +86,7 @@ def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any
 def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, tmp_path: Path) -> None:
     by_size: dict[int, set[tuple[float, ...]]] = {}
     degrees: dict[int, set[int]] = {}
-    for settings in rasterized(STUBS[name], scene, tmp_path / "run", *WHITE):
+    for settings in rasterized(STUBS[name], scene, tmp_path / "run", *WHITE, joint=0.0):
         by_size.setdefault(settings.image_width, set()).add(tuple(settings.bg.tolist()))
         degrees.setdefault(settings.image_width, set()).add(settings.sh_degree)
     assert by_size == {32: {(1.0, 1.0, 1.0)}, 64: {(0.0, 0.0, 0.0)}}

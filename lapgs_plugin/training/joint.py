@@ -1,0 +1,73 @@
+"""The finished fields, trained along in the last part of a residual stage.
+
+What `adapters.joint` does in a checkout's loop, in ours: predictions are rendered anew instead of being read from a
+cache, and the fields that they are made of step with the residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.rendering.compose import level_camera
+from lapgs_plugin.training.model import TrainableField
+
+
+@dataclass
+class JointFields:
+    """Finished fields under training.
+
+    Attributes:
+        models: by level, coarsest first.
+        cameras: of every view at full size, by name.
+        rasterizer: renders them.
+        background: (3,) behind the base; residuals are rendered over zero.
+        pyramid: Up between two levels.
+    """
+
+    models: Mapping[int, TrainableField]
+    cameras: Mapping[str, Camera]
+    rasterizer: Rasterizer
+    background: Tensor
+    pyramid: Pyramid
+    _visible: dict[int, Tensor] = field(default_factory=dict)
+
+    def predict(self, name: str) -> Tensor:
+        """(3, h, w) Up of what the fields make of a view, at the size of the level below them, with gradients."""
+        composed: Tensor | None = None
+        for level, model in self.models.items():
+            camera = level_camera(self.cameras[name], level)
+            background = self.background.new_zeros(3) if model.signed else self.background
+            result = self.rasterizer(model.field, camera, background=background)
+            if model.sparse:
+                self._visible[level] = result.radii > 0
+            below = None if composed is None else self.pyramid.up(composed, (camera.height, camera.width))
+            composed = result.image if below is None else result.image + below
+        assert composed is not None
+        camera = level_camera(self.cameras[name], min(self.models) - 1)
+        return self.pyramid.up(composed, (camera.height, camera.width))
+
+    def step(self, means_rate: float) -> None:
+        """One Adam step on every field, after a backward pass through what `predict` gave.
+
+        Args:
+            means_rate: step size of the positions, in world units.
+        """
+        for level, model in self.models.items():
+            model.step(means_rate, model.field.sh.shape[1], self._visible.get(level))
+
+    @property
+    def fields(self) -> dict[int, GaussianField]:
+        """What the fields have become, by level, without gradients."""
+        return {level: model.field.detach() for level, model in self.models.items()}
+
+    def state(self) -> dict[int, dict[str, Any]]:
+        """Of every model, for checkpoints: what `TrainableField.from_state` takes, by level."""
+        return {level: model.state() for level, model in self.models.items()}
