@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 from lapgs_plugin.adapters import gsplat
+from lapgs_plugin.environment import driver_version
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer
@@ -18,10 +21,11 @@ ANTIALIASING = "antialiasing"
 def choose_rasterizer(name: str) -> str:
     """What `--rasterizer auto` is on this machine; any other name as it is.
 
-    With a CUDA device it is gsplat or an error: nobody is to find out hours later that a GPU stood idle.
+    With a GPU it is gsplat or an error: nobody is to find out hours later that it stood idle. An empty
+    CUDA_VISIBLE_DEVICES, or -1, says that there is none.
 
     Raises:
-        MissingExtraError: there is a CUDA device, and gsplat cannot use it.
+        MissingExtraError: there is a GPU, and PyTorch or gsplat cannot use it.
         UserInputError: an unknown name.
     """
     known = (AUTO, gsplat.NAME, *CPU_RASTERIZERS)
@@ -30,6 +34,12 @@ def choose_rasterizer(name: str) -> str:
     if name != AUTO:
         return name
     if not torch.cuda.is_available():
+        if os.environ.get("CUDA_VISIBLE_DEVICES") not in ("", "-1") and (driver := driver_version()):
+            build = f"which is built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+            raise MissingExtraError(
+                f"there is a GPU with driver {driver}, and PyTorch {torch.__version__}, {build}, cannot use it; "
+                "`lapgs doctor` says what to update or install, --rasterizer cpu does without"
+            )
         return "cpu"
     if reason := gsplat.missing():
         raise MissingExtraError(

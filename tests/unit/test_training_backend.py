@@ -24,6 +24,7 @@ from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import backend
 from lapgs_plugin.training import views as training_views
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
@@ -64,7 +65,16 @@ def losses(archive: RunArchive) -> list[tuple[int, int, float]]:
 
 def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(backend, "driver_version", lambda: "")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert choose_rasterizer("auto") == "cpu"
+    monkeypatch.setattr(backend, "driver_version", lambda: "470.10")
+    for build, words in (("13.0", "which is built for CUDA 13.0, cannot use it"), (None, "built without CUDA, cannot")):
+        monkeypatch.setattr(torch.version, "cuda", build)
+        with pytest.raises(MissingExtraError, match=f"driver 470.10, and PyTorch .*{words}.*--rasterizer cpu does"):
+            choose_rasterizer("auto")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
+    assert choose_rasterizer("auto") == "cpu", "the GPU was hidden on purpose"
     with pytest.raises(MissingExtraError, match="PyTorch sees no CUDA device"):
         training_rasterizer("gsplat", SETTINGS)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
