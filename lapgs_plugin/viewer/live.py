@@ -1,14 +1,13 @@
 """Watching a run while it is trained.
 
 Pictures are drawn by the thread that trains, between two iterations, so nothing is copied, nothing races with density
-control, and what watching costs is known exactly: after a picture there is no other until so much time has passed that
-pictures are the share of it that was allowed. Whatever fails here ends the watching, never the training.
+control, and what watching costs is known exactly: pictures wait until so much time has passed that they are the share
+of it that was allowed. Whatever fails here ends the watching, never the training.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -37,6 +36,9 @@ DEFAULT_PERCENT, MOST_PERCENT = 1.5, 50.0
 LIVE_PACE = Pace(moving=0.02, still=0.06, ahead=False)
 """What a picture takes: at 1.5 % that is one every 1.3 s while somebody moves, and every 4 s otherwise."""
 
+BURST_SECONDS = 0.25
+"""That pictures may take at once before they wait for their share: the first of a stage brings a new panel."""
+
 PAUSE_PATIENCE = 0.1
 
 
@@ -58,7 +60,7 @@ class LiveView(Watcher):
         self._rig: Rig | None = None
         self._begun = False  # clients know where to begin
         self._finished: dict[int, GaussianField] = {}
-        self._ended, self._cost = -math.inf, 0.0  # of the last look
+        self._credit, self._counted = BURST_SECONDS, time.perf_counter()  # seconds to spend, and as of when
         gui = page.server.gui
         with gui.add_folder("Training"):
             self._percent = gui.add_slider(
@@ -97,8 +99,10 @@ class LiveView(Watcher):
             return False
         if self._pause.value:
             return True
-        share = self._percent.value / 100.0
-        return share > 0.0 and time.perf_counter() >= self._ended + self._cost * (1.0 / share - 1.0)
+        share, now = self._percent.value / 100.0, time.perf_counter()
+        self._credit = min(self._credit + share * (now - self._counted), BURST_SECONDS)
+        self._counted = now
+        return share > 0.0 and self._credit > 0.0
 
     def look(
         self,
@@ -112,10 +116,10 @@ class LiveView(Watcher):
         with self._harmless():
             self._show(stage, iteration, fields())
             self._viewer.draw_next(patience=0.0)
-            self._cost = time.perf_counter() - begin
+            self._credit -= time.perf_counter() - begin
             while self._pause.value and self._viewer.watched and not interrupted():
                 self._viewer.draw_next(PAUSE_PATIENCE)
-        self._ended = time.perf_counter()
+        self._counted = time.perf_counter()
 
     def stage_finished(self, stage: Stage, fields: Callable[[], Mapping[int, GaussianField]]) -> None:
         with self._harmless():

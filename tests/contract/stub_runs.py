@@ -23,6 +23,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.watching import Watcher
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
 
@@ -150,10 +151,17 @@ def drive(
     hooks: Sequence[StageHook] = (),
     resume: bool = False,
     breakdown: bool = False,
+    watcher: Watcher | None = None,
     **options: Any,
 ) -> None:
     driver = HierarchyDriver(
-        adapter, HierarchyOptions(**options), device="cpu", resume=resume, hooks=hooks, breakdown=breakdown
+        adapter,
+        HierarchyOptions(**options),
+        device="cpu",
+        resume=resume,
+        hooks=hooks,
+        breakdown=breakdown,
+        watcher=watcher,
     )
     driver.run()
 
@@ -166,12 +174,13 @@ def run_hierarchy(
     hooks: Sequence[StageHook] = (),
     resume: bool = False,
     breakdown: bool = False,
+    watcher: Watcher | None = None,
     **options: Any,
 ) -> tuple[RunArchive, Result]:
     """Train a stub as a hierarchy with `HierarchyOptions(**options)`."""
     results: list[Result] = []
     with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
-        drive(adapter, hooks=hooks, resume=resume, breakdown=breakdown, **options)
+        drive(adapter, hooks=hooks, resume=resume, breakdown=breakdown, watcher=watcher, **options)
     return RunArchive.open(folder), results[0]
 
 

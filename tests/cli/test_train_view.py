@@ -1,0 +1,61 @@
+"""`lapgs train --view`: what it says, what it refuses before anything is written, and a port that is free again."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import socket
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.run import CONTEXT, run
+from lapgs_plugin.cli.train import train
+from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
+from tests.cli.run_folder import write_scene
+from tests.contract.stub_runs import STUBS
+
+pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+app = typer.Typer()
+app.command("train")(train)
+app.command("run", context_settings=CONTEXT)(run)
+
+
+def lapgs(*arguments: object) -> str:
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [str(argument) for argument in arguments])
+    if isinstance(result.exception, LapgsError):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), size=(128, 96))
+
+
+def test_nobody_looks(scene: Path, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        output = lapgs("train", scene, "-o", tmp_path / "run", "--iterations", 6, "--view", "--view-port", port)
+    assert f"port {port} is taken, using {port + 1}" in output
+    assert f"open http://localhost:{port + 1} in a browser; it shows the run while it is trained" in output
+    records = json.loads((tmp_path / "run" / "manifest.json").read_text())["records"]
+    assert len(records) == 2
+    assert not any("view" in record["overhead_seconds"] for record in records)
+    with socket.create_server(("127.0.0.1", port + 1)):
+        pass  # nothing listens any more
+
+
+def test_mistakes_come_before_the_run_folder(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserInputError, match="--view-port 8123 needs --view"):
+        lapgs("train", scene, "-o", tmp_path / "run", "--view-port", 8123)
+    with pytest.raises(UserInputError, match="--view with --off"):
+        lapgs("run", "--off", "--view", "--device", "cpu", STUBS["graphdeco"].script)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"--view needs viser.*lapgs_plugin\[viewer\]"):
+        lapgs("train", scene, "-o", tmp_path / "run", "--view")
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,82 @@
+"""A run that is watched: what a watcher is shown, when, and that it changes nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+import torch
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.plan import Stage
+from lapgs_plugin.watching import Watcher
+from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
+
+EVERY = 4
+
+
+class Diary(Watcher):
+    """Looks after every fourth iteration and notes what it sees."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.counts: list[int] = []
+        self.last: dict[int, GaussianField] = {}
+        self._asked = 0
+
+    def run_started(self, archive: RunArchive) -> None:
+        self.lines.append(f"run {archive.manifest.levels}")
+
+    def stage_started(self, stage: Stage) -> None:
+        self.lines.append(f"stage {stage.level}")
+        self._asked = 0
+
+    def wants_look(self) -> bool:
+        self._asked += 1
+        return self._asked % EVERY == 0
+
+    def look(
+        self,
+        stage: Stage,
+        iteration: int,
+        fields: Callable[[], Mapping[int, GaussianField]],
+        interrupted: Callable[[], bool],
+    ) -> None:
+        seen = fields()
+        assert not any(tensor.requires_grad for field in seen.values() for tensor in field.parameters.values())
+        assert seen[stage.level].signed == stage.signed
+        assert not interrupted()
+        self.lines.append(f"iteration {iteration} of level {stage.level}: {sorted(seen)}")
+        self.counts.append(len(seen[stage.level]))
+        self.last = dict(seen)
+
+    def stage_finished(self, stage: Stage, fields: Callable[[], Mapping[int, GaussianField]]) -> None:
+        self.lines.append(f"finished {stage.level}: {sorted(fields())}")
+        self.last = dict(fields())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_watcher_sees_every_stage_and_changes_nothing(
+    name: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    diary = Diary()
+    with caplog.at_level(logging.WARNING):
+        watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", watcher=diary)
+        said = len(caplog.records)
+        alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone")
+    assert len(caplog.records) == 2 * said  # a look says nothing that archiving does not
+    first, coarse, residual = diary.lines.index("stage 1"), diary.lines.index("stage 0"), diary.lines
+    assert residual[0] == "run 2"
+    assert residual[first + 1] == f"iteration {EVERY - 1} of level 1: [1]"
+    assert residual[coarse - 1] == "finished 1: [1]"
+    assert residual[coarse + 1] == f"iteration {EVERY - 1} of level 0: [0]"
+    assert residual[-1] == "finished 0: [0, 1]"  # the base was trained along at the end
+    assert max(diary.counts) > min(diary.counts)
+    for level in (1, 0):
+        for a, b in zip(watched.field(level).parameters.values(), alone.field(level).parameters.values(), strict=True):
+            assert torch.equal(a, b)
+        assert torch.equal(diary.last[level].means, watched.field(level).means)
+        assert watched.manifest.record(level).overhead_seconds["view"] > 0
