@@ -51,7 +51,8 @@ def bench_experiment(
         str | None, typer.Option(rich_help_panel=SELECTION, help="Instead of the file's, such as 0,1,2.")
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(min=1, rich_help_panel=SELECTION, help="Instead of the file's, for a shorter trial.")
+        int | None,
+        typer.Option(min=1, rich_help_panel=SELECTION, help="Instead of the file's; a variant's own in proportion."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -239,7 +240,7 @@ def _follow(
     if finished:
         console.print(f"{finished} of {len(run_ids)} runs are done already")
     # A batch system ends a job with SIGTERM: the runs of its workers are given back, as after Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     with item_progress("runs") as progress:
         task = progress.add_task("Running", total=len(run_ids), completed=finished)
 
@@ -255,6 +256,8 @@ def _follow(
             execute(store, run_ids, start, say)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; the same command goes on with the runs that are left") from None
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _summary(record: dict[str, Any]) -> str:

@@ -87,7 +87,7 @@ class Selection:
     Attributes:
         scenes, backbones, variants: names of those to run.
         seeds: instead of the file's.
-        iterations: instead of the file's, for every variant without its own.
+        iterations: instead of the file's; a variant's own change in proportion.
     """
 
     scenes: Collection[str] | None = None
@@ -162,11 +162,16 @@ def _spec(
         rasterizer=backbone.rasterizer,
         checkout=backbone.checkout,
         method=variant.method,
-        iterations=variant.iterations or selection.iterations or experiment.iterations,
+        iterations=_iterations(experiment, selection, variant),
         seed=seed,
         options=options,
         arguments=[] if backbone.checkout is None else [*preset, *backbone.arguments, *variant.arguments],
     )
+
+
+def _iterations(experiment: Experiment, selection: Selection, variant: Variant) -> int:
+    own = variant.iterations or experiment.iterations
+    return own if selection.iterations is None else max(1, round(own * selection.iterations / experiment.iterations))
 
 
 def _scenes(entry: Scenes) -> Iterator[SceneSpec]:

@@ -14,8 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
+from lapgs_plugin.experiments.expansion import Selection, plan_runs
+from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.experiments.store import DONE, FAILED, Job, ResultStore
 from lapgs_plugin.scenes.sample import make_sample_scene
 
 EXPERIMENT = """
@@ -140,6 +143,20 @@ def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path
     assert isinstance(error, UserInputError)
     assert "checkout fastgs: nothing says where it is; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
     assert not (experiment.parent / "out").exists()
+
+
+def test_results_of_another_version_are_named(experiment: Path) -> None:
+    out = experiment.parent / "out"
+    planned = plan_runs(load_experiment(experiment, _option_names()), Selection())
+    store = ResultStore.create(out / "results.sqlite")
+    store.plan([Job(run.spec.run_id, run.spec, "", "", (), True) for run in planned])
+    claim = store.claim([planned[0].spec.run_id])
+    assert claim is not None
+    store.record(claim, {"psnr": 20.0, "train_seconds": 1.0, "lapgs_version": "0.0.9"})
+    result = CliRunner().invoke(bench_app, [str(experiment), "--out", str(out), "--tables-only"])
+    assert result.exit_code == 0
+    assert "some results were made by lapgs_plugin 0.0.9" in result.stderr
+    assert "lapgs_plugin 0.0.9" in (out / "tables.md").read_text()
 
 
 def test_tables_of_nothing(experiment: Path) -> None:

@@ -87,6 +87,14 @@ def test_what_is_selected_is_what_is_run() -> None:
         plan_runs(experiment(), Selection(backbones=["cpu"], variants=["fast alone"]))
 
 
+def test_fewer_iterations_are_fewer_for_all() -> None:
+    variants = [{"name": "usual"}, {"name": "longer", "iterations": 60}]
+    planned = plan_runs(
+        experiment(variants=variants), Selection(iterations=10, scenes=["a"], seeds=[0], backbones=["cpu"])
+    )
+    assert {run.variant: run.spec.iterations for run in planned} == {"usual": 10, "longer": 15}, "of 40 and 60"
+
+
 def test_data_sets_know_their_scenes_and_image_folders() -> None:
     built = experiment(scenes=[{"dataset": "mipnerf360", "only": ["garden", "room"], "images": "downscaled"}])
     assert [(scene.name, scene.images) for scene in scenes_of(built, Selection())] == [
