@@ -57,6 +57,7 @@ class BackboneInfo:
         density_control: methods of its GaussianModel that add, remove or reset Gaussians.
         density_scores: functions of its script or utilities by whose scores density control decides.
         color_rates: its options that are learning rates of SH coefficients.
+        densify_thresholds: its options that are thresholds on screen-space gradients for densification.
         raster_defaults: what its options set in the rasterizer unless a user says otherwise, where that changes the
             image and is not in `extensions.CONSTANTS`.
         telling_options: of the model, in the `cfg_args` that it writes and no other backbone does.
@@ -68,6 +69,7 @@ class BackboneInfo:
     stand_in: str
     density_control: tuple[str, ...]
     color_rates: tuple[str, ...]
+    densify_thresholds: tuple[str, ...]
     density_scores: tuple[str, ...] = ()
     raster_defaults: Mapping[str, Any] = field(default_factory=dict)
     telling_options: tuple[str, ...] = ()
@@ -115,6 +117,7 @@ class StageWindow:
         total: iterations of the whole run, as the user asked for.
         levels: of the whole run.
         residual_color_rate: factor on the SH learning rates of residual stages.
+        coarse_threshold: factor on densification thresholds for each time that a level's images are halved.
     """
 
     stage: Stage
@@ -122,6 +125,7 @@ class StageWindow:
     total: int
     levels: int
     residual_color_rate: float
+    coarse_threshold: float
 
     def scaled(self, iterations: int) -> int:
         """A constant of the whole run's schedule, as the same share of this stage."""
@@ -211,6 +215,8 @@ class BackboneAdapter(ABC):
         opt.iterations = window.stage.iterations
         opt.densify_until_iter = window.scaled(opt.densify_until_iter)
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
+        for name in self.info.densify_thresholds:
+            setattr(opt, name, getattr(opt, name) * window.coarse_threshold**window.stage.level)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
             dataset.white_background = False

@@ -230,7 +230,10 @@ class HierarchyDriver:
         finished: list[FinishedStage] = []
         before: Finished | None = None
         for stage in plan:
-            window = StageWindow(stage, start, plan.iterations, plan.levels, self._options.residual_color_rate)
+            options = self._options
+            window = StageWindow(
+                stage, start, plan.iterations, plan.levels, options.residual_color_rate, options.coarse_threshold
+            )
             active = ActiveStage(self._context, call, scene, archive, window, tuple(finished), before, path)
             self._active = active
             try:

@@ -36,6 +36,7 @@ class FastGSAdapter(BackboneAdapter):
         density_control=("densify_and_prune_fastgs", "reset_opacity", "final_prune_fastgs"),
         density_scores=("compute_gaussian_score_fastgs",),
         color_rates=("lowfeature_lr", "highfeature_lr"),
+        densify_thresholds=("grad_thresh", "grad_abs_thresh"),
         raster_defaults={"mult": 0.5},
     )
 

@@ -29,6 +29,7 @@ class GraphdecoAdapter(BackboneAdapter):
         stand_in="graphdeco-aa",
         density_control=("densify_and_prune", "reset_opacity"),
         color_rates=("feature_lr",),
+        densify_thresholds=("densify_grad_threshold",),
         telling_options=("depths",),
     )
 

@@ -40,6 +40,7 @@ class HierarchyOptions:
         joint: share of each residual stage, its last, in which the finished fields are trained along, 0 to 1. Ablations
             that supervise residuals alone have no use for it: nothing is composed there.
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
+        coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
         prediction_precision: what cached predictions are stored as, a key of `imagestore.PRECISIONS`.
         fused_adam: let PyTorch's Adam step each tensor in one kernel.
@@ -57,6 +58,7 @@ class HierarchyOptions:
     inherit_ratio: float = 1.0
     joint: float = JOINT_SHARE
     residual_color_rate: float = 4.0
+    coarse_threshold: float = 1.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
     fused_adam: bool = True
@@ -67,8 +69,9 @@ class HierarchyOptions:
         Pyramid(self.grid)
         self.shares()
         check_joint_share(self.joint)
-        if self.residual_color_rate <= 0 or not math.isfinite(self.residual_color_rate):
-            raise UserInputError(f"--residual-color-rate {self.residual_color_rate}: expected a positive factor")
+        for name in ("residual_color_rate", "coarse_threshold"):
+            if (factor := getattr(self, name)) <= 0 or not math.isfinite(factor):
+                raise UserInputError(f"--{name.replace('_', '-')} {factor}: expected a positive factor")
         if self.images_on not in ("auto", *PLACES):
             raise UserInputError(f"--images-on {self.images_on}: expected {', '.join(('auto', *PLACES))}")
         if self.prediction_precision not in PRECISIONS:

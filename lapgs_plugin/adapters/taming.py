@@ -41,6 +41,7 @@ class TamingAdapter(BackboneAdapter):
         density_control=("densify_with_score", "reset_opacity"),
         density_scores=("compute_gaussian_score",),
         color_rates=("feature_lr", "shfeature_lr"),
+        densify_thresholds=("densify_grad_threshold",),
     )
 
     @staticmethod

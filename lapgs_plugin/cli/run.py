@@ -95,6 +95,14 @@ def run(
     residual_color_rate: Annotated[
         float, typer.Option(rich_help_panel=HIERARCHY, help="Factor on the SH learning rates of residual stages.")
     ] = 4.0,
+    coarse_threshold: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="Factor on the backbone's gradient thresholds for densification, for each time that a level's images "
+            "are halved: above 1 gives coarse levels fewer Gaussians.",
+        ),
+    ] = 1.0,
     seed: Annotated[
         int,
         typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),
@@ -167,6 +175,7 @@ def run(
         inherit_ratio=ratio,
         joint=joint,
         residual_color_rate=residual_color_rate,
+        coarse_threshold=coarse_threshold,
         images_on=images_on,
         prediction_precision=prediction_precision,
         fused_adam=fused_adam,

@@ -15,8 +15,8 @@ from lapgs_plugin.plan import Stage
 from tests.contract.stub_runs import NAMES, STUBS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000
-BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0)
-FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0)
+BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
+FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0, 1.5)
 
 
 def published_call(name: str, adapter: Any, **changes: Any) -> TrainingCall:
@@ -58,6 +58,15 @@ def test_schedules_are_scaled_to_the_stage(name: str, scene: Path, tmp_path: Pat
         opt = stage.opt
         kept = (opt.densify_from_iter, opt.densification_interval, opt.opacity_reset_interval)
         assert kept == (500, 100, 3_000)
+    thresholds = [
+        name for name in vars(call.opt) if name.endswith(("grad_threshold", "grad_thresh", "grad_abs_thresh"))
+    ]
+    assert thresholds
+    for threshold in adapter.info.densify_thresholds:
+        assert threshold in thresholds
+        whole = getattr(call.opt, threshold)
+        assert getattr(base.opt, threshold) == pytest.approx(1.5 * whole), "its images are halved once"
+        assert getattr(finest.opt, threshold) == whole
 
 
 @pytest.mark.parametrize("name", NAMES)
