@@ -36,7 +36,8 @@ def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
         if fine.device.type == "cpu" and fine.dtype in (torch.float32, torch.float64):
             return _on_cpu(pyramid, coarse, fine)
         if fine.device.type == "cuda" and fine.dtype == torch.float32 and (kernel := _cuda_kernel()) is not None:
-            return kernel(pyramid, coarse, fine)
+            with torch.cuda.device(fine.device):  # Triton launches on the current one
+                return kernel(pyramid, coarse, fine)
     return pyramid.up(coarse, (fine.shape[-2], fine.shape[-1])) + fine
 
 
