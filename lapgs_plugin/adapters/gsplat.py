@@ -11,7 +11,9 @@ also asks how many Gaussians are visible.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -143,19 +145,19 @@ class GsplatRasterizer:
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, absgrad: bool
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Images (b, h, w, 3), opacities (b, h, w, 1) and what gsplat found on the way; cameras of one size."""
-        from gsplat import rasterization, spherical_harmonics
+        from gsplat import rasterization
 
         means = field.means
         viewmats, intrinsics, positions = _on_device(cameras, means)
-        colors = [spherical_harmonics(degree, means - position, field.sh) for position in positions]  # (n, 3) each
+        colors = _harmonics(field, degree, viewmats, positions)
         if not field.signed:
-            colors = [torch.clamp_min(color + 0.5, 0.0) for color in colors]
+            colors = torch.clamp_min(colors + 0.5, 0.0)
         found: tuple[Tensor, Tensor, dict[str, Any]] = rasterization(
             means,
             field.quaternions,
             torch.exp(field.log_scales),
             torch.sigmoid(field.opacity_logits),
-            colors[0] if len(colors) == 1 else torch.stack(colors),
+            colors,
             viewmats,
             intrinsics,
             cameras[0].width,
@@ -183,6 +185,23 @@ class GsplatRasterizer:
         radii = torch.zeros(len(means2d), dtype=torch.int32, device=means2d.device)  # (n,)
         radii[rows] = torch.where(shown, found_radii, 0).to(torch.int32)
         return radii
+
+
+def _harmonics(field: GaussianField, degree: int, viewmats: Tensor, positions: Tensor) -> Tensor:
+    """The raw SH values from each camera: (n, 3) for one, (b, n, 3) for several."""
+    from gsplat import spherical_harmonics
+
+    if _takes_cameras(spherical_harmonics):
+        values: Tensor = spherical_harmonics(degree, field.means, viewmats, field.sh)  # (b, n, 3)
+        return values
+    each = [spherical_harmonics(degree, field.means - position, field.sh) for position in positions]  # (n, 3)
+    return each[0] if len(each) == 1 else torch.stack(each)
+
+
+@lru_cache(maxsize=4)
+def _takes_cameras(spherical_harmonics: Callable[..., Tensor]) -> bool:
+    """Whether it is gsplat's from 1.6.0 on, which wants means and poses where earlier ones want directions."""
+    return "viewmats" in inspect.signature(spherical_harmonics).parameters
 
 
 def _on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
