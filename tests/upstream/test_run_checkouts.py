@@ -57,7 +57,7 @@ def test_two_levels(variable: str, scene: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
-    done = run(variable, scene, tmp_path / "run", "--levels", "3")
+    done = run(variable, scene, tmp_path / "run", "--levels", "3", "--breakdown")
     archive = RunArchive.open(done.folder)
     assert archive.available_levels == (2, 1, 0)
     assert archive.manifest.complete
@@ -65,6 +65,11 @@ def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
     assert base[-1] < 0.95 * base[0]
     # Of 30 iterations and 21 views that are not alike, the running mean says which views were drawn last.
     assert all(0 < loss < 1 for losses in residuals for loss in losses)
+    for record in archive.manifest.records:
+        parts = record.breakdown_seconds
+        assert sum(parts.values()) == pytest.approx(record.train_seconds, rel=0.02)  # 0.01 % seen
+        assert min(parts[part] for part in ("forward", "loss", "backward", "optimizer", "other")) > 0
+    assert sum(record.breakdown_seconds["densification"] for record in archive.manifest.records) > 0
 
 
 @pytest.mark.parametrize("variable", ["LAPGS_TAMING", "LAPGS_GRAPHDECO"])
