@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 HOST, PORT = "127.0.0.1", 8080
 
 ViewOption = Annotated[
-    bool, typer.Option("--view", help="Watch training in a web browser; costs at most 2 % of its time.")
+    bool, typer.Option("--view", help="Watch training in a web browser, for 1.5 % of its time.")
 ]
 ViewPortOption = Annotated[
     int | None,

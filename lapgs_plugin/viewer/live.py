@@ -124,7 +124,7 @@ class LiveView(Watcher):
     def stage_finished(self, stage: Stage, fields: Callable[[], Mapping[int, GaussianField]]) -> None:
         with self._harmless():
             # They leave a GPU while nobody looks.
-            self._finished.update({level: field.detach().to("cpu") for level, field in fields().items()})
+            self._finished = {level: field.to("cpu") for level, field in {**self._finished, **fields()}.items()}
             self._viewer.forget()
             self._page.status = f"level {stage.level} is finished"
 

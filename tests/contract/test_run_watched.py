@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -80,3 +81,35 @@ def test_a_watcher_sees_every_stage_and_changes_nothing(
             assert torch.equal(a, b)
         assert torch.equal(diary.last[level].means, watched.field(level).means)
         assert watched.manifest.record(level).overhead_seconds["view"] > 0
+
+
+def test_the_viewer_shows_a_checkout_on_the_cpu(scene: Path, tmp_path: Path) -> None:
+    """The real watcher, inside of what makes "cuda" mean the CPU, and a client that looks at every stage."""
+    pytest.importorskip("viser", reason="needs the extra 'viewer'")
+    from lapgs_plugin.viewer.live import LiveView
+    from lapgs_plugin.viewer.page import Page
+    from tests.viewer.wire import wire_client
+
+    with Page("127.0.0.1", 8950, "run") as page:
+        watcher = LiveView(page, "cpu")
+        watcher._percent.value = 50.0
+        words, pictures = list[str](), list[int]()
+
+        def look() -> None:
+            with wire_client(page.address) as client:
+                connected.set()
+                while not done.is_set():
+                    client.listen(0.1)
+                words.extend(client.words)
+                pictures.append(len(client.pictures))
+
+        connected, done = threading.Event(), threading.Event()
+        thread = threading.Thread(target=look)
+        thread.start()
+        connected.wait(30)
+        run_hierarchy(STUBS["fastgs"], scene, tmp_path / "run", watcher=watcher)
+        done.set()
+        thread.join(30)
+    assert pictures[0] >= 2
+    assert any("training level 0 of 2: iteration" in text for text in words)
+    assert not watcher._failed
