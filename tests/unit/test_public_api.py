@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lapgs_plugin as lapgs
@@ -26,6 +26,7 @@ def test_every_public_name_is_there_and_importing_the_package_imports_no_torch()
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@settings(deadline=None)
 @given(width=st.integers(16, 500), height=st.integers(16, 500), level=st.integers(0, 3))
 def test_intrinsics_of_a_level_are_those_of_its_camera(width: int, height: int, level: int) -> None:
     camera = replace(ring_camera(0.3, width, height), cx=0.4 * width, fy=1.3 * width)
