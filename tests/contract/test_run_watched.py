@@ -17,6 +17,7 @@ from lapgs_plugin.watching import Watcher
 from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
 
 EVERY = 4
+SHORT = ("--iterations", 45, "--densify_until_iter", 40)
 
 
 class Diary(Watcher):
@@ -65,9 +66,9 @@ def test_a_watcher_sees_every_stage_and_changes_nothing(
 ) -> None:
     diary = Diary()
     with caplog.at_level(logging.WARNING):
-        watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", watcher=diary)
+        watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", *SHORT, watcher=diary)
         said = len(caplog.records)
-        alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone")
+        alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone", *SHORT)
     assert len(caplog.records) == 2 * said  # a look says nothing that archiving does not
     first, coarse, residual = diary.lines.index("stage 1"), diary.lines.index("stage 0"), diary.lines
     assert residual[0] == "run 2"

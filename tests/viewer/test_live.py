@@ -66,7 +66,7 @@ class Watched(LiveView):
 
 
 def watched_run(
-    folder: Path, page: Page, watcher: Watched, client_does: Callable[[WireClient], None], iterations: int = 300
+    folder: Path, page: Page, watcher: Watched, client_does: Callable[[WireClient], None], iterations: int = 150
 ) -> RunArchive:
     """Train in a thread while a client looks on."""
     result: list[RunArchive] = []
@@ -109,7 +109,7 @@ def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(page: Pag
     archive = watched_run(tmp_path / "watched", page, watcher, look)
     assert watcher.looks > 3
     assert all(record.overhead_seconds["view"] > 0 for record in archive.manifest.records)
-    assert same_bits(archive, train(tmp_path / "alone", Watcher(), 300))
+    assert same_bits(archive, train(tmp_path / "alone", Watcher(), 150))
 
 
 def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: 
         with wire_client(page.address) as again:
             assert again.listen(PATIENCE, pictures=1) == 1
 
-    watched_run(tmp_path / "run", page, watcher, look, iterations=600)
+    watched_run(tmp_path / "run", page, watcher, look, iterations=300)
 
 
 def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, tmp_path: Path) -> None:
