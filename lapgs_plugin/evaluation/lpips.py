@@ -95,9 +95,10 @@ class Network:
     smallest: int
 
     def layers(self) -> nn.Sequential:
-        """Its convolutions with random weights, up to the last tap."""
+        """Its convolutions up to the last tap, with shapes but no values: on PyTorch's device "meta"."""
         make = {"AlexNet": _alexnet, "VGG": _vgg16, "SqueezeNet": _squeezenet}[self.title]
-        return nn.Sequential(*make())
+        with torch.device("meta"):
+            return nn.Sequential(*make())
 
 
 NETWORKS = {
@@ -141,7 +142,9 @@ class Lpips(nn.Module):
         network = NETWORKS[name]
         self._taps = network.taps
         self.features = network.layers()
-        self.learned = nn.ParameterList([nn.Parameter(torch.zeros(1, c, 1, 1)) for c in network.channels])
+        self.learned = nn.ParameterList(
+            [nn.Parameter(torch.empty(1, c, 1, 1, device="meta")) for c in network.channels]
+        )
         found = {re.sub(r"^lin(\d)\.weight$", r"learned.\1", key): value for key, value in weights.items()}
         for key, own in self.state_dict().items():
             if key not in found or found[key].shape != own.shape:
@@ -150,7 +153,7 @@ class Lpips(nn.Module):
                     f"LPIPS weights of {network.title}: {key} is {shape}, expected {tuple(own.shape)}; give a file of "
                     "torchvision's weights, or one with the learned layers lin<k>.weight too"
                 )
-        self.load_state_dict({key: found[key] for key in self.state_dict()})
+        self.load_state_dict({key: found[key].float() for key in self.state_dict()}, assign=True)
         self.requires_grad_(False)
         self.eval()
 

@@ -180,7 +180,8 @@ def test_lpips_is_measured_where_there_are_weights_and_said_where_not(
     assert "not measured" in output
     assert "LPIPS vgg was not measured: no weights" in output
 
-    layers = {f"features.{key}": value for key, value in NETWORKS["alex"].layers().state_dict().items()}
+    shapes = {f"features.{key}": value.shape for key, value in NETWORKS["alex"].layers().state_dict().items()}
+    layers = {key: 0.05 * torch.randn(shape) for key, shape in shapes.items()}
     learned = {f"lin{k}.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(NETWORKS["alex"].channels)}
     torch.save({**layers, **learned}, tmp_path / "alex.pth")
     output = lapgs("eval", run, "--lpips-weights", tmp_path / "alex.pth")

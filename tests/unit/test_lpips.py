@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,10 @@ NAMES = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}
 
 def random_weights(name: str, learned: bool = True) -> dict[str, Tensor]:
     """In torchvision's layout, classifier included; learned layers are positive, as those of LPIPS."""
-    weights = {f"features.{key}": value for key, value in from_text(TEXTS[NAMES[name]]).state_dict().items()}
+    with torch.device("meta"):
+        shapes = {key: value.shape for key, value in from_text(TEXTS[NAMES[name]]).state_dict().items()}
+    # Layers that neither explode nor die out: He's initialisation without its slow start.
+    weights = {f"features.{k}": torch.randn(s) * math.sqrt(2 / max(1, math.prod(s[1:]))) for k, s in shapes.items()}
     weights["classifier.1.weight"] = torch.zeros(2, 2)
     if learned:
         for index, channels in enumerate(NETWORKS[name].channels):
@@ -86,9 +90,10 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> Callable[..., float]:
     theirs = pytest.importorskip("torchmetrics.functional.image.lpips")
 
     def distance(name: str, weights: dict[str, Tensor], image: Tensor, target: Tensor, rescaled: bool = True) -> float:
-        network = from_text(TEXTS[NAMES[name]])
+        with torch.device("meta"):
+            network = from_text(TEXTS[NAMES[name]])
         features = {key.removeprefix("features."): v for key, v in weights.items() if key.startswith("features.")}
-        network.load_state_dict(features)
+        network.load_state_dict(features, assign=True)
         monkeypatch.setattr(theirs, "_get_tv_model_features", lambda _, pretrained: network)
         model: Any = theirs._LPIPS(net=name, pnet_rand=True)  # with its own learned layers
         for index in range(len(NETWORKS[name].channels)):
@@ -99,7 +104,7 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> Callable[..., float]:
     return distance
 
 
-def images(height: int = 70, width: int = 85) -> tuple[Tensor, Tensor]:
+def images(height: int = 44, width: int = 53) -> tuple[Tensor, Tensor]:
     target = torch.rand(3, height, width)
     return (target + 0.2 * torch.randn(3, height, width)).clamp(0, 1), target
 
@@ -111,7 +116,7 @@ def test_distances_are_those_of_torchmetrics(
 ) -> None:
     weights = random_weights(name, learned)
     torch.save(weights, tmp_path / "weights.pth")
-    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 70, CPU)
+    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 44, CPU)
     assert metrics.missing == {}
     image, target = images()
     found = metrics.measure(image, target)
@@ -127,7 +132,7 @@ def test_distances_are_those_of_torchmetrics(
 def test_a_safetensors_file_and_what_is_shown(tmp_path: Path) -> None:
     safetensors = pytest.importorskip("safetensors.torch")
     safetensors.save_file(random_weights("alex"), tmp_path / "alex.safetensors")
-    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "alex.safetensors",)), 70, CPU)
+    metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "alex.safetensors",)), 44, CPU)
     image, target = images()
     assert metrics.measure(target, target) == {"alex": 0.0}
     assert metrics.measure(target + 2.0, torch.ones_like(target)) == {"alex": 0.0}  # clamped to what is shown
@@ -150,21 +155,21 @@ def test_published_weights_of_alexnet(shared_data: Path, reference: Callable[...
 
 def test_without_weights_it_is_said_and_nothing_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    metrics = lpips_metrics(LpipsRequest(), 70, CPU)
+    metrics = lpips_metrics(LpipsRequest(), 44, CPU)
     assert set(metrics.missing) == {"vgg", AS_3DGS}
     assert all("--lpips-weights" in reason for reason in metrics.missing.values())
     assert metrics.measure(*images()) == {}
-    assert lpips_metrics(LpipsRequest.parse("none"), 70, CPU).missing == {}
+    assert lpips_metrics(LpipsRequest.parse("none"), 44, CPU).missing == {}
 
     (tmp_path / "checkpoints").mkdir()
     torch.save(random_weights("squeeze"), tmp_path / "checkpoints" / NETWORKS["squeeze"].cached_as)
-    metrics = lpips_metrics(LpipsRequest.parse("squeeze,alex"), 70, CPU)
+    metrics = lpips_metrics(LpipsRequest.parse("squeeze,alex"), 44, CPU)
     assert set(metrics.measure(*images())) == {"squeeze"}
     assert set(metrics.missing) == {"alex"}
 
     monkeypatch.setattr(lpips, "LINEAR_FILES", {})
     torch.save(random_weights("alex", learned=False), tmp_path / "checkpoints" / NETWORKS["alex"].cached_as)
-    assert "lapgs_plugin[lpips]" in lpips_metrics(LpipsRequest.parse("alex"), 70, CPU).missing["alex"]
+    assert "lapgs_plugin[lpips]" in lpips_metrics(LpipsRequest.parse("alex"), 44, CPU).missing["alex"]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -189,7 +194,7 @@ def damaged(folder: Path) -> dict[str, Path]:
 def test_files_that_are_no_weights(said: str, tmp_path: Path) -> None:
     path = damaged(tmp_path)[said]
     with pytest.raises(UserInputError, match=said) as raised:
-        lpips_metrics(LpipsRequest(files=(path,)), 70, CPU)
+        lpips_metrics(LpipsRequest(files=(path,)), 44, CPU)
     assert str(path) in str(raised.value)
     assert "expected" in str(raised.value)
     assert "\n" not in str(raised.value)
@@ -199,7 +204,7 @@ def test_learned_layers_of_another_shape(tmp_path: Path) -> None:
     weights = {**random_weights("alex"), "lin2.weight": torch.zeros(1, 5, 1, 1)}
     torch.save(weights, tmp_path / "weights.pth")
     with pytest.raises(UserInputError, match=r"learned.2 is \(1, 5, 1, 1\), expected \(1, 384, 1, 1\)"):
-        lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 70, CPU)
+        lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 44, CPU)
 
 
 def test_an_unknown_variant_names_the_known_ones() -> None:
