@@ -121,11 +121,13 @@ class Outcome:
 class ResultStore:
     """An experiment's results. Every method is one transaction; objects may be used by several threads.
 
+    All methods raise RunFolderError when the file cannot be read or written.
+
     Args:
         path: the file; `create` makes one.
 
     Raises:
-        RunFolderError: there is none, or another version wrote it.
+        RunFolderError: there is none, it is no store, or another version wrote it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -260,6 +262,11 @@ class ResultStore:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
             connection.execute("COMMIT")
+        except sqlite3.OperationalError as error:
+            raise RunFolderError(
+                f"{self._path} cannot be read or written ({error}); expected a store of results on a disk with room "
+                "and file locks"
+            ) from error
         finally:
             connection.close()  # rolls back what was not committed
 

@@ -204,6 +204,23 @@ def test_a_store_of_another_version(tmp_path: Path) -> None:
         ResultStore(tmp_path / "none.sqlite")
 
 
+def test_a_store_without_its_tables_or_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "results.sqlite"
+    sqlite3.connect(path).close()
+    path.touch()
+    with pytest.raises(RunFolderError, match=r"cannot be read or written \(no such table"):
+        ResultStore(path)
+    path.unlink()
+    store = ResultStore.create(path)
+    monkeypatch.setattr(store_module, "PATIENCE", 0.1)
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(RunFolderError, match="database is locked"):
+        store.claim([])
+    other.close()
+    assert store.claim([]) is None
+
+
 def test_many_processes_make_one_store(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "results.sqlite"
     code = "import sys; from pathlib import Path; from lapgs_plugin.experiments.store import ResultStore; "
