@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import weakref
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -166,22 +167,27 @@ class GsplatRasterizer:
             eps2d=PIXEL_VARIANCE,
             radius_clip=0.0,
             packed=self._packed,
-            backgrounds=background.to(means).expand(len(cameras), 3),
+            # 1.5.3 refuses every background where it packs.
+            backgrounds=None if self._packed else background.to(means).expand(len(cameras), 3),
             rasterize_mode=self._mode,
             absgrad=absgrad,
         )
-        return found
+        images, alphas, info = found
+        return images + (1 - alphas) * background.to(means) if self._packed else images, alphas, info
 
     def _describe(self, found: dict[str, Any], means2d: Tensor) -> Tensor:
         """Fill in `means2d` (n, 2) and return the radii (n,) from what gsplat found."""
         rows = found["gaussian_ids"] if self._packed else slice(None)
-        centres, theirs, conics = (
-            found[name] if self._packed else found[name][0] for name in ("means2d", "radii", "conics")
-        )  # (v, 2), (v, 2), (v, 3)
+
+        def of(name: str) -> Tensor:
+            values: Tensor = found[name]
+            return values if self._packed else values[0]  # (v, ...)
+
+        theirs = of("radii")  # (v, 2)
         shown = (theirs > 0).all(-1)  # (v,)
         # What gsplat leaves for culled Gaussians is memory as it was; its pixels have their centre at 0.5.
-        means2d[rows] = torch.where(shown[:, None], centres - 0.5, 0.0)
-        found_radii = theirs.amax(-1) if self._own_radii else _three_sigma_radii(conics)
+        means2d[rows] = torch.where(shown[:, None], of("means2d") - 0.5, 0.0)
+        found_radii = theirs.amax(-1) if self._own_radii else _three_sigma_radii(of("conics"))
         radii = torch.zeros(len(means2d), dtype=torch.int32, device=means2d.device)  # (n,)
         radii[rows] = torch.where(shown, found_radii, 0).to(torch.int32)
         return radii
@@ -232,16 +238,26 @@ def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tens
     """Let the backward pass leave what it finds for gsplat's centres, (1, n, 2) or packed (v, 2), in our (n, 2)."""
     theirs: Any = found["means2d"]
     ids: Tensor | None = found["gaussian_ids"] if theirs.ndim == 2 else None  # (v,)
-
-    def unpacked(values: Tensor) -> Tensor:
-        if ids is None:
-            return values[0]
-        return torch.zeros_like(means2d).index_copy_(0, ids, values)
+    # The backward pass leaves absolute gradients with the tensor that gsplat made, which has to live as long as ours.
+    ours: Any = means2d
+    ours.found = theirs
+    # A hook that held one of them would hold itself, and with it everything that a backward pass needs: on bonsai
+    # 93 GB had gathered before Python looked for such circles.
+    weak_theirs, weak_ours = weakref.ref(theirs), weakref.ref(means2d)
 
     def hand_over(gradient: Tensor) -> None:
-        means2d.grad = unpacked(gradient).clone()
+        centres, held = weak_theirs(), weak_ours()
+        if centres is None or held is None:
+            return  # nobody has kept what they would be handed to
+
+        def unpacked(values: Tensor) -> Tensor:
+            if ids is None:
+                return values[0]
+            return torch.zeros_like(held).index_copy_(0, ids, values)
+
+        held.grad = unpacked(gradient).clone()
         if absgrad2d is not None:
-            absgrad2d.copy_(unpacked(theirs.absgrad))
+            absgrad2d.copy_(unpacked(centres.absgrad))
 
     theirs.register_hook(hand_over)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -383,3 +385,19 @@ def test_gsplat_without_gaussians_shows_the_background(without_cuda: WithoutCuda
     assert without_cuda.asked == {}
     with pytest.raises(UserInputError, match=r"means is torch\.float64 on cpu, expected float32 on cpu"):
         case.to(torch.float64).render(GsplatRasterizer("cpu"))
+
+
+def test_what_a_backward_pass_needed_is_let_go_at_once(without_cuda: WithoutCuda) -> None:
+    """Not when Python next looks for circles of references: it sees small objects, not gigabytes behind them."""
+    case = faint(False).with_leaves()
+    gc.collect()
+    gc.disable()
+    try:
+        result = GsplatRasterizer("cpu", absgrad=False)(case.field, case.camera, background=torch.zeros(3))
+        centres = weakref.ref(result.means2d.found)  # type: ignore[attr-defined]  # where gsplat leaves its gradients
+        result.image.sum().backward()
+        assert result.means2d.grad is not None
+        del result
+        assert centres() is None
+    finally:
+        gc.enable()
