@@ -53,9 +53,7 @@ class CpuRasterizer:
         degree = field.sh_degree if sh_degree is None else sh_degree
         _check(field, background, degree)
         kind = field.means.dtype
-        pose = camera.world_to_camera.detach().to("cpu", kind).numpy()
-        focal, principal = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        view = pipeline.make_view(camera.width, camera.height, pose, focal, principal)
+        view = _view(camera, kind)
         background = background.to(kind)
 
         n = len(field)
@@ -69,6 +67,20 @@ class CpuRasterizer:
             call, background, means2d, *parameters
         )
         return RenderResult(image, transmittance, radii, means2d, absgrad2d)
+
+    @torch.no_grad()
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        """Images alone; see `lapgs_plugin.raster.ImageRasterizer`.
+
+        Raises:
+            UserInputError: as a call.
+        """
+        _check(field, background, field.sh_degree)
+        kind = field.means.dtype
+        gaussians = _gaussians(list(field.parameters.values()), field.signed, field.sh_degree)
+        color = background.to(kind).contiguous().numpy()
+        images = [pipeline.render(gaussians, _view(camera, kind), color, keep=False).image for camera in cameras]
+        return torch.from_numpy(images[0][None] if len(images) == 1 else np.stack(images))
 
 
 @dataclass(frozen=True)
@@ -89,8 +101,7 @@ class _Call:
 
     def gaussians(self, parameters: Sequence[Tensor]) -> Gaussians:
         """The field's parameters, in its order, as arrays."""
-        means, quats, log_scales, logits, sh = (p.detach().contiguous().numpy() for p in parameters)
-        return Gaussians(means, quats, log_scales, logits, sh, None, True, self.signed, self.sh_degree)
+        return _gaussians(parameters, self.signed, self.sh_degree)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -130,6 +141,16 @@ class _Rasterize(torch.autograd.Function):
             by_background = torch.from_numpy(grad_image.reshape(3, -1) @ weights)
         arrays = (found.centres, found.means, found.quats, found.scales, found.opacities, found.sh)
         return None, by_background, *(None if a is None else torch.from_numpy(a) for a in arrays)
+
+
+def _view(camera: Camera, kind: torch.dtype) -> View:
+    pose = camera.world_to_camera.detach().to("cpu", kind).numpy()
+    return pipeline.make_view(camera.width, camera.height, pose, (camera.fx, camera.fy), (camera.cx, camera.cy))
+
+
+def _gaussians(parameters: Sequence[Tensor], signed: bool, sh_degree: int) -> Gaussians:
+    means, quats, log_scales, logits, sh = (p.detach().contiguous().numpy() for p in parameters)
+    return Gaussians(means, quats, log_scales, logits, sh, None, True, signed, sh_degree)
 
 
 def _zeros(rows: int, columns: int, kind: type[np.floating[Any]]) -> Floats:

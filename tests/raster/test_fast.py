@@ -338,3 +338,17 @@ def test_without_gradients_the_image_has_the_same_bits(name: str, dtype: torch.d
     assert torch.equal(quiet.image, loud.image)
     assert torch.equal(quiet.transmittance, loud.transmittance)
     assert torch.equal(quiet.radii, loud.radii)
+
+
+def test_images_alone_have_the_same_bits() -> None:
+    case = scenes.random_case(60, 45, 37, seed=5, sh_degree=2).to(torch.float32)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    cameras = [case.camera, replace(case.camera, fx=1.2 * case.camera.fx)]
+    images = CPU.render_images(case.field, cameras, background=background)
+    assert images.shape == (2, 3, 37, 45)
+    for image, camera in zip(images, cameras, strict=True):
+        assert torch.equal(image, CPU(case.field, camera, background=background).image)
+    (alone,) = CPU.render_images(case.field, cameras[:1], background=background)
+    assert torch.equal(alone, images[0])
+    with pytest.raises(UserInputError, match="background"):
+        CPU.render_images(case.field, cameras, background=torch.zeros(4))
