@@ -55,9 +55,8 @@ def test_delays_land_in_their_parts(scene: Path, tmp_path: Path, name: str) -> N
         }
         for part in PARTS:
             own = parts[part] - slept.get(part, 0.0)
+            # As they add up to the whole, a sleep told of another part would be missing here.
             assert own > 0 or (part, slept.get(part)) == ("densification", 0.0), part
-            # Densification renders every view for scores. The others' own work: 15 ms an iteration seen at most.
-            assert part == "densification" or own < 0.04 * record.iterations, part
 
 
 def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None:
@@ -83,7 +82,9 @@ def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None
         handles[0].remove()
     assert len(taken) >= 18
     optimizer = sum(record.breakdown_seconds["optimizer"] for record in archive.manifest.records)
-    assert STEP * len(taken) <= optimizer < (STEP + 0.02) * len(taken)
+    assert optimizer >= STEP * len(taken)
+    whole = sum(record.train_seconds for record in archive.manifest.records)
+    assert sum(sum(r.breakdown_seconds.values()) for r in archive.manifest.records) == pytest.approx(whole, rel=0.03)
 
 
 def test_without_the_option_nothing_of_it_is_there(scene: Path, tmp_path: Path) -> None:

@@ -82,9 +82,9 @@ def test_delays_land_in_their_parts_and_all_parts_are_the_whole(
         assert tuple(parts) == PARTS
         assert math.fsum(parts.values()) == pytest.approx(record.train_seconds, rel=0.02)  # 0.1 % seen
         for part, delay in DELAYS.items():
-            # At least what was asked for; 2 ms an iteration more than it were seen beside other work.
-            assert delay <= parts[part] / record.iterations < delay + 0.01, part
-        assert 0 < parts["densification"] / record.iterations < 0.01
+            # As they add up to the whole, a delay told of another part would be missing here.
+            assert parts[part] >= delay * record.iterations, part
+        assert parts["densification"] > 0
 
 
 def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:

@@ -127,7 +127,8 @@ def test_parts_of_known_sleeps() -> None:
     expected = {"forward": 0.05, "loss": 0.01, "backward": 0.06, "densification": 0.04, "optimizer": 0.0, "other": 0.0}
     assert sum(found.values()) == pytest.approx(total, abs=2e-3)  # 0.1 ms seen
     for part, seconds in expected.items():
-        assert seconds <= found[part] < seconds + 0.03, part  # sleeps last at least as long as asked for; 1 ms seen
+        assert seconds <= found[part], part  # sleeps last at least as long as asked for
+    assert found["optimizer"] == found["other"] == 0.0
 
 
 def test_what_was_measured_before_is_continued() -> None:
