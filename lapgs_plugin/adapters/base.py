@@ -44,6 +44,16 @@ PARAMETERS: dict[str, Callable[[GaussianField], Tensor]] = {
 }
 """Attributes of the family's GaussianModel that hold parameters, and what they are of a GaussianField."""
 
+GROUPS = {
+    "xyz": "_xyz",
+    "f_dc": "_features_dc",
+    "f_rest": "_features_rest",
+    "opacity": "_opacity",
+    "scaling": "_scaling",
+    "rotation": "_rotation",
+}
+"""The same attributes by the names of their groups in the family's optimizers."""
+
 
 @dataclass(frozen=True)
 class BackboneInfo:

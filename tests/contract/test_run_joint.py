@@ -52,8 +52,10 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 ) -> None:
     """The checkout's own report is of the composed hierarchy as it was at the last iteration."""
     before = FieldsAt(tmp_path / "run")
-    more = ("--test_iterations", ITERATIONS) if name != "fastgs" else ()
-    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.5)
+    more: tuple[Any, ...] = ("--test_iterations", ITERATIONS) if name != "fastgs" else ()
+    if name == "taming":
+        more += ("--ho_iteration", 40)  # before: its optimizer then holds opacities that its model has no longer
+    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.3)
     after = archive.field(1).parameters
     assert before.fields.keys() == {1}
     for part, value in before.fields[1].items():
