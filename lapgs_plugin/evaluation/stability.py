@@ -153,7 +153,7 @@ def path_frames(
         images[COMPOSITION] = images[COMPOSITION].clamp(0.0, 1.0)
         if single is not None:
             images[SINGLE] = single.render(camera).composed[0].to(images[COMPOSITION]).clamp(0.0, 1.0)
-        depth = render_depth(surface.rasterizer, surface.fields[surface.levels - 1], camera)
+        depth = render_depth(surface.rasterizer, surface.field(surface.levels - 1), camera)
         yield Frame(camera, depth, images)
 
 

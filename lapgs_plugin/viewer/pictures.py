@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import Rasterizer, RenderResult
+from lapgs_plugin.raster import Rasterizer, RenderResult, render_images
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.rig import Rig
@@ -34,13 +34,17 @@ class Stopwatch:
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """As `Rasterizer`."""
+        """As `Rasterizer`, not timed."""
+        return self._rasterizer(field, camera, background=background, sh_degree=sh_degree)
+
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        """As `ImageRasterizer`."""
         begin = time.perf_counter()
-        result = self._rasterizer(field, camera, background=background, sh_degree=sh_degree)
-        if result.image.is_cuda:
-            torch.cuda.synchronize(result.image.device)
+        images = render_images(self._rasterizer, field, cameras, background)
+        if images.is_cuda:
+            torch.cuda.synchronize(images.device)
         self.laps.append((field, 1e3 * (time.perf_counter() - begin)))
-        return result
+        return images
 
 
 @dataclass(frozen=True)
