@@ -6,6 +6,8 @@ import importlib.util
 import re
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -102,3 +104,9 @@ def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_folder_that_is_no_run_is_refused_before_anything_is_served(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r"nowhere does not exist, so it is not a run"):
         lapgs_view(tmp_path / "nowhere")
+
+
+def test_the_page_is_served_without_torch() -> None:
+    """A browser loads it while the process still imports what draws."""
+    code = "import sys; import lapgs_plugin.viewer.page, lapgs_plugin.cli.view; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
