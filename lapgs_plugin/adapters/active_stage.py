@@ -73,6 +73,7 @@ class ActiveStage:
         self._excluded = 0.0  # seconds since `_began` that are not optimization
         self._iteration = self._peak = 0
         self._gaussian_steps = 0  # Gaussians, summed over the iterations
+        self._trained_along = 0  # Gaussians of finished fields, while these learn as well
         self._gaussians: Any = None
         self._kept: Tensor | None = None  # which Gaussians of the level before are inherited
         self._views: dict[str, Any] = {}
@@ -143,7 +144,7 @@ class ActiveStage:
         if iteration == self._joint_from:
             self._train_jointly(gaussians)
         self._iteration = iteration
-        count = len(gaussians._xyz)
+        count = len(gaussians._xyz) + self._trained_along
         self._peak = max(self._peak, count)
         self._gaussian_steps += count
         if self._hooks:
@@ -159,6 +160,7 @@ class ActiveStage:
         """From now on the finished fields learn as well."""
         self._joint = JointLevels(self._context, self._finished, self._archive, self._images, self._path)
         self._joint.follow(gaussians, self._options.residual_color_rate)
+        self._trained_along = sum(record.num_gaussians for record in self._archive.manifest.records)
         self._rendering.accumulated = self._joint
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:

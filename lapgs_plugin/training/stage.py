@@ -127,6 +127,12 @@ class StageRun:
             self._note_loss(loss, self.progress.iteration - back)
 
     @property
+    def num_optimized(self) -> int:
+        """Gaussians under training: the stage's own, and those of finished fields that are trained along."""
+        along = () if self.joint is None else self.joint.models.values()
+        return len(self.model) + sum(len(model) for model in along)
+
+    @property
     def _device(self) -> torch.device:
         return self.background.device
 
@@ -151,7 +157,7 @@ class StageRun:
         )
         self._announce_next(iteration)
         degree = self.schedule.active_sh_degree(iteration)
-        self.progress.gaussian_steps += len(self.model)
+        self.progress.gaussian_steps += self.num_optimized
         self.hooks.before_render(context)
         self.breakdown.mark("forward")
         result = self.rasterizer(self.model.field, view.camera, background=self.background, sh_degree=degree)
@@ -198,7 +204,7 @@ class StageRun:
     def _densify(self, context: StageContext, result: RenderResult, view: LevelView) -> None:
         if self.densifier.after_step(self.model, context.iteration, result, view.camera):
             self.hooks.on_densify(context)
-        self.progress.peak_gaussians = max(self.progress.peak_gaussians, len(self.model))
+        self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
     def _keep_loss(self, loss: Tensor, iteration: int) -> None:
         """On a CPU read it at once, before a loss that is not finite does harm."""

@@ -315,7 +315,7 @@ class Trainer:
             iteration=progress.iteration,
             elapsed=finished + progress.seconds,
             loss=progress.loss,
-            num_gaussians=len(run.model),
+            num_gaussians=run.num_optimized,
             rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
             psnr=psnr,
         )

@@ -87,6 +87,14 @@ def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None
     assert sum(sum(r.breakdown_seconds.values()) for r in archive.manifest.records) == pytest.approx(whole, rel=0.03)
 
 
+def test_fields_that_are_trained_along_count(scene: Path, tmp_path: Path) -> None:
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, joint=0.5)
+    base, residual = archive.manifest.records
+    assert residual.peak_gaussians >= base.num_gaussians + residual.num_gaussians
+    apart, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "apart", *TINY, joint=0.0)
+    assert apart.manifest.record(0).peak_gaussians < base.num_gaussians + residual.num_gaussians
+
+
 def test_without_the_option_nothing_of_it_is_there(scene: Path, tmp_path: Path) -> None:
     class Looking(StageHook):
         seen: Any = None

@@ -26,7 +26,7 @@ from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
-    iterations=30, sh_degree=0, densification=Densification(start=3, until=25, every=5, reset_every=100)
+    iterations=30, sh_degree=0, joint=0.0, densification=Densification(start=3, until=25, every=5, reset_every=100)
 )
 DELAYS = {"forward": 0.004, "loss": 0.002, "backward": 0.006, "other": 0.003, "optimizer": 0.005}
 """Seconds that every iteration spends in a part on top of its work, which takes about 1 ms in all."""
@@ -117,6 +117,20 @@ def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
         else:
             assert record.breakdown_seconds == {}
             assert "level 0 was begun without --breakdown" in said[0]
+
+
+def test_fields_that_are_trained_along_count(tmp_path: Path) -> None:
+    settings = replace(SETTINGS, joint=0.5)
+    with make_archive(tmp_path / "run", settings) as archive:
+        Trainer(ring_scene(), settings, archive, CpuRasterizer()).run()
+    archive = RunArchive.open(tmp_path / "run")
+    base, residual = archive.manifest.records
+    counts = [entry["num_gaussians"] for entry in archive.history() if entry["level"] == 0]
+    half = residual.iterations // 2
+    assert counts[-1] == residual.num_gaussians + base.num_gaussians
+    assert residual.peak_gaussians == max(counts)
+    assert counts[half] - counts[half - 2] >= base.num_gaussians  # they join in between
+    assert max(counts[: half - 1]) < base.num_gaussians + residual.num_gaussians
 
 
 def test_measuring_changes_no_bit(tmp_path: Path) -> None:
