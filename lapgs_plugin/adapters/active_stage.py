@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from lapgs_plugin.adapters.shim import StageRendering
 from lapgs_plugin.adapters.stage_images import StageImages
 from lapgs_plugin.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.inheritance import inherit
@@ -324,13 +323,13 @@ class ActiveStage:
 
     @torch.no_grad()
     def _report_held_out(self, gaussians: Any) -> None:
-        values = []
-        for camera in self._images.test:
-            image = self._composed(gaussians, camera).clamp(0, 1)
-            values.append(psnr(image, self._images.targets.get(self._images.key(camera))))
-        mean = math.fsum(values) / len(values)
-        self._archive.append_history({"level": self.stage.level, "iteration": self.stage.iterations, "psnr": mean})
-        logger.info("held-out PSNR of the composed hierarchy: %.2f dB over %d views", mean, len(values))
+        cameras = self._images.test
+        means = mean_quality(
+            (self._composed(gaussians, camera), self._images.targets.get(self._images.key(camera)))
+            for camera in cameras
+        )
+        self._archive.append_history({"level": self.stage.level, "iteration": self.stage.iterations, **means})
+        logger.info("held-out PSNR of the composed hierarchy: %.2f dB over %d views", means["psnr"], len(cameras))
 
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) I_hat^l of a view, before exposure and clamping."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import sys
 import time
 from collections.abc import Callable
@@ -18,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lapgs_plugin.adapters.attachment import Attachment, Replacement
 from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
 
 logger = logging.getLogger(__name__)
@@ -142,29 +142,31 @@ class Witness:
             "peak_gaussians": max(self._peak, len(gaussians._xyz)),
             "mean_gaussians": self._summed / self._iteration,
             "memory_bytes": self._memory,
-            "psnr": self._held_out_psnr(gaussians),
+            **self._held_out(gaussians),
             "timeline": self._timeline,
         }
 
     @torch.no_grad()
-    def _held_out_psnr(self, gaussians: Any) -> float | None:
-        """Mean PSNR in dB over the held-out views, None without any."""
+    def _held_out(self, gaussians: Any) -> dict[str, float]:
+        """Means of PSNR in dB and SSIM over the held-out views, empty without any."""
         assert self._call is not None, "called after training"
         cameras = list(self._scene.getTestCameras())
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
-        images: list[Any] = []
+        images: list[Tensor] = []
 
         def keeping(original: Callable[..., Any]) -> Callable[..., Any]:
             return lambda raster_settings: _Keeping(original(raster_settings=raster_settings), images)
 
         renderer = sys.modules["gaussian_renderer"]
-        values = []
         with Attachment([Replacement(renderer, "GaussianRasterizer", keeping, None, "render()")]):
-            for camera in cameras:
-                self._adapter.render(self._call, camera, gaussians, background)
-                image = images.pop()
-                values.append(psnr(image, camera.original_image.to(image.device)))
-        return math.fsum(values) / len(values) if values else None
+            return mean_quality(self._rendered(camera, gaussians, background, images) for camera in cameras)
+
+    def _rendered(self, camera: Any, gaussians: Any, background: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """A view as its rasterizer, which puts it into `images`, makes it, and its photo; (3, h, w) each."""
+        assert self._call is not None, "called after training"
+        self._adapter.render(self._call, camera, gaussians, background)
+        image = images.pop()
+        return image, camera.original_image.to(image.device)
 
     def _image_bytes(self) -> int:
         """Of the photos that lie on the GPU."""
@@ -180,7 +182,7 @@ class Witness:
 class _Keeping:
     """A rasterizer of the checkout for one view, whose image is kept."""
 
-    def __init__(self, original: Any, images: list[Any]) -> None:
+    def __init__(self, original: Any, images: list[Tensor]) -> None:
         self._original, self._images = original, images
 
     def __getattr__(self, name: str) -> Any:

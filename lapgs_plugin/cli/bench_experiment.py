@@ -92,7 +92,7 @@ def bench_experiment(
         bool,
         typer.Option(
             "--eval/--no-eval",
-            help="Measure every run with `lapgs eval`; without, the PSNR that training noted at its end is taken.",
+            help="Measure every run with `lapgs eval`; without, what training noted of its images at its end is taken.",
         ),
     ] = True,
     lpips_weights: Annotated[
@@ -188,7 +188,7 @@ def _require_measuring() -> None:
     if missing:
         raise UserInputError(
             f"{' and '.join(missing)} cannot be imported here, which `lapgs eval` reads scenes with; give --no-eval to "
-            "take the PSNR that training notes"
+            "take what training notes of its images"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -37,3 +38,14 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
         return float(ssim_cpu(image, target))
     return float(supervision.ssim(image, target))
+
+
+def mean_quality(pairs: Iterable[tuple[Tensor, Tensor]]) -> dict[str, float]:
+    """Means over images of "psnr" in dB and "ssim"; empty without an image.
+
+    Args:
+        pairs: image and target of each, as `psnr` and `ssim` take them.
+    """
+    measured = [{"psnr": psnr(image, target), "ssim": ssim(image, target)} for image, target in pairs]
+    names = measured[0] if measured else {}
+    return {name: math.fsum(each[name] for each in measured) / len(measured) for name in names}

@@ -27,6 +27,8 @@ from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
 
+NOTED = ("psnr", "ssim")
+"""What training itself notes of its images."""
 EVALUATED, RECORDED = "lapgs eval", "training"
 
 
@@ -62,8 +64,8 @@ def _identity(spec: RunSpec, run_id: str) -> dict[str, Any]:
 def _image_figures(archive: RunArchive, evaluate: bool) -> dict[str, Any]:
     """How good its images are."""
     if not evaluate:
-        recorded = [entry["psnr"] for entry in archive.history() if entry.get("psnr") is not None]
-        return {"psnr": recorded[-1]} if recorded else {}
+        noted = [entry for entry in archive.history() if entry.get("psnr") is not None]
+        return {name: noted[-1][name] for name in NOTED if name in noted[-1]} if noted else {}
     metrics = archive.metrics()
     if metrics is None:
         raise RunFolderError(f"{archive.path()} has no metrics.json, though `lapgs eval` ended well; run it again")
@@ -112,8 +114,7 @@ def _bare_figures(folder: Path) -> dict[str, Any]:
         "gaussians_level_0": count,
         **{name: values[name] for name in ("peak_gaussians", "mean_gaussians")},
     }
-    if values["psnr"] is not None:
-        row["psnr"] = values["psnr"]
+    row |= {name: values[name] for name in NOTED if name in values}
     if memory := values["memory_bytes"]:
         row["peak_memory_bytes"] = memory["peak"]
         row["peak_memory_without_images_bytes"] = memory["peak"] - memory["images"]

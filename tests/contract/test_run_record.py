@@ -67,7 +67,9 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
     assert level.overhead_seconds["saving"] == values["saving_seconds"]
     assert len(archive.history()) == ITERATIONS
     # The script's own render against our rasterizer over the saved field: rounding alone, worst seen 7e-8 dB.
-    assert evaluate_run(archive)["psnr"] == pytest.approx(values["psnr"], abs=1e-4)
+    measured = evaluate_run(archive)
+    assert measured["psnr"] == pytest.approx(values["psnr"], abs=1e-4)
+    assert measured["ssim"] == pytest.approx(values["ssim"], abs=1e-5)
 
 
 def test_record_without_off(scene: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.evaluation.metrics import psnr, ssim
+from lapgs_plugin.evaluation.metrics import mean_quality, psnr, ssim
 
 
 @given(offset=st.floats(1e-3, 0.4), low=st.floats(0.0, 0.6))
@@ -63,3 +63,12 @@ def test_ssim_agrees_with_opencv() -> None:
 def test_ssim_of_an_image_with_itself_is_one() -> None:
     image = torch.rand(3, 20, 30)
     assert ssim(image, image) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_means_over_images_are_of_each_images_own_figures() -> None:
+    generator = torch.Generator().manual_seed(2)
+    pairs = [(torch.rand(3, 20, 30, generator=generator), torch.rand(3, 20, 30, generator=generator)) for _ in range(3)]
+    means = mean_quality(iter(pairs))
+    assert means["psnr"] == pytest.approx(sum(psnr(*pair) for pair in pairs) / 3)
+    assert means["ssim"] == pytest.approx(sum(ssim(*pair) for pair in pairs) / 3)
+    assert mean_quality([]) == {}
