@@ -44,12 +44,12 @@ def blob_field(count: int = 300, seed: int = 0) -> GaussianField:
     )
 
 
-def ring_scene(train: int = 6, test: int = 2) -> Scene:
+def ring_scene(train: int = 6, test: int = 2, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Scene:
     field = blob_field()
     count = train + test
     views = []
     for i in range(count):
-        camera = ring_camera(2 * math.pi * i / count)
+        camera = ring_camera(2 * math.pi * i / count, *size)
         with torch.no_grad():
             image = CpuRasterizer()(field, camera, background=torch.zeros(3)).image
         views.append(View(f"view_{i}.png", camera, image.clamp(0, 1)))

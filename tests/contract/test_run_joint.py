@@ -63,7 +63,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
         assert not torch.equal(after[part], value), part
     if name != "fastgs":  # it reports no held-out views
         (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
-        assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 4e-5 seen
+        assert composed_psnr(archive) == pytest.approx(reported, abs=1e-4)  # 5e-7 seen
 
 
 @pytest.mark.parametrize("options", [{"joint": 0.0}, {"supervision": "online_residual"}, {"joint": 0.001}])
@@ -114,7 +114,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
     inspected = Inspected(monkeypatch, differences)
     run_hierarchy(STUBS["graphdeco"], odd, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
     assert [len(found) for found in inspected.results] == [3, 3], "two residual stages"
-    assert max(max(found) for found in inspected.results) < 2e-5  # 1.6e-6 seen
+    assert max(max(found) for found in inspected.results) < 5e-6  # 1.8e-7 seen
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -146,7 +146,7 @@ def test_gradients_reach_every_finished_field(
     options = ("--iterations", 60) if name == "taming" else ("--iterations", 12)
     run_hierarchy(STUBS[name], odd, tmp_path / "run", *options, levels=3, joint=0.5)
     assert [len(errors) for errors in inspected.results] == [1, 2]
-    assert max(max(errors) for errors in inspected.results) < 0.02  # 3e-3 seen: dark colours of the base are clamped
+    assert max(max(errors) for errors in inspected.results) < 2e-3  # 1.9e-4 seen: dark colours of the base are clamped
 
 
 def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,7 +179,7 @@ def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> No
         views = load_scene(scene, eval=True, progress=False).train
         squares = [(renderer.render(view.camera).composed[0] - view.image).square().mean() for view in views]
         errors[share] = float(torch.stack(squares).mean())
-    assert errors[0.5] < 0.97 * errors[0.0]  # 0.8 seen
+    assert errors[0.5] < 0.97 * errors[0.0]  # 0.80 seen
 
 
 def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_path: Path) -> None:

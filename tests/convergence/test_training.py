@@ -95,12 +95,12 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(scene: Scen
 
 @pytest.fixture(scope="module", params=["geometry", "full"])
 def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
-    """An uninterrupted run."""
+    """An uninterrupted run; from iteration 23 of level 0 on the base is trained along."""
     settings = replace(SETTINGS, inherit=request.param)
     return train(tmp_path_factory.mktemp("whole") / "run", scene, settings)
 
 
-@pytest.mark.parametrize(("level", "iteration"), [(1, 7), (1, 20), (0, 1), (0, 23)])
+@pytest.mark.parametrize(("level", "iteration"), [(1, 7), (1, 20), (0, 1), (0, 22), (0, 27)])
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     scene: Scene, tmp_path: Path, whole: RunArchive, level: int, iteration: int
 ) -> None:
@@ -114,6 +114,33 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
         assert plys(archive) == plys(whole)
         places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
+
+
+@pytest.mark.parametrize("levels", [2, 3])
+def test_finished_fields_trained_along_match_the_photos_better(levels: int, tmp_path: Path) -> None:
+    """And what the run measured of held-out views at its end is what the archive renders."""
+    scene = ring_scene(size=(96, 64))
+    calm = Densification(start=20, until=100, every=20, reset_every=10_000)
+    fits, fields = {}, {}
+    for share in (0.0, 0.5):
+        settings = replace(SETTINGS, levels=levels, iterations=240, densification=calm, joint=share)
+        archive = train(tmp_path / str(share), scene, settings)
+        renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
+        fits[share], held_out = (
+            math.fsum(psnr(renderer.render(view.camera).composed[0], view.image) for view in views) / len(views)
+            for views in (scene.train, scene.test)
+        )
+        assert archive.history()[-1]["psnr"] == pytest.approx(held_out, abs=1e-5)  # 2e-8 seen
+        fields[share] = archive.field(levels - 1)
+    assert fits[0.5] > fits[0.0] + 0.1  # 0.30 and 0.23 dB
+    assert len(fields[0.5]) == len(fields[0.0])
+    assert not torch.equal(fields[0.5].means, fields[0.0].means)
+
+
+def test_residuals_supervised_alone_leave_finished_fields_alone(scene: Scene, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, supervision="online_residual")
+    with_share = train(tmp_path / "a", scene, settings)
+    assert plys(with_share) == plys(train(tmp_path / "b", scene, replace(settings, joint=0.0)))
 
 
 def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_path: Path) -> None:
