@@ -238,7 +238,7 @@ def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
     parts = [f"{' and '.join(f'{count:,}' for count in iterations)} iterations"]
     machines = sorted({str(row.get("gpu") or row.get("processor") or "an unknown machine") for _, row in found})
     parts.append(" and ".join(machines))
-    for words, name in (("torch", "torch"), ("lapgs_plugin", "lapgs_version"), ("images by", "measured_by")):
+    for words, name in (("torch", "torch"), ("lapgs_plugin", "lapgs_version"), ("images measured by", "measured_by")):
         if values := sorted({str(row[name]) for _, row in found if row.get(name)}):
             parts.append(f"{words} {' and '.join(values)}")
     return ", ".join(parts)
