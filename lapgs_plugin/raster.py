@@ -80,7 +80,10 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class ImageRasterizer(Protocol):
-    """A rasterizer that can leave out what training alone looks at, and render several views in one go."""
+    """A rasterizer that can leave out what training alone looks at, and render several views in one go.
+
+    On a GPU all its work goes to PyTorch's current stream, so that fields can be rendered beside each other.
+    """
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         """Images (b, 3, height, width) of b cameras of one size, as `Rasterizer` renders them one by one."""

@@ -17,7 +17,7 @@ from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, UserInputErro
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer, render_images
+from lapgs_plugin.raster import ImageRasterizer, Rasterizer, render_images
 from lapgs_plugin.rendering.raising import add_raised
 from lapgs_plugin.rendering.residence import Residence
 
@@ -88,7 +88,8 @@ class HierarchyRenderer:
         background: RGB behind the base. Residuals are always rendered over zero.
         clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
             paper authors' release does in training and rendering.
-        concurrent: on a GPU, let fields be rendered beside each other instead of one after the other.
+        concurrent: on a GPU, let fields be rendered beside each other instead of one after the other, where the
+            rasterizer can. The extensions of 3DGS codebases cannot: their kernels all go to one stream of their own.
         residence: brings fields to the device when they are needed; None where they are there.
 
     Raises:
@@ -296,10 +297,15 @@ class HierarchyRenderer:
                 )
         return gains or {}
 
+    @property
+    def can_be_concurrent(self) -> bool:
+        """Whether there are fields that can be rendered beside each other."""
+        return self.device.type == "cuda" and len(self.fields) > 1 and isinstance(self.rasterizer, ImageRasterizer)
+
     @cached_property
     def _streams(self) -> dict[int, torch.cuda.Stream]:
         """By level; none where fields are rendered one after the other."""
-        if not self.concurrent or self.device.type != "cuda" or len(self.fields) == 1:
+        if not self.concurrent or not self.can_be_concurrent:
             return {}
         torch.cuda.synchronize(self.device)  # the fields are complete: no stream has to wait for them later
         # Coarser levels go first wherever the finer ones, which fill the GPU, leave room.

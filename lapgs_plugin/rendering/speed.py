@@ -99,7 +99,7 @@ def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> It
     for finest in range(level, coarsest):
         fields, what = range(finest, renderer.levels), f"levels {coarsest} to {finest}"
         yield _Kind(f"{what}, one after the other", _composing(in_turn, finest), fields, finest)
-        if renderer.device.type == "cuda":
+        if renderer.can_be_concurrent:
             together = replace(renderer, concurrent=True)
             yield _Kind(f"{what}, beside each other", _composing(together, finest), fields, finest)
     if batches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, replace
 from typing import Any
@@ -250,6 +250,13 @@ def test_the_level_of_detail_is_the_coarsest_that_is_not_smaller(size: tuple[int
     assert HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer()).level_for_size(CAMERA, size) == max(level, 1)
 
 
+class ConstantImages(Constant):
+    """The same of a rasterizer that works in the current stream."""
+
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        return torch.stack([self(field, camera, background=background).image for camera in cameras])
+
+
 class Streams:
     """What `torch.cuda` offers for streams, writing down who waits for whom and who uses what."""
 
@@ -280,7 +287,7 @@ class Stream:
 
 def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pytest.MonkeyPatch) -> None:
     fields = {2: constant_field(0.4, False), 1: constant_field(-0.25, True), 0: constant_field(0.125, True)}
-    rasterizer, streams = Constant(), Streams()
+    rasterizer, streams = ConstantImages(), Streams()
     renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
     expected = renderer.render(CAMERA)
     monkeypatch.setattr(HierarchyRenderer, "device", torch.device("cuda"))
@@ -304,4 +311,5 @@ def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pyte
     assert streams.log == first[4:]  # not one wait of the processor
     streams.log.clear()
     replace(renderer, concurrent=False).render(CAMERA)
+    replace(renderer, rasterizer=Constant()).render(CAMERA)  # may have a stream of its own that nobody waits for
     assert streams.log == []
