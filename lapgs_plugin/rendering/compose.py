@@ -307,7 +307,9 @@ class HierarchyRenderer:
         """By level; none where fields are rendered one after the other."""
         if not self.concurrent or not self.can_be_concurrent:
             return {}
-        torch.cuda.synchronize(self.device)  # the fields are complete: no stream has to wait for them later
+        for level in self.fields:
+            self.behind(level)  # makes what all of them share
+        torch.cuda.synchronize(self.device)  # it and the fields are complete: no stream has to wait for them later
         # Coarser levels go first wherever the finer ones, which fill the GPU, leave room.
         return {
             level: torch.cuda.Stream(self.device, priority=-min(level - self.finest, 1))  # type: ignore[no-untyped-call]  # torch's
