@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import typer
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
-from lapgs_plugin.cli.report import report
 from tests.cli.run_folder import write_run, write_scene
+from tests.cli.test_report import lapgs_report
+from tests.cli.test_report_experiment import write_experiment
 from tests.headless import CHROMIUM, NO_CHROMIUM, headless_chromium
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright")
@@ -28,10 +28,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("report")
     scene = write_scene(folder / "scene")
     run, baseline = write_run(folder / "run", scene), write_run(folder / "baseline", scene, levels=1, seed=5)
-    app = typer.Typer()
-    app.command()(report)
-    result = CliRunner().invoke(app, [str(run), "--baseline", str(baseline)])
-    assert result.exit_code == 0, result.output
+    lapgs_report(run, "--baseline", baseline)
     return (run / "report.html").as_uri()
 
 
@@ -41,10 +38,23 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Of the page of an experiment."""
+    folder = write_experiment(tmp_path_factory.mktemp("experiment") / "trial")
+    lapgs_report(folder)
+    return (folder / "report.html").as_uri()
+
+
 @pytest.fixture(params=[PHONE, DESKTOP], ids=["phone", "desktop"])
-def page(request: pytest.FixtureRequest, browser: Any, address: str) -> Iterator[Any]:
-    """The page, which asked for nothing and reported no mistake by the end of the test."""
-    width, height = request.param
+def size(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@contextmanager
+def opened(browser: Any, address: str, size: tuple[int, int]) -> Iterator[Any]:
+    """A page, which asked for nothing and reported no mistake by the end of the test."""
+    width, height = size
     troubles: list[str] = []
     page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=1)
     page.on("pageerror", lambda error: troubles.append(str(error)))
@@ -56,6 +66,27 @@ def page(request: pytest.FixtureRequest, browser: Any, address: str) -> Iterator
     yield page
     assert troubles == []
     page.close()
+
+
+@pytest.fixture
+def page(browser: Any, address: str, size: tuple[int, int]) -> Iterator[Any]:
+    with opened(browser, address, size) as page:
+        yield page
+
+
+def test_an_experiment_fits_and_shows_what_it_should(browser: Any, experiment: str, size: tuple[int, int]) -> None:
+    with opened(browser, experiment, size) as page:
+        widths = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
+        assert widths[0] <= widths[1]
+        assert page.locator("#tables table").is_visible()
+        assert page.locator(".charts svg[role=img]").first.locator("line[marker-end]").count() == 4  # an arrow each
+        scenes = page.locator("details.part")
+        assert scenes.count() == 4
+        assert [scene.locator(".pair").first.is_visible() for scene in scenes.all()] == [True, False, False, False]
+        scenes.nth(2).locator("summary").first.click()
+        divider = scenes.nth(2).get_by_role("slider")
+        divider.press("End")
+        assert divider.get_attribute("aria-valuenow") == "100"
 
 
 def pixels(element: Any) -> NDArray[np.float64]:

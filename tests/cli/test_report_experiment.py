@@ -50,10 +50,8 @@ def row(scene: str, backbone: str, variant: str, seed: int) -> dict[str, Any]:
     }
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An experiment whose runs are all there; one of them without metrics."""
-    folder = tmp_path_factory.mktemp("trial") / "trial"
+def write_experiment(folder: Path) -> Path:
+    """What `lapgs bench` leaves of an experiment whose runs are all there; one of them without metrics."""
     scene = write_scene(folder / "scenes" / "striped")
     rows = [row(s, b, v, seed) for seed in SEEDS for s in SCENES for b in BACKBONES for v in VARIANTS]
     for each in rows:
@@ -64,6 +62,11 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_csv(folder / "results.csv", rows)
     write_text(folder / "tables.md", "# A trial\n\nMeans.\n\n|  | PSNR |\n| --- | --- |\n| <i>bare</i> | 27.0 |\n")
     return folder
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_experiment(tmp_path_factory.mktemp("trial") / "trial")
 
 
 @pytest.fixture
