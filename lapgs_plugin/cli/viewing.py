@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8080
 
-ViewOption = Annotated[
-    bool, typer.Option("--view", help="Watch training in a web browser, for 1.5 % of its time.")
-]
+ViewOption = Annotated[bool, typer.Option("--view", help="Watch training in a web browser, for 1.5 % of its time.")]
 ViewPortOption = Annotated[
     int | None,
     typer.Option(min=1, max=65535, help=f"Port of --view; the next free one where it is taken. Default: {PORT}."),
