@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.commands import Places, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
-from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
+from lapgs_plugin.experiments.store import DONE, FAILED, PATIENCE, Job, Outcome, ResultStore
+from lapgs_plugin.files import FolderLock, one_line_errors
 
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
 LOOK_EVERY = 0.5
@@ -65,25 +66,50 @@ def prepare(
 
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
-    """Make the sample scenes that are not there yet."""
-    for scene in scenes:
-        path = _sample(scene, folder)
-        if scene.sample is None or path.is_dir():
-            continue
-        from lapgs_plugin.scenes.sample import make_sample_scene  # needs what reads scenes
+    """Make the sample scenes that are not there yet; one process at a time.
 
-        width, _, height = scene.sample.size.partition("x")
-        if not (width.isdecimal() and height.isdecimal()):
-            raise UserInputError(f"scene {scene.name}: size {scene.sample.size!r}, expected WIDTHxHEIGHT")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        make_sample_scene(
-            path,
-            width=int(width),
-            height=int(height),
-            views=scene.sample.views,
-            points=scene.sample.points,
-            progress=True,
-        )
+    Raises:
+        UserInputError: a size is none.
+        RunFolderError: another process holds the folder and does not come to an end.
+    """
+    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample(scene, folder).is_dir()]
+    if not missing:
+        return
+    from lapgs_plugin.scenes.sample import make_sample_scene  # needs what reads scenes
+
+    place = folder.path.absolute() / SCENES
+    with one_line_errors(place):
+        place.mkdir(parents=True, exist_ok=True)
+    lock = _waited_for(place)
+    try:
+        for scene, sample in missing:
+            if _sample(scene, folder).is_dir():  # another process made it meanwhile
+                continue
+            width, _, height = sample.size.partition("x")
+            if not (width.isdecimal() and height.isdecimal()):
+                raise UserInputError(f"scene {scene.name}: size {sample.size!r}, expected WIDTHxHEIGHT")
+            make_sample_scene(
+                _sample(scene, folder),
+                width=int(width),
+                height=int(height),
+                views=sample.views,
+                points=sample.points,
+                progress=True,
+            )
+    finally:
+        lock.release()
+
+
+def _waited_for(place: Path) -> FolderLock:
+    """The lock of a folder that another process may have for a while."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return FolderLock.acquire(place)
+        except RunFolderError:
+            if time.monotonic() > end:
+                raise
+        time.sleep(LOOK_EVERY)
 
 
 def _sample(scene: SceneSpec, folder: Folder) -> Path:

@@ -19,7 +19,7 @@ import time
 import uuid
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,16 @@ class Job:
     steps: tuple[Step, ...]
     evaluate: bool
 
+    def attempt(self, number: int) -> Job:
+        """The same in a folder of its own: a worker that lost its claim may still be writing into the last one's."""
+        if number == 1:
+            return self
+        folder, log = f"{self.folder}-attempt{number}", f"{self.log.removesuffix('.log')}-attempt{number}.log"
+        steps = [
+            Step(tuple(word.replace(self.folder, folder) for word in step.command), step.cwd) for step in self.steps
+        ]
+        return replace(self, folder=folder, log=log, steps=tuple(steps))
+
     def to_json(self) -> str:
         return json.dumps(asdict(self))
 
@@ -91,7 +101,7 @@ class Claim:
     """A worker's right to one run.
 
     Attributes:
-        job: the run.
+        job: the run, in a folder of this attempt.
         owner: who has it; no two claims have the same.
         number: how often the run was claimed so far, this time included.
     """
@@ -206,7 +216,7 @@ class ResultStore:
                     "UPDATE runs SET state = ?, owner = ?, lease_until = ?, claims = ? WHERE run_id = ?",
                     (RUNNING, owner, now + LEASE, claims + 1, run_id),
                 )
-                return Claim(Job.from_json(job), owner, claims + 1)
+                return Claim(Job.from_json(job).attempt(claims + 1), owner, claims + 1)
         return None
 
     def has_free(self, run_ids: Collection[str]) -> bool:

@@ -91,7 +91,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
     job = claim.job
     folder = Path(job.folder)
-    if folder.exists():  # what an earlier attempt left
+    if folder.exists():  # what an earlier command left
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     log = Path(job.log)

@@ -38,7 +38,12 @@ def wait_until(condition: Callable[[], bool], seconds: float = 30.0) -> None:
 def starts(folder: Path) -> Counter[str]:
     """How often each run was started."""
     path = folder / "started"
-    return Counter(path.read_text().split()) if path.exists() else Counter()
+    return Counter(without_attempt(name) for name in path.read_text().split()) if path.exists() else Counter()
+
+
+def without_attempt(name: str) -> str:
+    """A run's id from the name of the folder of one of its attempts."""
+    return name.partition("-attempt")[0]
 
 
 @pytest.fixture
@@ -79,8 +84,11 @@ def test_a_killed_worker_costs_one_run_its_first_attempt(tmp_path: Path) -> None
     assert [outcome.state for outcome in store.outcomes(run_ids)] == [DONE] * len(run_ids)
     first, *others = run_ids
     assert starts(tmp_path) == {first: 2, **dict.fromkeys(others, 1)}
-    assert store.outcomes([first])[0].record is not None
-    assert (store.outcomes([first])[0].record or {})["attempt"] == 2
+    record = store.outcomes([first])[0].record
+    assert record is not None
+    assert record["attempt"] == 2
+    assert record["folder"].endswith(f"{first}-attempt2"), "not where the dead one's command was writing"
+    assert Path(record["folder"], "manifest.json").is_file()
 
 
 def test_a_worker_that_slept_through_its_lease_records_nothing(
