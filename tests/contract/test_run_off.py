@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+import typer
 
 from lapgs_plugin.adapters.script import loaded_script
 from lapgs_plugin.cli.run import run
@@ -39,8 +40,10 @@ def files(folder: Path) -> dict[str, bytes]:
 def run_off(name: str, scene: Path, folder: Path, *more: Any) -> Result:
     results: list[Result] = []
     stub = STUBS[name]
-    with forgetting_stubs(), captured(folder, results):
-        run(stub.script, arguments(stub, scene, folder, more), off=True, device="cpu")
+    app = typer.Typer()
+    app.command()(run)
+    with forgetting_stubs(), captured(folder, results), typer.Context(typer.main.get_command(app)) as context:
+        run(context, stub.script, arguments(stub, scene, folder, more), off=True, device="cpu")
     return results[0]
 
 
