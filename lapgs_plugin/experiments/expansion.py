@@ -180,7 +180,7 @@ def _scenes(entry: Scenes) -> Iterator[SceneSpec]:
         yield SceneSpec(entry.name, "", entry.path, entry.sample, entry.resolution, entry.images)
         return
     known = DATASETS[entry.dataset].scenes
-    for name in entry.only or known:
+    for name in entry.names:
         images = known[name] if entry.images == "downscaled" else entry.images
         yield SceneSpec(name, entry.dataset, None, None, entry.resolution, images)
 

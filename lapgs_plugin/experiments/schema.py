@@ -73,6 +73,13 @@ class Scenes(_Part):
             raise ValueError("a sample scene has a name alone, no dataset and no path")
         return self
 
+    @property
+    def names(self) -> list[str]:
+        """Its scenes, in their order."""
+        if self.dataset is None:
+            return [self.name or ""]
+        return self.only or list(DATASETS[self.dataset].scenes)
+
 
 class Backbone(_Part):
     """One `[backbones.NAME]`: the built-in trainer on a rasterizer, or a checkout.
@@ -170,17 +177,30 @@ class Experiment(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> Experiment:
-        names = [variant.name for variant in self.variants]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"two variants are called {name!r}")
+        if (twice := _twice([variant.name for variant in self.variants])) is not None:
+            raise ValueError(f"two variants are called {twice!r}")
+        if (twice := _twice([name for entry in self.scenes for name in entry.names])) is not None:
+            raise ValueError(f"scene {twice!r} is there twice; a variant may have a resolution of its own instead")
         for variant in self.variants:
             unknown = {*variant.backbones, *(variant.paper if isinstance(variant.paper, dict) else ())}
             for name in sorted(unknown - self.backbones.keys()):
                 raise ValueError(
                     f"variant {variant.name!r} names backbone {name!r}, expected {', '.join(self.backbones)}"
                 )
+            self._check_effect(variant)
         return self
+
+    def _check_effect(self, variant: Variant) -> None:
+        """Refuse what would change nothing."""
+        checkouts = [self.backbones[name].checkout is not None for name in variant.backbones or self.backbones]
+        if variant.method == "bare" and "levels" in variant.options:
+            raise ValueError(f"variant {variant.name!r} is bare, which is one level; leave levels out")
+        if variant.method == "bare" and variant.options and all(checkouts):
+            raise ValueError(
+                f"variant {variant.name!r} is bare: options of `lapgs run` mean nothing to it; set the script's arguments"
+            )
+        if variant.arguments and not any(checkouts):
+            raise ValueError(f"variant {variant.name!r} has arguments, but no script of a checkout to give them to")
 
 
 PARTS: Mapping[str, type[BaseModel]] = {
@@ -216,6 +236,11 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         raise UserInputError(f"{path}: {_first_problem(error)}") from None
     _check_options(path, experiment, option_names)
     return experiment
+
+
+def _twice(names: list[str]) -> str | None:
+    """The first name that is there more than once."""
+    return next((name for name in names if names.count(name) > 1), None)
 
 
 def nearest(name: str, known: Set[str]) -> str:
