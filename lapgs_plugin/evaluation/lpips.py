@@ -9,7 +9,7 @@ The learned layers on top come from the same file, or from whichever of the two 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,6 +82,7 @@ class Network:
 
     Attributes:
         title: as tables call it.
+        make: its layers up to the last tap.
         taps: layers whose output is compared.
         channels: of these outputs.
         cached_as: name of torchvision's weights in PyTorch's cache of downloads.
@@ -89,6 +90,7 @@ class Network:
     """
 
     title: str
+    make: Callable[[], list[nn.Module]]
     taps: tuple[int, ...]
     channels: tuple[int, ...]
     cached_as: str
@@ -96,16 +98,20 @@ class Network:
 
     def layers(self) -> nn.Sequential:
         """Its convolutions up to the last tap, with shapes but no values: on PyTorch's device "meta"."""
-        make = {"AlexNet": _alexnet, "VGG": _vgg16, "SqueezeNet": _squeezenet}[self.title]
         with torch.device("meta"):
-            return nn.Sequential(*make())
+            return nn.Sequential(*self.make())
 
 
 NETWORKS = {
-    "vgg": Network("VGG", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), "vgg16-397923af.pth", 16),
-    "alex": Network("AlexNet", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), "alexnet-owt-7be5be79.pth", 31),
+    "vgg": Network("VGG", _vgg16, (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), "vgg16-397923af.pth", 16),
+    "alex": Network("AlexNet", _alexnet, (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), "alexnet-owt-7be5be79.pth", 31),
     "squeeze": Network(
-        "SqueezeNet", (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512), "squeezenet1_1-b8a52dc0.pth", 17
+        "SqueezeNet",
+        _squeezenet,
+        (1, 4, 7, 9, 10, 11, 12),
+        (64, 128, 256, 384, 384, 512, 512),
+        "squeezenet1_1-b8a52dc0.pth",
+        17,
     ),
 }
 AS_3DGS = "vgg_3dgs"

@@ -59,9 +59,7 @@ def opened(browser: Any, address: str, size: tuple[int, int]) -> Iterator[Any]:
     page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=1)
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("console", lambda message: troubles.append(message.text))
-    page.on(
-        "request", lambda request: troubles.append(request.url[:80]) if request.url[:5] not in ("file:", "data:") else 0
-    )
+    page.on("request", lambda request: request.url[:5] in ("file:", "data:") or troubles.append(request.url))
     page.goto(address)
     yield page
     assert troubles == []
