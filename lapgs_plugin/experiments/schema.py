@@ -197,7 +197,7 @@ class Experiment(_Part):
             raise ValueError(f"variant {variant.name!r} is bare, which is one level; leave levels out")
         if variant.method == "bare" and variant.options and all(checkouts):
             raise ValueError(
-                f"variant {variant.name!r} is bare: options of `lapgs run` mean nothing to it; set the script's arguments"
+                f"variant {variant.name!r} is bare: options of `lapgs run` mean nothing; set the script's arguments"
             )
         if variant.arguments and not any(checkouts):
             raise ValueError(f"variant {variant.name!r} has arguments, but no script of a checkout to give them to")

@@ -70,7 +70,7 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         (
             'name = "one"\noptions = { levels = 1 }',
             'name = "one"\nmethod = "bare"\nbackbones = ["fast"]\noptions = { inherit = "xyz" }',
-            ("options of `lapgs run` mean nothing to it",),
+            ("options of `lapgs run` mean nothing",),
         ),
         ('name = "one"', 'name = "one"\nbackbones = ["cpu"]\narguments = ["-x"]', ("no script of a checkout",)),
         ('name = "x"', "name = x", ("is not TOML",)),
