@@ -140,6 +140,11 @@ class ActiveStage:
             with self.outside("view"):
                 self._context.watcher.look(self.stage, iteration - 1, lambda: self._fields(gaussians), lambda: False)
         self._context.parts.breakdown.mark("other")
+        every = self._context.test_every
+        if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._images.test:
+            elapsed = self._elapsed()
+            with self.outside("evaluation"):
+                self._report_held_out(gaussians, iteration - 1, elapsed)
         if iteration == self._joint_from:
             self._train_jointly(gaussians)
         self._iteration = iteration
@@ -149,10 +154,8 @@ class ActiveStage:
         if self._hooks:
             self._hooks.iteration_begins(iteration)
         if iteration % max(1, self.window.total // HISTORY_ENTRIES) == 0:
-            finished = sum(record.train_seconds for record in self._archive.manifest.records)
-            elapsed = finished + self._seconds()
             self._archive.append_history(
-                {"level": self.stage.level, "iteration": iteration, "elapsed": elapsed, "num_gaussians": count}
+                {"level": self.stage.level, "iteration": iteration, "elapsed": self._elapsed(), "num_gaussians": count}
             )
 
     def _train_jointly(self, gaussians: Any) -> None:
@@ -275,6 +278,10 @@ class ActiveStage:
         assert self._began is not None, "training() without an iteration"
         return time.perf_counter() - self._began - self._excluded
 
+    def _elapsed(self) -> float:
+        """Seconds of optimization since the start of the run."""
+        return sum(record.train_seconds for record in self._archive.manifest.records) + self._seconds()
+
     def _archive_level(self, finished: Finished, seconds: float, memory: dict[str, int]) -> None:
         stage, field = self.stage, finished.field
         left = {"carried": dict(finished.carried), "moments": dict(finished.moments)}
@@ -304,12 +311,12 @@ class ActiveStage:
         moments: Mapping[str, dict[str, Tensor]],
     ) -> Finished:
         predictions = None
+        if self._images.test and (self.stage.level == 0 or self._context.test_every is not None):
+            with self.overhead.timed("evaluation"):
+                self._report_held_out(gaussians, self.stage.iterations)
         if self.stage.level > 0:
             with self.overhead.timed("cache"):
                 predictions = self._predict(gaussians)
-        elif self._images.test:
-            with self.overhead.timed("evaluation"):
-                self._report_held_out(gaussians)
         return Finished(field, predictions, carried, moments)
 
     @torch.no_grad()
@@ -322,22 +329,36 @@ class ActiveStage:
         return store
 
     @torch.no_grad()
-    def _report_held_out(self, gaussians: Any) -> None:
+    def _report_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
+        """Note how good the held-out views are after an iteration, all brought to full resolution."""
         cameras = self._images.test
         means = mean_quality(
-            (self._composed(gaussians, camera), self._images.targets.get(self._images.key(camera)))
+            (self._whole(gaussians, camera), self._context.album.photo(self._images.key(camera)).image(self._device))
             for camera in cameras
         )
-        self._archive.append_history({"level": self.stage.level, "iteration": self.stage.iterations, **means})
+        when = {} if elapsed is None else {"elapsed": elapsed}
+        self._archive.append_history({"level": self.stage.level, "iteration": iteration, **when, **means})
         logger.info("held-out PSNR of the composed hierarchy: %.2f dB over %d views", means["psnr"], len(cameras))
+
+    def _whole(self, gaussians: Any, camera: Any) -> Tensor:
+        """(3, h, w) a view at full resolution, as if every finer residual were zero."""
+        image = self._composed(gaussians, camera)
+        for level in range(self.stage.level - 1, -1, -1):
+            width, height = self._images.size(camera, level)
+            image = self._pyramid.up(image, (height, width))
+        return image
 
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) I_hat^l of a view, before exposure and clamping."""
-        self._rendering.composed, self._rendering.capture = self._images.keys, True
+        rendering, composed = self._rendering, self._rendering.composed
+        rendering.composed, rendering.capture = self._images.keys, True
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
-        self._adapter.render(self._call, self._view(camera), gaussians, background)
-        assert self._rendering.captured is not None
-        return self._rendering.captured
+        try:
+            self._adapter.render(self._call, self._view(camera), gaussians, background)
+            assert rendering.captured is not None
+            return rendering.captured
+        finally:  # training may go on, and supervise residuals alone
+            rendering.composed, rendering.capture, rendering.captured = composed, False, None
 
     def _initialise(self, gaussians: Any) -> None:
         """Points for the base; for a residual the field of the level before."""

@@ -57,6 +57,7 @@ class HierarchyDriver:
         hooks: run after those registered by entry point.
         breakdown: measure the parts of iterations.
         watcher: may look at the fields between iterations; None for nobody.
+        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class HierarchyDriver:
         hooks: Sequence[StageHook] = (),
         breakdown: bool = False,
         watcher: Watcher | None = None,
+        test_every: int | None = None,
     ) -> None:
         self._adapter, self._options = adapter, options
         self._resume, self._overwrite = resume, overwrite
@@ -77,7 +79,15 @@ class HierarchyDriver:
         place = torch.device(device)
         self._parts = IterationParts(place, breakdown)
         self._context = RunContext(
-            *(adapter, options, place, self._album, self._shim, HookCaller(hooks), self._parts, watcher or Watcher())
+            adapter=adapter,
+            options=options,
+            device=place,
+            album=self._album,
+            shim=self._shim,
+            hooks=HookCaller(hooks),
+            parts=self._parts,
+            watcher=watcher or Watcher(),
+            test_every=test_every,
         )
         self._active: ActiveStage | None = None
 

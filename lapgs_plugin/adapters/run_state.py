@@ -104,6 +104,7 @@ class RunContext:
         shim: between its render and its rasterizer.
         hooks: of the user.
         parts: told which part of an iteration begins.
+        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
         watcher: may look at the fields between iterations.
     """
 
@@ -115,6 +116,7 @@ class RunContext:
     hooks: HookCaller
     parts: IterationParts
     watcher: Watcher
+    test_every: int | None
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,14 @@ def run(
             help="Step the backbone's plain Adam optimizers in one kernel a tensor.",
         ),
     ] = True,
+    test_every: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Measure held-out PSNR this often, for the curves of `lapgs report`; its time is not counted. "
+            "Default: at the end of the run.",
+        ),
+    ] = None,
     breakdown: Annotated[
         bool,
         typer.Option(
@@ -211,6 +219,7 @@ def run(
                 overwrite=overwrite,
                 breakdown=breakdown,
                 watcher=watcher,
+                test_every=test_every,
             )
             driver.run()
     except ImportError as error:

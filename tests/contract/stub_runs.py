@@ -152,6 +152,7 @@ def drive(
     resume: bool = False,
     breakdown: bool = False,
     watcher: Watcher | None = None,
+    test_every: int | None = None,
     **options: Any,
 ) -> None:
     driver = HierarchyDriver(
@@ -162,6 +163,7 @@ def drive(
         hooks=hooks,
         breakdown=breakdown,
         watcher=watcher,
+        test_every=test_every,
     )
     driver.run()
 
@@ -175,12 +177,21 @@ def run_hierarchy(
     resume: bool = False,
     breakdown: bool = False,
     watcher: Watcher | None = None,
+    test_every: int | None = None,
     **options: Any,
 ) -> tuple[RunArchive, Result]:
     """Train a stub as a hierarchy with `HierarchyOptions(**options)`."""
     results: list[Result] = []
     with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
-        drive(adapter, hooks=hooks, resume=resume, breakdown=breakdown, watcher=watcher, **options)
+        drive(
+            adapter,
+            hooks=hooks,
+            resume=resume,
+            breakdown=breakdown,
+            watcher=watcher,
+            test_every=test_every,
+            **options,
+        )
     return RunArchive.open(folder), results[0]
 
 

@@ -1,0 +1,53 @@
+"""`lapgs run --test-every`: held-out PSNR over a checkout's training, without a trace in what is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.rendering.compose import to_full_size
+from lapgs_plugin.rendering.run import run_renderer, run_scene
+from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
+
+SHORT = ("--iterations", 30, "--densify_from_iter", 0, "--densification_interval", 3, "--densify_until_iter", 30)
+EVERY = 4
+
+
+def rendered(archive: RunArchive, level: int) -> float:
+    """Held-out PSNR of a finished level at full resolution, by code that knows no checkout."""
+    renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
+    values = []
+    for view in run_scene(archive).test:
+        image = renderer.render(view.camera, level).composed[level]
+        values.append(psnr(to_full_size(image, view.camera, level, renderer.pyramid), view.image))
+    return sum(values) / len(values)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("supervision", ["reconstructed", "gt_laplacian"])
+def test_curves_leave_no_trace(scene: Path, tmp_path: Path, name: str, supervision: str) -> None:
+    runs = {}
+    for every in (None, EVERY):
+        folder = tmp_path / str(every)
+        runs[every], _ = run_hierarchy(
+            STUBS[name], scene, folder, *SHORT, test_every=every, joint=0.0, supervision=supervision
+        )
+    plain, measured = runs[None], runs[EVERY]
+    for level in (1, 0):
+        assert measured.field_path(level).read_bytes() == plain.field_path(level).read_bytes()
+    noted = [entry for entry in measured.history() if "psnr" in entry]
+    assert [(entry["level"], entry["iteration"]) for entry in noted] == [
+        *((1, i) for i in (4, 8, 10)),
+        *((0, i) for i in (4, 8, 12, 16, 20)),
+    ]
+    times = [entry["elapsed"] for entry in noted if "elapsed" in entry]
+    assert len(times) == len(noted) - 2  # those at the ends of stages lie at the ends
+    assert times == sorted(times)
+    ends = {entry["level"]: entry["psnr"] for entry in noted if "elapsed" not in entry}
+    for level, value in ends.items():
+        # Photos are 8-bit, predictions float16, and Taming's opacities archived with a limit: 0.05 dB seen.
+        assert value == pytest.approx(rendered(measured, level), abs=0.1)
+    assert "evaluation" in measured.manifest.record(1).overhead_seconds
