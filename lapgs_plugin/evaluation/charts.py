@@ -49,6 +49,8 @@ WHOLE = Frame(420, 260, left=50, right=14, top=22, bottom=42)
 """Narrow enough that a phone shows the labels at a readable size."""
 INSET = Frame(200, 112, left=42, right=10, top=8, bottom=20)
 """Drawn inside another chart, in the corner that curves which rise and flatten out leave free."""
+INSET_AT = WHOLE.width - WHOLE.right - INSET.width, WHOLE.height - WHOLE.bottom - INSET.height - 6
+"""Of its upper left corner."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class Chart:
         lines, arrows: in drawing order.
         x_ticks, y_ticks: from the origin on.
         marks: at their place.
-        inset: the start of the lines, larger.
+        inset: the start of the lines, larger, at `INSET_AT`.
     """
 
     title: str
@@ -243,6 +245,9 @@ def draw(
     count = TICKS if frame is WHOLE else INSET_TICKS
     right, highest = max(xs) or 1.0, max(ys)
     y_ticks = _ticks(0.0 if from_zero else min(ys), highest * HEADROOM if from_zero else highest, count)
+    inset = None if inset_until is None else _start(x_label, series, inset_until, format_x, format_y)
+    if inset is not None:
+        y_ticks = _above_inset(series, right, y_ticks)
     bottom, top = y_ticks[0], y_ticks[-1]
     lines = []
     for line in series:
@@ -256,7 +261,7 @@ def draw(
         y_ticks=tuple(Tick(frame.y((y - bottom) / (top - bottom)), format_y(y)) for y in y_ticks),
         lines=tuple(lines),
         marks=_place_marks([(frame.x(mark.x / right), mark.label) for mark in marks], frame),
-        inset=None if inset_until is None else _start(x_label, series, inset_until, format_x, format_y),
+        inset=inset,
     )
 
 
@@ -273,6 +278,24 @@ def _start(
     if not any(len(line.points) >= INSET_POINTS for line in begins):
         return None
     return draw("the start", x_label, begins, from_zero=False, format_x=format_x, format_y=format_y, frame=INSET)
+
+
+def _above_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
+    """Ticks of a y axis that begins so low that no line runs behind the inset."""
+    begin = right * (INSET_AT[0] - WHOLE.left) / WHOLE.plot_width
+    behind = [
+        y
+        for line in series
+        for (x, y), (after, _) in zip(line.points, [*line.points[1:], line.points[-1]], strict=True)
+        if max(x, after) >= begin
+    ]
+    room = (WHOLE.height - WHOLE.bottom - INSET_AT[1] + 6) / WHOLE.plot_height
+    for _ in range(TICKS):  # rounder ticks may lift the upper end again
+        bottom, top = ticks[0], ticks[-1]
+        if not behind or min(behind) - bottom >= room * (top - bottom):
+            break
+        ticks = _ticks((min(behind) - room * top) / (1 - room), top, TICKS)
+    return ticks
 
 
 def draw_moves(

@@ -11,6 +11,7 @@ import jinja2
 
 from lapgs_plugin.archive import REPORT, RunArchive
 from lapgs_plugin.evaluation.charts import (
+    INSET_AT,
     Bar,
     BarChart,
     Chart,
@@ -125,7 +126,7 @@ def render_page(template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(values)
+    return environment.get_template(template).render(values, inset_at=INSET_AT)
 
 
 def write_page(path: Path, page: str) -> Path:

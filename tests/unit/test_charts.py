@@ -9,7 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.evaluation.charts import INSET, WHOLE, Bar, Frame, Mark, Move, Series, draw, draw_bars, draw_moves
+from lapgs_plugin.evaluation.charts import (
+    INSET,
+    INSET_AT,
+    WHOLE,
+    Bar,
+    Frame,
+    Mark,
+    Move,
+    Series,
+    draw,
+    draw_bars,
+    draw_moves,
+)
 
 LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
 WIDTH, HEIGHT = WHOLE.width, WHOLE.height
@@ -87,6 +99,27 @@ def test_an_inset_holds_the_start_and_nothing_else() -> None:
     assert found == [pytest.approx(point, abs=0.1) for point in rising[:6]]
     assert chart.inset.inset is None
     assert draw("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
+
+
+curves = st.lists(
+    st.lists(st.tuples(st.floats(0.0, 100.0), st.floats(5.0, 40.0)), min_size=4, max_size=30), min_size=1, max_size=3
+)
+
+
+@settings(deadline=None)
+@given(curves=curves)
+def test_nothing_runs_behind_an_inset(curves: list[list[tuple[float, float]]]) -> None:
+    longest = max(x for curve in curves for x, _ in curve)
+    series = [Series("run", sorted(curve)) for curve in curves]
+    chart = draw("t", "x", series, from_zero=False, inset_until=0.3 * longest)
+    if chart.inset is None:
+        return
+    for line in chart.lines:
+        points = plotted(line.points)
+        for (x0, y0), (x1, y1) in pairwise(points):
+            for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+                x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+                assert x < INSET_AT[0] - 0.1 or y < INSET_AT[1]  # y counts downwards
 
 
 coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
