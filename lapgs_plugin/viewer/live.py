@@ -36,8 +36,8 @@ DEFAULT_PERCENT, MOST_PERCENT = 1.5, 50.0
 LIVE_PACE = Pace(moving=0.02, still=0.06, ahead=False)
 """What a picture takes: at 1.5 % that is one every 1.3 s while somebody moves, and every 4 s otherwise."""
 
-BURST_SECONDS = 0.25
-"""That pictures may take at once before they wait for their share: the first of a stage brings a new panel."""
+MOST_SAVED = 0.25
+"""Seconds of pictures that can be saved up while nobody wants any: the first of a stage brings a new panel."""
 
 PAUSE_PATIENCE = 0.1
 
@@ -60,7 +60,7 @@ class LiveView(Watcher):
         self._rig: Rig | None = None
         self._begun = False  # clients know where to begin
         self._finished: dict[int, GaussianField] = {}
-        self._credit, self._counted = BURST_SECONDS, time.perf_counter()  # seconds to spend, and as of when
+        self._credit, self._counted = 0.0, time.perf_counter()  # seconds to spend, and as of when
         gui = page.server.gui
         with gui.add_folder("Training"):
             self._percent = gui.add_slider(
@@ -75,7 +75,7 @@ class LiveView(Watcher):
 
     def run_started(self, archive: RunArchive) -> None:
         with self._harmless():
-            self._archive = archive
+            self._archive, self._counted = archive, time.perf_counter()
             self._placed = rasterizer_for(archive.manifest, self._device)
             self._finished = {level: archive.field(level) for level in archive.available_levels}
             try:
@@ -94,15 +94,13 @@ class LiveView(Watcher):
     def wants_look(self) -> bool:
         if self._failed:
             return False
+        share, now = self._percent.value / 100.0, time.perf_counter()
+        self._credit = min(self._credit + share * (now - self._counted), MOST_SAVED)
+        self._counted = now
         if not self._viewer.watched:
             self._viewer.forget()  # it holds the memory of a field
             return False
-        if self._pause.value:
-            return True
-        share, now = self._percent.value / 100.0, time.perf_counter()
-        self._credit = min(self._credit + share * (now - self._counted), BURST_SECONDS)
-        self._counted = now
-        return share > 0.0 and self._credit > 0.0
+        return self._pause.value or (share > 0.0 and self._credit > 0.0)
 
     def look(
         self,

@@ -198,7 +198,7 @@ def test_pictures_take_no_more_than_their_share(page: Page, monkeypatch: pytest.
             looking += clock() - before
     share = percent / 100.0
     last = 0.04  # its time has not come
-    assert looking <= share * (training + looking) + live.BURST_SECONDS + last
+    assert looking <= share * (training + looking) + last
     assert looking >= 0.9 * share * training
 
 
