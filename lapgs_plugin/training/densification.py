@@ -31,13 +31,17 @@ class DensityControl(Protocol):
 
     state: dict[str, Any]
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+    def looks_at(self, iteration: int) -> bool:
+        """Whether `after_step` of that iteration wants to know more of a render than its image."""
+        ...
+
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
         """Accumulate the statistics of one render and edit the field when the schedule says so.
 
         Args:
             model: edited in place; its parameters are new tensors afterwards when something changed.
             iteration: counts from 1 within the stage.
-            result: the render, after `backward()`.
+            result: the render, after `backward()`; it may be None where `looks_at` says so.
             camera: it was rendered from.
 
         Returns:
@@ -76,10 +80,15 @@ class Densifier:
         )
         self.state: dict[str, Any] = self._strategy.initialize_state(scene_scale=extent)
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+    def looks_at(self, iteration: int) -> bool:
         """See `DensityControl`."""
-        if iteration >= self._schedule.densify_until:
+        return iteration < self._schedule.densify_until
+
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+        """See `DensityControl`."""
+        if not self.looks_at(iteration):
             return False
+        assert result is not None, "looked at in this iteration"
         if _refines(self._schedule, iteration):
             info = self._info(result, camera)
             self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
@@ -149,7 +158,11 @@ class McmcDensifier:
         )
         self.state: dict[str, Any] = self._strategy.initialize_state()
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera) -> bool:
+    def looks_at(self, iteration: int) -> bool:
+        """Never: it goes by opacities."""
+        return False
+
+    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
         """See `DensityControl`."""
         rate = model.optimizers["means"].param_groups[0]["lr"]
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)

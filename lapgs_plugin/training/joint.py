@@ -15,7 +15,7 @@ from torch import Tensor
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.raster import Rasterizer, render_image
 from lapgs_plugin.rendering.compose import level_camera
 from lapgs_plugin.training.model import TrainableField
 
@@ -45,14 +45,19 @@ class JointFields:
         for level, model in self.models.items():
             camera = level_camera(self.cameras[name], level)
             background = self.background.new_zeros(3) if model.signed else self.background
-            result = self.rasterizer(model.field, camera, background=background)
-            if model.sparse:
-                self._visible[level] = result.radii > 0
+            image = self._render(level, model, camera, background)
             below = None if composed is None else self.pyramid.up(composed, (camera.height, camera.width))
-            composed = result.image if below is None else result.image + below
+            composed = image if below is None else image + below
         assert composed is not None
         camera = level_camera(self.cameras[name], min(self.models) - 1)
         return self.pyramid.up(composed, (camera.height, camera.width))
+
+    def _render(self, level: int, model: TrainableField, camera: Camera, background: Tensor) -> Tensor:
+        if not model.sparse:
+            return render_image(self.rasterizer, model.field, camera, background)
+        result = self.rasterizer(model.field, camera, background=background)
+        self._visible[level] = result.radii > 0
+        return result.image
 
     def step(self, means_rate: float) -> None:
         """One Adam step on every field, after a backward pass through what `predict` gave.
@@ -61,7 +66,7 @@ class JointFields:
             means_rate: step size of the positions, in world units.
         """
         for level, model in self.models.items():
-            model.step(means_rate, model.field.sh.shape[1], self._visible.get(level))
+            model.step(means_rate, visible=self._visible.get(level))
 
     @property
     def fields(self) -> dict[int, GaussianField]:

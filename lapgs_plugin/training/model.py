@@ -84,17 +84,18 @@ class TrainableField:
         """The current parameters, sharing their memory and gradients."""
         return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int, visible: Tensor | None = None) -> None:
+    def step(self, means_rate: float, active_coefficients: int | None = None, visible: Tensor | None = None) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
             means_rate: step size of the positions, already scaled by the extent.
-            active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped.
+            active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
             visible: (n,) bool, the Gaussians that were rendered; looked at by sparse steps alone.
         """
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
         if isinstance(self.optimizers.get("sh"), FieldAdam):
-            self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients
+            every = self.params["sh"].shape[1]
+            self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
         for optimizer in self.optimizers.values():
             if self.sparse:
                 optimizer.step(visible)

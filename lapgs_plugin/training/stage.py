@@ -13,10 +13,11 @@ from torch import Tensor
 
 from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
+from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
-from lapgs_plugin.raster import Rasterizer, RenderResult
+from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -160,18 +161,19 @@ class StageRun:
         self.progress.gaussian_steps += self.num_optimized
         self.hooks.before_render(context)
         self.breakdown.mark("forward")
-        result = self.rasterizer(self.model.field, view.camera, background=self.background, sh_degree=degree)
+        gaussians = self.model.field
+        rendered, result = self._render(gaussians, view, iteration, degree)
         self.breakdown.mark("loss")
-        image = self.hooks.compose(context, result.image)
+        image = self.hooks.compose(context, rendered)
         loss = self.hooks.loss(context, image)
         self._keep_loss(loss.detach(), iteration)
-        regularization = self.densifier.regularization(self.model.field)
+        regularization = self.densifier.regularization(gaussians)
         self.breakdown.mark("backward")
         (loss if regularization is None else loss + regularization).backward()  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
-        visible = result.radii > 0 if self.model.sparse else None
+        visible = result.radii > 0 if self.model.sparse and result is not None else None
         means_rate = self.schedule.means_learning_rate(iteration) * self.extent
         self.model.step(means_rate, (degree + 1) ** 2, visible)
         if self.joint is not None:
@@ -181,6 +183,15 @@ class StageRun:
         self.breakdown.mark("other")
         if iteration % FINITE_CHECK_EVERY == 0 or iteration == self.stage.iterations:
             self._require_finite(iteration)
+
+    def _render(
+        self, gaussians: GaussianField, view: LevelView, iteration: int, degree: int
+    ) -> tuple[Tensor, RenderResult | None]:
+        """The image, and what else is known of the render where somebody looks at it."""
+        if self.model.sparse or self.densifier.looks_at(iteration):
+            result = self.rasterizer(gaussians, view.camera, background=self.background, sh_degree=degree)
+            return result.image, result
+        return render_image(self.rasterizer, gaussians, view.camera, self.background, degree), None
 
     def _view(self, iteration: int) -> LevelView:
         return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
@@ -201,7 +212,7 @@ class StageRun:
         if self.accumulated is not None and self.joint is None:
             self.accumulated.announce(name)
 
-    def _densify(self, context: StageContext, result: RenderResult, view: LevelView) -> None:
+    def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
         if self.densifier.after_step(self.model, context.iteration, result, view.camera):
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)

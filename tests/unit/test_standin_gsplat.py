@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.gsplat import GsplatRasterizer
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.raster import render_image
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as on_cpu
 from tests.unit.test_rasterizers import WithoutCuda, faint
@@ -106,6 +107,25 @@ def test_several_cameras_at_once(harmonics: Any, signed: bool, monkeypatch: pyte
     nobody = case.field.with_parameters({name: value[:0] for name, value in case.field.parameters.items()})
     empty = GsplatRasterizer("cpu").render_images(nobody, cameras, background=background)
     assert torch.equal(empty, background[:, None, None].expand_as(images))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_an_image_alone_has_the_pixels_and_gradients_of_a_call(signed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat, "rasterization", on_cpu.rasterization)
+    monkeypatch.setattr(gsplat, "spherical_harmonics", on_cpu.spherical_harmonics)
+    rasterizer = GsplatRasterizer("cpu", absgrad=False, own_radii=True)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    whole, plain = faint(signed).with_leaves(), faint(signed).with_leaves()
+    expected = rasterizer(whole.field, whole.camera, background=background, sh_degree=1).image
+    image = render_image(rasterizer, plain.field, plain.camera, background, 1)
+    assert torch.equal(image, expected)
+    for each in (expected, image):
+        each.square().sum().backward()
+    for name, value in plain.field.parameters.items():
+        assert torch.equal(value.grad, whole.field.parameters[name].grad), name
+    nobody = plain.field.with_parameters({name: value[:0] for name, value in plain.field.parameters.items()})
+    empty = render_image(rasterizer, nobody, plain.camera, background)
+    assert torch.equal(empty, background[:, None, None].expand_as(image))
 
 
 def test_masked_harmonics_are_zero() -> None:
