@@ -93,13 +93,20 @@ class Pyramid:
             first (fine,) int64 and weights (fine, k) float64, k at most 5, both on the CPU.
         """
         coarse = (fine + 1) // 2
-        every = torch.eye(coarse, dtype=torch.float64)
-        matrix = _blur(_sample(every, 0, self._fine_centres(fine, coarse)), 0)  # (fine, coarse)
-        used = matrix != 0
-        first = used.to(torch.uint8).argmax(1)
-        taps = int((coarse - used.flip(1).to(torch.uint8).argmax(1) - first).max())
+        centres = self._fine_centres(fine, coarse)
+        lower, upper, fraction = _neighbours(coarse, centres, torch.float64, torch.device("cpu"))
+        fraction = torch.zeros(fine, dtype=torch.float64) if fraction is None else fraction
+        offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1)
+        blurred = _reflected(torch.arange(fine)[:, None] + offsets, fine)  # (fine, 5)
+        binomial = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=torch.float64) / 16
+        parts = torch.cat([lower[blurred], upper[blurred]], 1)  # (fine, 10) coarse samples, some of them the same
+        shares = torch.cat([(1 - fraction[blurred]) * binomial, fraction[blurred] * binomial], 1)
+        used = shares > 0
+        first = torch.where(used, parts, coarse).amin(1)
+        taps = int((torch.where(used, parts, 0).amax(1) - first).max()) + 1
         first = first.clamp_max(coarse - taps)
-        return first, matrix.gather(1, first[:, None] + torch.arange(taps))
+        weights = torch.zeros(fine, taps, dtype=torch.float64)
+        return first, weights.scatter_add_(1, torch.where(used, parts - first[:, None], 0), shares)
 
     def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
         """Gaussian pyramid: I^0 = `image`, I^(l+1) = Down(I^l), finest first.
@@ -167,10 +174,15 @@ def _blur(image: Tensor, dim: int) -> Tensor:
 @lru_cache(maxsize=256)
 def _mirrored(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Which samples stand for those just before and after the n of a side; sides of 1 and 2 mirror repeatedly."""
-    period = max(2 * (n - 1), 1)
-    outside = torch.tensor([[-2, -1], [n, n + 1]]) % period
-    before, after = torch.minimum(outside, period - outside).clamp_max(n - 1).to(device)
+    before, after = _reflected(torch.tensor([[-2, -1], [n, n + 1]]), n).to(device)
     return before, after
+
+
+def _reflected(positions: Tensor, n: int) -> Tensor:
+    """Which of the n samples of a side stand for those at integer positions, mirrored at its ends."""
+    period = max(2 * (n - 1), 1)
+    around = positions % period
+    return torch.minimum(around, period - around).clamp_max(n - 1)
 
 
 def _sample(image: Tensor, dim: int, centres: tuple[float, float, int]) -> Tensor:

@@ -73,7 +73,8 @@ def _cuda_kernel() -> Raise | None:
     try:
         from lapgs_plugin.rendering.raising_triton import add_raised_triton
 
-        small, large = (torch.zeros(1, side, side, device="cuda") for side in (2, 4))
+        # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.
+        small, large = (torch.zeros(side, side, 3, device="cuda").permute(2, 0, 1) for side in (5, 10))
         add_raised_triton(Pyramid(), small, large)
     except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
         logger.info("Up in many small operations instead of one kernel: %s", str(error).strip().split("\n")[0])

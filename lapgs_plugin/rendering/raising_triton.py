@@ -13,9 +13,17 @@ from torch import Tensor
 from lapgs_plugin.pyramid import Pyramid
 
 BLOCK_ROWS, BLOCK_COLUMNS = 8, 128
+MOST_TAPS = 5
+
+# Triton compiles a kernel anew, for a second, where an integer is 1 or a multiple of 16 and was not before: with
+# these, at many a new size of an image. Distances between columns are 1 or 3, and to know that they are 1 helps.
+OF_ANY_VALUE = (
+    *("height", "width", "coarse_image", "coarse_plane", "coarse_row"),
+    *("fine_image", "fine_plane", "fine_row", "out_image", "out_plane", "out_row"),
+)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _kernel(
     coarse: tl.tensor, fine: tl.tensor, out: tl.tensor,
     first_row: tl.tensor, row_weights: tl.tensor, first_column: tl.tensor, column_weights: tl.tensor,
@@ -69,5 +77,11 @@ def add_raised_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _device_taps(grid: str, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`Pyramid.up_taps`, as many taps for all sizes: their number is compiled into the kernel."""
     first, weights = Pyramid(grid).up_taps(size)
-    return first.to(device, torch.int32), weights.to(device, torch.float32)
+    coarse = (size + 1) // 2
+    taps = min(MOST_TAPS, coarse)
+    earlier = first.clamp_max(coarse - taps)
+    places = (first - earlier)[:, None] + torch.arange(weights.shape[1])
+    wide = weights.new_zeros(size, taps).scatter_(1, places, weights)
+    return earlier.to(device, torch.int32), wide.to(device, torch.float32)
