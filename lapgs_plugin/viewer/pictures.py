@@ -21,11 +21,11 @@ DIVIDER_PIXELS = 2
 
 
 class Stopwatch:
-    """A rasterizer that remembers how long each field took, in milliseconds."""
+    """A rasterizer that remembers how long each field took, in milliseconds, in the order of their rendering."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._rasterizer = rasterizer
-        self.laps: list[tuple[GaussianField, float]] = []
+        self.laps: list[float] = []
 
     @property
     def name(self) -> str:
@@ -43,7 +43,7 @@ class Stopwatch:
         images = render_images(self._rasterizer, field, cameras, background)
         if images.is_cuda:
             torch.cuda.synchronize(images.device)
-        self.laps.append((field, 1e3 * (time.perf_counter() - begin)))
+        self.laps.append(1e3 * (time.perf_counter() - begin))
         return images
 
 
@@ -160,8 +160,10 @@ def draw(
         as_trained = PictureSettings(level=settings.level)
         right, _ = _shown(other, camera, as_trained, other.level_for(settings, window, distance))
         image = side_by_side(image, right.to(image), settings.divider)
-    levels = {id(field): each for each, field in run.renderer.fields.items()}
-    return Picture(image, level, {levels[id(field)]: lap for field, lap in stopwatch.laps})
+    # A composition is rendered from the finest level on. Fields do not tell: one may come to a GPU as another object.
+    bands = range(level, run.renderer.levels) if settings.band is None else [settings.band]
+    rendered = [each for each in bands if settings.gains.get(each, 1.0) != 0.0]
+    return Picture(image, level, dict(zip(rendered, stopwatch.laps, strict=True)))
 
 
 def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:

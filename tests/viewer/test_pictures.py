@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import time
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +13,11 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.camera import Camera
+from lapgs_plugin.field import GaussianField
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.residence import Residence
 from lapgs_plugin.viewer.navigation import Pose
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw, side_by_side
 from lapgs_plugin.viewer.session import as_bytes
@@ -56,6 +60,28 @@ def test_gains_and_switched_off_levels(run: ShownRun) -> None:
     only_base = picture(run, PictureSettings(level=1))
     torch.testing.assert_close(only_base.image, up.clamp(0, 1))
     assert only_base.level == 1
+
+
+@dataclass
+class Elsewhere(Residence):
+    """Fields that come as other objects each time."""
+
+    def bring(self, level: int, wanted: GaussianField) -> GaussianField:
+        return wanted.with_parameters({name: value.clone() for name, value in wanted.parameters.items()})
+
+
+def test_each_band_has_its_own_time_wherever_its_field_waits(run: ShownRun) -> None:
+    class SlowDetail(CpuRasterizer):
+        def render_images(self, field: GaussianField, *args: Any, **kwargs: Any) -> Tensor:
+            time.sleep(0.05 if field.signed else 0.0)
+            return super().render_images(field, *args, **kwargs)
+
+    away = replace(run.renderer, rasterizer=SlowDetail(), residence=Elsewhere(torch.device("cpu")))
+    times = picture(replace(run, renderer=away), PictureSettings()).milliseconds
+    assert times.keys() == {1, 0}
+    assert times[0] >= 50.0
+    assert picture(replace(run, renderer=away), PictureSettings(band=0)).milliseconds[0] >= 50.0
+    assert picture(replace(run, renderer=away), PictureSettings({0: 0.0})).milliseconds.keys() == {1}
 
 
 def test_one_band_alone_lies_around_grey(run: ShownRun) -> None:
