@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.inheritance import field_from_points
+from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
@@ -27,6 +32,18 @@ LOOK_SECONDS = 1.0
 """Time between two looks at whether a run has changed."""
 
 Stamp = tuple[int, int] | None  # nanoseconds of the last change and size of a file; None where there is none
+
+
+def load_rasterizer(placed: PlacedRasterizer) -> None:
+    """Render next to nothing, so that what a picture needs is there: on a GPU its context, kernels and compilers.
+
+    What fails here will fail in the first picture again, and is reported there.
+    """
+    camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
+    ahead = torch.tensor([[0.0, 0.0, 1.0]])
+    with contextlib.suppress(Exception):
+        base = field_from_points(ahead, ahead, 3).to(placed.device)
+        HierarchyRenderer({1: base, 0: replace(base, signed=True)}, 2, Pyramid(), placed.rasterizer).render(camera)
 
 
 class FollowedRun:
@@ -97,6 +114,8 @@ class FollowedRun:
             self._placed = rasterizer_for(manifest, self._device, self._rasterizer)
             self._created = manifest.created
             self._fields = {}
+            if self._placed.device.type == "cuda":  # beside the reading of the fields
+                threading.Thread(target=load_rasterizer, args=(self._placed,), daemon=True).start()
         fields: dict[int, GaussianField] = {}
         self.problem = None
         for level in archive.available_levels:

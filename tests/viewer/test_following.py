@@ -15,6 +15,8 @@ import torch
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.field import GaussianField
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.rasterizers import PlacedRasterizer
 from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
@@ -39,6 +41,22 @@ def finish(run: Path, of: Path) -> None:
 
 def levels(run: FollowedRun) -> list[int]:
     return [] if run.shown is None else list(run.shown.counts)
+
+
+def test_what_is_rendered_to_load_a_rasterizer_is_a_hierarchy_and_fails_in_silence() -> None:
+    class Recording(CpuRasterizer):
+        def render_images(self, field: GaussianField, *args: Any, **kwargs: Any) -> torch.Tensor:
+            rendered.append(field.signed)
+            return super().render_images(field, *args, **kwargs)
+
+    class Broken(CpuRasterizer):
+        def render_images(self, *args: Any, **kwargs: Any) -> torch.Tensor:
+            raise RuntimeError("no kernel image is available for execution on the device")
+
+    rendered: list[bool] = []
+    following.load_rasterizer(PlacedRasterizer(Recording(), torch.device("cpu"), {}))
+    assert sorted(rendered) == [False, True]
+    following.load_rasterizer(PlacedRasterizer(Broken(), torch.device("cpu"), {}))
 
 
 def test_new_levels_are_read_and_old_ones_are_not_read_again(
