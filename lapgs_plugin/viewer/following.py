@@ -16,7 +16,6 @@ from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.files import MANIFEST
-from lapgs_plugin.inheritance import field_from_points
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
@@ -41,8 +40,9 @@ def load_rasterizer(placed: PlacedRasterizer) -> None:
     """
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
+    base = GaussianField(ahead, torch.eye(4)[:1], ahead - 3.0, torch.zeros(1), torch.zeros(1, 16, 3))
     with contextlib.suppress(Exception):
-        base = field_from_points(ahead, ahead, 3).to(placed.device)
+        base = base.to(placed.device)
         HierarchyRenderer({1: base, 0: replace(base, signed=True)}, 2, Pyramid(), placed.rasterizer).render(camera)
 
 
