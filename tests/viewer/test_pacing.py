@@ -51,3 +51,12 @@ def test_a_change_while_drawing_is_not_lost() -> None:
     pacing.change(1.5)
     pacing.end(scale, 0.01)
     assert pacing.due() == 1.5
+
+
+def test_slow_first_pictures_are_forgotten_soon() -> None:
+    """What is compiled or loaded with them says nothing about those that follow."""
+    pacing = Pacing()
+    for frame in range(3):
+        pacing.change(float(frame))
+        pacing.end(pacing.begin(), 3.0)
+    assert move(pacing, 0.01, 8) == 1.0
