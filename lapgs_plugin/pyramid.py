@@ -151,6 +151,29 @@ class Pyramid:
         return 0.5 * coarse / fine - 0.5, coarse / fine, fine
 
 
+def transposed_taps(first: Tensor, weights: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+    """Taps of the transposed sums: what gradients take back.
+
+    Args:
+        first (n,), weights (n, k): sums over `samples` samples, as `Pyramid.up_taps` gives them.
+        samples: how many.
+
+    Returns:
+        first (samples,) and weights (samples, j) of sums over n samples, in the same form.
+    """
+    n, taps = weights.shape
+    summed = first[:, None] + torch.arange(taps)  # (n, k)
+    used = weights != 0
+    sums = torch.arange(n)[:, None].expand(n, taps)[used]
+    earliest = torch.full((samples,), n).scatter_reduce_(0, summed[used], sums, "amin")
+    latest = torch.zeros(samples, dtype=torch.int64).scatter_reduce_(0, summed[used], sums, "amax")
+    most = int((latest - earliest).max()) + 1
+    earliest = earliest.clamp_max(n - most)
+    back = weights.new_zeros(samples, most)
+    back[summed[used], sums - earliest[summed[used]]] = weights[used]
+    return earliest, back
+
+
 def _size(image: Tensor) -> tuple[int, int]:
     return image.shape[-2], image.shape[-1]
 

@@ -8,7 +8,6 @@ both sides in one kernel, a CPU first across and then down.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,24 +20,43 @@ from lapgs_plugin.pyramid import Pyramid
 
 logger = logging.getLogger(__name__)
 
-Raise = Callable[[Pyramid, Tensor, Tensor], Tensor]
-
 
 def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     """Up(coarse) + fine, as `pyramid.up` gives it but for rounding.
 
     Args:
         coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images.
-        fine: (c, h, w) or (b, c, h, w), of the same type and on the same device. Images that a gradient is wanted of
-            take the way of PyTorch's operations.
+        fine: (c, h, w) or (b, c, h, w), of the same type and on the same device.
     """
-    if not (torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad)):
-        if fine.device.type == "cpu" and fine.dtype in (torch.float32, torch.float64):
-            return _on_cpu(pyramid, coarse, fine)
-        if fine.device.type == "cuda" and fine.dtype == torch.float32 and (kernel := _cuda_kernel()) is not None:
-            with torch.cuda.device(fine.device):  # Triton launches on the current one
-                return kernel(pyramid, coarse, fine)
+    if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
+        return raised(pyramid, coarse, (fine.shape[-2], fine.shape[-1])) + fine
+    if fine.device.type == "cpu" and fine.dtype in (torch.float32, torch.float64):
+        return _on_cpu(pyramid, coarse, fine)
+    if _in_triton(fine):
+        from lapgs_plugin.rendering.raising_triton import add_raised_triton
+
+        with torch.cuda.device(fine.device):  # Triton launches on the current one
+            return add_raised_triton(pyramid, coarse, fine)
     return pyramid.up(coarse, (fine.shape[-2], fine.shape[-1])) + fine
+
+
+def raised(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    """`pyramid.up(coarse, size)` but for rounding, with its gradient.
+
+    Args:
+        coarse: as `add_raised` takes it.
+        size: (h, w), height first.
+    """
+    if not _in_triton(coarse):
+        return pyramid.up(coarse, size)
+    from lapgs_plugin.rendering.raising_triton import raised_triton
+
+    with torch.cuda.device(coarse.device):
+        return raised_triton(pyramid, coarse, size)
+
+
+def _in_triton(image: Tensor) -> bool:
+    return image.device.type == "cuda" and image.dtype == torch.float32 and _triton_works()
 
 
 def _on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
@@ -68,8 +86,8 @@ def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> _NumpyTaps:
 
 
 @lru_cache(maxsize=1)
-def _cuda_kernel() -> Raise | None:
-    """The kernel in Triton, which comes with PyTorch for CUDA on Linux; None where it is missing or fails."""
+def _triton_works() -> bool:
+    """Whether there is Triton, which comes with PyTorch for CUDA on Linux, and can compile."""
     try:
         from lapgs_plugin.rendering.raising_triton import add_raised_triton
 
@@ -78,5 +96,5 @@ def _cuda_kernel() -> Raise | None:
         add_raised_triton(Pyramid(), small, large)
     except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
         logger.info("Up in many small operations instead of one kernel: %s", str(error).strip().split("\n")[0])
-        return None
-    return add_raised_triton
+        return False
+    return True

@@ -24,6 +24,7 @@ from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
+from lapgs_plugin.rendering.raising import raised
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
 from lapgs_plugin.training.densification import density_control, mcmc_start
@@ -61,7 +62,9 @@ def check_cache(settings: TrainSettings, device: torch.device) -> None:
     ImageStore.check(where, precision, device)
 
 
-def warm_up(rasterizer: Rasterizer, device: torch.device | str = "cpu", sparse: bool = False) -> None:
+def warm_up(
+    rasterizer: Rasterizer, device: torch.device | str = "cpu", *, sparse: bool = False, joint: bool = False
+) -> None:
     """Run every kernel of an iteration once, so that compiling them is not taken for training."""
     settings = TrainSettings(sh_degree=0)
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
@@ -71,6 +74,9 @@ def warm_up(rasterizer: Rasterizer, device: torch.device | str = "cpu", sparse: 
     result = rasterizer(model.field, camera, background=torch.zeros(3, device=device))
     photometric_loss(result.image, torch.zeros_like(result.image)).backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
+    if joint:
+        coarse = torch.zeros(3, 8, 8, device=device, requires_grad=True)
+        raised(Pyramid(), coarse, (16, 16)).square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
 @dataclass
@@ -128,7 +134,8 @@ class Trainer:
         checkpoint = self.archive.load_checkpoint() if resume else None
         with stop_request() as stop:
             try:
-                warm_up(self.rasterizer, self.device, self.settings.sparse_adam)
+                joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
+                warm_up(self.rasterizer, self.device, sparse=self.settings.sparse_adam, joint=joint)
                 self.watcher.run_started(self.archive)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:

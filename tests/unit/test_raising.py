@@ -12,15 +12,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.pyramid import GRIDS, Pyramid
-from lapgs_plugin.rendering.raising import add_raised
+from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
+from lapgs_plugin.rendering.raising import add_raised, raised
 
 TRITON = """
 import os
 os.environ["TRITON_INTERPRET"] = "1"
 import torch
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.raising_triton import add_raised_triton
+from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
 for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
     for grid in ("camera", "even"):
         h, w = shape[-2:]
@@ -29,6 +29,12 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
         turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as gsplat has them
         for images in ((coarse, fine), turned):
             torch.testing.assert_close(add_raised_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
+        gradients = []
+        for up in (Pyramid(grid).up, lambda *given: raised_triton(Pyramid(grid), *given)):
+            leaf = coarse.clone().requires_grad_()
+            (up(leaf, (h, w)) * fine).sum().backward()
+            gradients.append(leaf.grad)
+        torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=1e-5)
 """
 
 
@@ -79,6 +85,17 @@ def test_taps_are_few_and_averages(grid: str, size: int) -> None:
     assert float((weights.sum(1) - 1).abs().max()) < 1e-14
 
 
+@settings(deadline=None, max_examples=60)
+@given(st.sampled_from(GRIDS), st.integers(1, 400))
+def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
+    first, weights = transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2)
+    assert weights.shape[1] <= 12
+    leaf, fine = torch.randn((size + 1) // 2, 1, dtype=torch.float64, requires_grad=True), torch.randn(size).double()
+    (Pyramid(grid).up(leaf, (size, 1))[:, 0] * fine).sum().backward()
+    taken = (weights * fine[first[:, None] + torch.arange(weights.shape[1])]).sum(1)
+    torch.testing.assert_close(taken, leaf.grad[:, 0], rtol=0, atol=1e-14)
+
+
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 def test_the_kernel_of_a_gpu_interpreted() -> None:
     command = [sys.executable, "-c", TRITON]
@@ -90,8 +107,15 @@ def test_the_kernel_of_a_gpu_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
-    from lapgs_plugin.rendering.raising import _cuda_kernel
+    from lapgs_plugin.rendering.raising import _triton_works
 
-    assert _cuda_kernel() is not None
+    assert _triton_works()
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")
     torch.testing.assert_close(add_raised(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
+    gradients = []
+    for up in (raised, Pyramid.up):
+        leaf = coarse.clone().requires_grad_()
+        (up(Pyramid(), leaf, (shape[-2], shape[-1])) * fine).sum().backward()
+        assert leaf.grad is not None
+        gradients.append(leaf.grad)
+    torch.testing.assert_close(*gradients, rtol=0, atol=2e-5)
