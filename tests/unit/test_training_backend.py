@@ -28,7 +28,7 @@ from lapgs_plugin.training import backend
 from lapgs_plugin.training import views as training_views
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
-from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.trainer import Trainer, check_cache
@@ -212,6 +212,29 @@ def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
         # Rounding of five steps; worst seen 6e-7.
         torch.testing.assert_close(value, ours.field.parameters[name], rtol=0, atol=1e-5)
         assert not torch.equal(value, field.parameters[name])
+
+
+def test_fused_steps_have_the_bits_of_the_optimizers_own() -> None:
+    generator = torch.Generator().manual_seed(3)
+    start = [torch.randn(20, width, generator=generator) for width in (3, 4, 1)]
+    rates = (1e-3, 5e-2, 2.5e-3)
+    ours, theirs = (
+        [gpu_adam(torch.nn.Parameter(value.clone()), rate, False) for value, rate in zip(start, rates, strict=True)]
+        for _ in range(2)
+    )
+    for step in range(4):
+        for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+            gradient = None if (step, index) == (2, 1) else torch.randn(start[index].shape, generator=generator)
+            for optimizer in (one, other):
+                optimizer.param_groups[0]["lr"] = rates[index] / (step + 1)
+                optimizer.param_groups[0]["params"][0].grad = gradient
+        fused_steps(ours)  # type: ignore[arg-type]  # Adam, where steps are not sparse
+        for optimizer in theirs:
+            optimizer.step()
+    for one, other in zip(ours, theirs, strict=True):
+        (param,), (expected,) = (optimizer.param_groups[0]["params"] for optimizer in (one, other))
+        assert torch.equal(param, expected)
+        assert all(torch.equal(one.state[param][name], other.state[expected][name]) for name in other.state[expected])
 
 
 def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
