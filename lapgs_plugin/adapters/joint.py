@@ -24,6 +24,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.rendering.raising import raised
 from lapgs_plugin.signed_color import ColorPath
 
 ADAM_EPS = 1e-15
@@ -131,10 +132,10 @@ class JointLevels:
         for one in self._fields:
             width, height = self._images.size(camera, one.of.stage.level)
             image = self._render(one, key, (width, height))
-            composed = image if composed is None else image + self._pyramid.up(composed, (height, width))
+            composed = image if composed is None else image + raised(self._pyramid, composed, (height, width))
         assert composed is not None
         width, height = self._images.size(camera, self._fields[-1].of.stage.level - 1)
-        return self._pyramid.up(composed, (height, width)).to(dtype or composed.dtype)
+        return raised(self._pyramid, composed, (height, width)).to(dtype or composed.dtype)
 
     def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
         """(3, h, w) of one field alone."""

@@ -20,6 +20,9 @@ from lapgs_plugin.pyramid import Pyramid
 
 logger = logging.getLogger(__name__)
 
+LARGEST_DIFFERENCE = 1e-4
+"""From PyTorch's operations, of values of about 1, that still counts as rounding."""
+
 
 def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     """Up(coarse) + fine, as `pyramid.up` gives it but for rounding.
@@ -87,14 +90,37 @@ def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> _NumpyTaps:
 
 @lru_cache(maxsize=1)
 def _triton_works() -> bool:
-    """Whether there is Triton, which comes with PyTorch for CUDA on Linux, and can compile."""
+    """Whether there is Triton, which comes with PyTorch for CUDA on Linux, and can compile what is right."""
     try:
-        from lapgs_plugin.rendering.raising_triton import add_raised_triton
-
-        # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.
-        small, large = (torch.zeros(side, side, 3, device="cuda").permute(2, 0, 1) for side in (5, 10))
-        add_raised_triton(Pyramid(), small, large)
+        difference = _difference_in_triton(Pyramid(), torch.device("cuda"))
     except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
         logger.info("Up in many small operations instead of one kernel: %s", str(error).strip().split("\n")[0])
         return False
+    if difference > LARGEST_DIFFERENCE:
+        logger.warning("Up in many small operations instead of one kernel, which is off by %g here", difference)
+        return False
     return True
+
+
+def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
+    """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1."""
+    from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
+
+    # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.
+    coarse, fine = (
+        torch.linspace(-1, 1, 3 * side * side, device=device).square().view(side, side, 3).permute(2, 0, 1)
+        for side in (5, 10)
+    )
+    weighed = []
+    for up in (pyramid.up, lambda image, size: raised_triton(pyramid, image, size)):
+        leaf = coarse.clone().requires_grad_()
+        image = up(leaf, (10, 10))
+        (gradient,) = torch.autograd.grad((image * fine).sum(), leaf)
+        weighed.append((image.detach(), gradient))
+    (image, gradient), (in_triton, gradient_in_triton) = weighed
+    pairs = (
+        (in_triton, image),
+        (gradient_in_triton, gradient),
+        (add_raised_triton(pyramid, coarse, fine), image + fine),
+    )
+    return max(float((one - other).abs().max()) for one, other in pairs)

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from types import ModuleType
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
+from lapgs_plugin.rendering import raising
 from lapgs_plugin.rendering.raising import add_raised, raised
 
 TRITON = """
@@ -94,6 +96,19 @@ def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
     (Pyramid(grid).up(leaf, (size, 1))[:, 0] * fine).sum().backward()
     taken = (weights * fine[first[:, None] + torch.arange(weights.shape[1])]).sum(1)
     torch.testing.assert_close(taken, leaf.grad[:, 0], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False)])
+def test_a_kernel_that_is_off_is_noticed(factor: float, right: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the difference that decides whether it is used at all; a stand-in on the CPU takes its place."""
+    kernels = ModuleType("kernels")
+    vars(kernels).update(
+        raised_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
+        add_raised_triton=lambda pyramid, coarse, fine: factor * pyramid.up(coarse, fine.shape[-2:]) + fine,
+    )
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.raising_triton", kernels)
+    difference = raising._difference_in_triton(Pyramid(), torch.device("cpu"))
+    assert (difference <= raising.LARGEST_DIFFERENCE) == right
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
