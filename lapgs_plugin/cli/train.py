@@ -10,7 +10,6 @@ import typer
 
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import JOINT_SHARE
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,10 +71,10 @@ def train(
         float,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of each residual stage, its last, in which the finished fields are trained along; 0 leaves "
-            "them as they are, as in the paper.",
+            help="Share of each residual stage, its last, in which the finished fields are trained along, such as "
+            "0.25; 0 leaves them as they are, as in the paper.",
         ),
-    ] = JOINT_SHARE,
+    ] = 0.0,
     grid: Annotated[
         str,
         typer.Option(

@@ -8,7 +8,7 @@ from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, joint_from
+from lapgs_plugin.plan import Stage, check_joint_share, joint_from
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import Supervision, parse_supervision
 
@@ -68,7 +68,7 @@ class TrainSettings:
     supervision: str = "reconstructed"
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
-    joint: float = JOINT_SHARE  # share of a residual stage, its last, in which finished fields are trained along
+    joint: float = 0.0  # share of a residual stage, its last, in which finished fields are trained along
     sh_degree: int = 3
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2

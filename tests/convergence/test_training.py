@@ -29,6 +29,7 @@ SETTINGS = TrainSettings(
     sh_degree=1,
     sh_every=10,
     densification=Densification(start=3, until=45, every=5, reset_every=12),
+    joint=0.25,
 )
 
 
