@@ -19,8 +19,10 @@ demo: $(VENV)/.installed
 	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
 
 # Two processes of one thread each take half the time of one process of two: most tests start others or hardly compute.
+# A browser that draws in software needs the machine for itself.
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m 'not slow and not browser'
+	$(BIN)/pytest -m 'browser and not slow'
 	$(MAKE) smoke
 
 smoke: $(VENV)/.installed
