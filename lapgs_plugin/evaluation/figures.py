@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
+from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
@@ -155,37 +156,20 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         lpips_missing: why others could not be measured, by variant; fps: frames a second of the composed image, median
             over some views; both added by `evaluate_run`.
         split, num_views: which views, "test" or "train", and how many.
-        train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
-        breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
-        num_gaussians: by level; peak_gaussians: the most that were optimized at once.
-        weighted_gaussians: num_gaussians weighted by the levels' iterations, as the paper's plot of time against count.
-        mean_gaussians: those being optimized, mean over all iterations; None when not recorded.
-        peak_memory_bytes, peak_memory_without_images_bytes: of the GPU in training, the highest stage; None on a CPU.
+        train_seconds and what else training took: see `training_figures`.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
             num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, memory_bytes.
         views: name, psnr, ssim, lpips_<variant> of each, in the scene's order.
         rasterizer, versions: what rendered them.
     """
     records = manifest.records
-    iterations = [record.iterations for record in records]
-    means = [record.mean_gaussians for record in records if record.mean_gaussians is not None]
-    memory = [record.memory_bytes for record in records if record.memory_bytes]
-    whole = all(record.breakdown_seconds for record in records)
     return {
         "psnr": _mean(view.psnr for view in views),
         "ssim": _mean(view.ssim for view in views),
         **{LPIPS_KEY.format(name): _mean(view.lpips[name] for view in views) for name in views[0].lpips},
         "split": split,
         "num_views": len(views),
-        "train_seconds": math.fsum(record.train_seconds for record in records),
-        "overhead_seconds": _sums(record.overhead_seconds for record in records),
-        "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
-        "num_gaussians": {str(record.level): record.num_gaussians for record in records},
-        "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
-        "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
-        "peak_gaussians": max(record.peak_gaussians for record in records),
-        "peak_memory_bytes": max((each["peak"] for each in memory), default=None),
-        "peak_memory_without_images_bytes": max((each["peak"] - each["images"] for each in memory), default=None),
+        **training_figures(records),
         "levels": {str(record.level): _level_figures(record, views) for record in records},
         "views": [_view_figures(view) for view in views],
         "rasterizer": rasterizer,
@@ -211,19 +195,6 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
 def _view_figures(view: ViewMetrics) -> dict[str, Any]:
     distances = {LPIPS_KEY.format(name): value for name, value in view.lpips.items()}
     return {"name": view.name, "psnr": view.psnr, "ssim": view.ssim, **distances}
-
-
-def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Each name's values added up."""
-    total: dict[str, float] = {}
-    for each in parts:
-        for name, value in each.items():
-            total[name] = total.get(name, 0.0) + value
-    return total
-
-
-def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
-    return math.fsum(value * weight for value, weight in zip(values, weights, strict=True)) / sum(weights)
 
 
 def _mean(values: Iterable[float]) -> float:

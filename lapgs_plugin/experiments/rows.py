@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.archive import LevelRecord, RunArchive
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
@@ -29,6 +30,8 @@ from lapgs_plugin.files import BARE_RECORD
 
 NOTED = ("psnr", "ssim")
 """What training itself notes of its images."""
+SINGLE = ("peak_gaussians", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes")
+"""Figures of training that are columns as they are, where they were measured."""
 EVALUATED, RECORDED = "lapgs eval", "training"
 
 
@@ -76,23 +79,18 @@ def _image_figures(archive: RunArchive, evaluate: bool) -> dict[str, Any]:
 
 def _figures_of_records(records: Sequence[LevelRecord]) -> dict[str, Any]:
     """What the manifest says about training."""
-    overhead = _sums(record.overhead_seconds for record in records)
-    iterations = sum(record.iterations for record in records)
+    figures = training_figures(records)
+    overhead, parts, counts = (figures[name] for name in ("overhead_seconds", "breakdown_seconds", "num_gaussians"))
     row: dict[str, Any] = {
-        "train_seconds": math.fsum(record.train_seconds for record in records),
+        "train_seconds": figures["train_seconds"],
         "overhead_seconds": math.fsum(overhead.values()),
         **{f"overhead_{name}_seconds": seconds for name, seconds in overhead.items()},
-        "gaussians": sum(record.num_gaussians for record in records),
-        **{f"gaussians_level_{record.level}": record.num_gaussians for record in records},
-        "peak_gaussians": max(record.peak_gaussians for record in records),
+        "gaussians": sum(counts.values()),
+        **{f"gaussians_level_{level}": count for level, count in counts.items()},
+        **{name: figures[name] for name in SINGLE if figures[name] is not None},
     }
-    means = [(record.mean_gaussians, record.iterations) for record in records]
-    if iterations and all(mean is not None for mean, _ in means):
-        row["mean_gaussians"] = math.fsum((mean or 0.0) * count for mean, count in means) / iterations
-    if memory := [record.memory_bytes for record in records if record.memory_bytes]:
-        row["peak_memory_bytes"] = max(each["peak"] for each in memory)
-        row["peak_memory_without_images_bytes"] = max(each["peak"] - each["images"] for each in memory)
-    if parts := _sums(record.breakdown_seconds for record in records):
+    if parts:
+        iterations = sum(record.iterations for record in records)
         row |= {f"{name}_ms": 1e3 * seconds / iterations for name, seconds in parts.items()}
         row["iteration_ms"] = 1e3 * math.fsum(parts.values()) / iterations
     return row
@@ -119,11 +117,3 @@ def _bare_figures(folder: Path) -> dict[str, Any]:
         row["peak_memory_bytes"] = memory["peak"]
         row["peak_memory_without_images_bytes"] = memory["peak"] - memory["images"]
     return row
-
-
-def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    total: dict[str, float] = {}
-    for each in parts:
-        for name, value in each.items():
-            total[name] = total.get(name, 0.0) + value
-    return total

@@ -1,0 +1,53 @@
+"""What training took, from the records of a run's levels: for metrics.json and for rows of experiments alike.
+
+Needs nothing but the records, so that experiments can be gathered where no image can be read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from lapgs_plugin.archive import LevelRecord
+
+
+def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
+    """Figures of finished levels as JSON, with levels as text because JSON has no other keys.
+
+    Keys:
+        train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
+        breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
+        num_gaussians: by level; peak_gaussians: the most that were optimized at once.
+        weighted_gaussians: num_gaussians weighted by the levels' iterations, as the paper's plot of time against count.
+        mean_gaussians: those being optimized, mean over all iterations; None when not recorded.
+        peak_memory_bytes, peak_memory_without_images_bytes: of the GPU in training, the highest stage; None on a CPU.
+    """
+    iterations = [record.iterations for record in records]
+    means = [record.mean_gaussians for record in records if record.mean_gaussians is not None]
+    memory = [record.memory_bytes for record in records if record.memory_bytes]
+    whole = all(record.breakdown_seconds for record in records)
+    return {
+        "train_seconds": math.fsum(record.train_seconds for record in records),
+        "overhead_seconds": _sums(record.overhead_seconds for record in records),
+        "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
+        "num_gaussians": {str(record.level): record.num_gaussians for record in records},
+        "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
+        "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
+        "peak_gaussians": max(record.peak_gaussians for record in records),
+        "peak_memory_bytes": max((each["peak"] for each in memory), default=None),
+        "peak_memory_without_images_bytes": max((each["peak"] - each["images"] for each in memory), default=None),
+    }
+
+
+def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Each name's values added up."""
+    total: dict[str, float] = {}
+    for each in parts:
+        for name, value in each.items():
+            total[name] = total.get(name, 0.0) + value
+    return total
+
+
+def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
+    return math.fsum(value * weight for value, weight in zip(values, weights, strict=True)) / sum(weights)
