@@ -162,13 +162,3 @@ def check_joint_share(share: float) -> None:
     """
     if not 0.0 <= share <= 1.0:
         raise UserInputError(f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25")
-
-
-def joint_from(iterations: int, share: float) -> int | None:
-    """The first of the last `share` of so many iterations, counted from 1; None when there are none.
-
-    >>> joint_from(20_000, 0.25)
-    15001
-    """
-    first = iterations - round(iterations * share) + 1
-    return first if first <= iterations else None

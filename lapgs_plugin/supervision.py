@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import Stage
 
 DEFAULT_SSIM_WEIGHT = 0.2
 """Lambda of 3DGS's loss (1 - lambda) L1 + lambda (1 - SSIM)."""
@@ -151,3 +152,18 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
     return (weights / weights.sum()).to(device, dtype)
+
+
+def joint_from(stage: Stage, share: float, supervision: Supervision) -> int | None:
+    """The first iteration of a stage's last `share`, in which the finished fields are trained along; counted from 1.
+
+    None when there is none: in the base's stage, where the share is less than an iteration, and where residuals are
+    supervised alone, since nothing is composed there.
+
+    >>> joint_from(Stage(0, (800, 533), 20_000, signed=True), 0.25, Supervision.RECONSTRUCTED)
+    15001
+    """
+    if not stage.signed or supervision is not Supervision.RECONSTRUCTED:
+        return None
+    first = stage.iterations - round(stage.iterations * share) + 1
+    return first if first <= stage.iterations else None

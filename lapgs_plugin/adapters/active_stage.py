@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.adapters.joint import FinishedStage, JointLevels
-from lapgs_plugin.adapters.level_views import AnnouncingViews, make_level_view
+from lapgs_plugin.adapters.level_views import AnnouncingViews
 from lapgs_plugin.adapters.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import StageRendering
 from lapgs_plugin.adapters.stage_images import StageImages
@@ -232,9 +232,7 @@ class ActiveStage:
     def restore(self) -> Finished:
         """What `train` returned when this level was finished, from its archived field."""
         field = self._archive.field(self.stage.level)
-        gaussians = self._adapter.new_model(self._whole_call)
-        self._adapter.import_field(gaussians, field.to(self._device))
-        gaussians.active_sh_degree = field.sh_degree
+        gaussians = self._adapter.model_of(self._whole_call, field.to(self._device))
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.field_path(self.stage.level).with_name(OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
@@ -405,9 +403,9 @@ class ActiveStage:
         key = self._images.key(camera)
         if key not in self._views:
             size = self._images.size(camera, self.stage.level)
-            view = make_level_view(camera, size, lambda: self._rendering.target(key))
-            self._adapter.level_view(view, camera, size, self.stage.signed)
-            self._views[key] = view
+            self._views[key] = self._adapter.view_at(
+                camera, size, self.stage.signed, lambda: self._rendering.target(key)
+            )
         return self._views[key]
 
     def _announcing(self, views: list[Any]) -> list[Any]:

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_plugin.adapters.attachment import Replacement
+from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
@@ -271,6 +272,26 @@ class BackboneAdapter(ABC):
     def new_model(self, call: TrainingCall) -> Any:
         """A GaussianModel without Gaussians, as the script makes it."""
         return self.train.GaussianModel(call.dataset.sh_degree, *self.model_options(call))
+
+    def model_of(self, call: TrainingCall, field: GaussianField) -> Any:
+        """A GaussianModel of an archived field, to be rendered; its optimizer is not set up."""
+        gaussians = self.new_model(call)
+        self.import_field(gaussians, field)
+        gaussians.active_sh_degree = field.sh_degree
+        return gaussians
+
+    def view_at(self, camera: Any, size: tuple[int, int], signed: bool, image: Callable[[], Tensor]) -> Any:
+        """A camera of the checkout at a level's size.
+
+        Args:
+            camera: of the full-size image; left as it is.
+            size: (width, height) of the level.
+            signed: whether a residual is trained.
+            image: gives the level's (3, height, width).
+        """
+        view = make_level_view(camera, size, image)
+        self.level_view(view, camera, size, signed)
+        return view
 
     def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
         """What the script gives its GaussianModel after the SH degree."""

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import GROUPS, TrainingCall
-from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.run_state import RunContext
 from lapgs_plugin.adapters.shim import StageRendering
 from lapgs_plugin.adapters.stage_images import StageImages
@@ -24,7 +23,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.raising import raised
+from lapgs_plugin.rendering.raising import add_raised, raised
 from lapgs_plugin.signed_color import ColorPath
 
 ADAM_EPS = 1e-15
@@ -87,14 +86,10 @@ class JointLevels:
         self._cameras = {images.key(camera): camera for camera in images.cameras}
         views = {id(camera.world_view_transform): key for key, camera in self._cameras.items()}
         self._fields = [self._thawed(one, views, path) for one in finished]
-        self._optimizers: list[torch.optim.Optimizer] = []
 
     def _thawed(self, finished: FinishedStage, views: dict[int, str], path: ColorPath) -> _FinishedField:
         adapter, device, call = self._context.adapter, self._context.device, finished.call
-        gaussians = adapter.new_model(call)
-        archived = self._archive.field(finished.stage.level)
-        adapter.import_field(gaussians, archived.to(device))
-        gaussians.active_sh_degree = archived.sh_degree
+        gaussians = adapter.model_of(call, self._archive.field(finished.stage.level).to(device))
         rendering = StageRendering(signed=finished.stage.signed, path=path, views=views, capture=True)
         background = torch.full((3,), float(call.dataset.white_background), device=device)
         return _FinishedField(finished, gaussians, rendering, background)
@@ -119,7 +114,6 @@ class JointLevels:
             ]
             on_gpu = self._context.device.type == "cuda"
             following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=on_gpu)
-            self._optimizers.append(following)
             leading.register_step_post_hook(_Follow(following))
 
     def announce(self, key: str) -> None:
@@ -132,7 +126,7 @@ class JointLevels:
         for one in self._fields:
             width, height = self._images.size(camera, one.of.stage.level)
             image = self._render(one, key, (width, height))
-            composed = image if composed is None else image + raised(self._pyramid, composed, (height, width))
+            composed = image if composed is None else add_raised(self._pyramid, composed, image)
         assert composed is not None
         width, height = self._images.size(camera, self._fields[-1].of.stage.level - 1)
         return raised(self._pyramid, composed, (height, width)).to(dtype or composed.dtype)
@@ -140,9 +134,7 @@ class JointLevels:
     def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
         """(3, h, w) of one field alone."""
         if key not in one.views:
-            camera = self._cameras[key]
-            one.views[key] = view = make_level_view(camera, size, _no_image)
-            self._context.adapter.level_view(view, camera, size, one.of.stage.signed)
+            one.views[key] = self._context.adapter.view_at(self._cameras[key], size, one.of.stage.signed, _no_image)
         shim = self._context.shim
         outer, shim.stage = shim.stage, one.rendering
         try:

@@ -19,9 +19,9 @@ from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore
-from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, joint_from, parse_split
+from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, parse_split
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.supervision import Supervision, parse_supervision
+from lapgs_plugin.supervision import joint_from, parse_supervision
 from lapgs_plugin.watching import Watcher
 
 PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
@@ -81,9 +81,7 @@ class HierarchyOptions:
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""
-        if not stage.signed or parse_supervision(self.supervision) is not Supervision.RECONSTRUCTED:
-            return None
-        return joint_from(stage.iterations, self.joint)
+        return joint_from(stage, self.joint, parse_supervision(self.supervision))
 
     def shares(self) -> tuple[Fraction, ...] | None:
         """Of the iterations for each stage, coarsest first; None leaves them to `StagePlan`."""

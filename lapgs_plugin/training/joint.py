@@ -17,7 +17,7 @@ from lapgs_plugin.field import GaussianField
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer, render_image
 from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.raising import raised
+from lapgs_plugin.rendering.raising import add_raised, raised
 from lapgs_plugin.training.model import TrainableField
 
 
@@ -47,8 +47,7 @@ class JointFields:
             camera = level_camera(self.cameras[name], level)
             background = self.background.new_zeros(3) if model.signed else self.background
             image = self._render(level, model, camera, background)
-            below = None if composed is None else raised(self.pyramid, composed, (camera.height, camera.width))
-            composed = image if below is None else image + below
+            composed = image if composed is None else add_raised(self.pyramid, composed, image)
         assert composed is not None
         camera = level_camera(self.cameras[name], min(self.models) - 1)
         return raised(self.pyramid, composed, (camera.height, camera.width))

@@ -8,9 +8,9 @@ from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.plan import Stage, check_joint_share, joint_from
+from lapgs_plugin.plan import Stage, check_joint_share
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.supervision import Supervision, parse_supervision
+from lapgs_plugin.supervision import joint_from, parse_supervision
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
@@ -97,13 +97,8 @@ class TrainSettings:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
     def joint_from(self, stage: Stage) -> int | None:
-        """The iteration of a stage from which the finished fields are trained along; None when they never are.
-
-        Ablations that supervise residuals alone have no use for it: nothing is composed there.
-        """
-        if not stage.signed or parse_supervision(self.supervision) is not Supervision.RECONSTRUCTED:
-            return None
-        return joint_from(stage.iterations, self.joint)
+        """The iteration of a stage from which the finished fields are trained along; None when they never are."""
+        return joint_from(stage, self.joint, parse_supervision(self.supervision))
 
     def for_manifest(self) -> dict[str, Any]:
         """The settings as keyword arguments of `Manifest`: those it names itself, and the rest under "settings"."""
