@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import typer
 from plyfile import PlyData
-from typer.testing import CliRunner
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.export import export
-from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_run, write_scene
 from tests.unit.test_spz import read_spz
 
@@ -22,14 +22,7 @@ app.command("export")(export)
 VIEWERS_NEED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
 VIEWERS_NEED += ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 """What SuperSplat, antimatter15's viewer and gsplat.js look for in a PLY's vertices."""
-
-
-def lapgs_export(*arguments: object) -> str:
-    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs_export = succeeding(app, columns=200)
 
 
 @pytest.fixture

@@ -13,18 +13,18 @@ import torch
 import torch.nn.functional as F
 import typer
 from torch import Tensor
-from typer.testing import CliRunner
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.cli.report import report
-from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.scenes import read_image
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_scene
 from tests.training_scene import blob_field
 
@@ -33,15 +33,7 @@ for command, function in (("import-run", import_run), ("render", render), ("eval
     app.command(command)(function)
 
 FASTGS = "diff_gaussian_rasterization_fastgs"
-
-
-def lapgs(*arguments: object) -> str:
-    """Standard output of a command that succeeds; a LapgsError comes through as it is."""
-    result = CliRunner(env={"COLUMNS": "100"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs = succeeding(app, columns=100)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 import typer
-from typer.testing import CliRunner
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.render import render
@@ -20,6 +19,7 @@ from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.rendering.trajectory import trajectory_json
 from lapgs_plugin.scenes import read_image
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_run, write_scene
 
 app = typer.Typer()
@@ -28,14 +28,7 @@ app.command("render")(render)
 needs_video = pytest.mark.skipif(
     importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs the extra 'video' (imageio-ffmpeg)"
 )
-
-
-def lapgs_render(*arguments: object) -> str:
-    result = CliRunner(env={"COLUMNS": "100"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs_render = succeeding(app, columns=100)
 
 
 @pytest.fixture(scope="module")

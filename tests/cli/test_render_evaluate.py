@@ -18,24 +18,17 @@ from typer.testing import CliRunner
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.render import render
-from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError, UserInputError
+from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.scenes import read_image
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
 
 app = typer.Typer()
 app.command("render")(render)
 app.command("eval")(evaluate)
-
-
-def lapgs(*arguments: object) -> str:
-    """Standard output of a command that succeeds; a LapgsError comes through as it is."""
-    result = CliRunner(env={"COLUMNS": "100"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs = succeeding(app, columns=100)
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.report import report
-from lapgs_plugin.errors import LapgsError, RunFolderError
+from lapgs_plugin.errors import RunFolderError
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 
 app = typer.Typer()
@@ -65,12 +65,7 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def lapgs_report(*arguments: object) -> str:
-    result = CliRunner(env={"COLUMNS": "120"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs_report = succeeding(app, columns=120)
 
 
 @pytest.fixture(scope="module")

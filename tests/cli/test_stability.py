@@ -7,25 +7,18 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
-from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.rendering.trajectory import trajectory_json
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 
 app = typer.Typer()
 app.command("eval")(evaluate)
-
-
-def lapgs_eval(*arguments: object) -> str:
-    result = CliRunner(env={"COLUMNS": "120"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs_eval = succeeding(app, columns=120)
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from lapgs_plugin.cli.run import CONTEXT, run
 from lapgs_plugin.cli.train import train
-from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_scene
 from tests.contract.stub_runs import STUBS
 
@@ -22,14 +22,7 @@ pytest.importorskip("viser", reason="needs the extra 'viewer'")
 app = typer.Typer()
 app.command("train")(train)
 app.command("run", context_settings=CONTEXT)(run)
-
-
-def lapgs(*arguments: object) -> str:
-    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs = succeeding(app, columns=200)
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
+from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
@@ -26,15 +26,7 @@ from lapgs_plugin.viewer.server import Viewer  # noqa: E402
 
 app = typer.Typer()
 app.command("view")(view)
-
-
-def lapgs_view(*arguments: object) -> str:
-    """What the command prints until somebody presses Ctrl-C."""
-    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [str(argument) for argument in arguments])
-    if isinstance(result.exception, LapgsError):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.stdout
+lapgs_view = succeeding(app, columns=200)
 
 
 @pytest.fixture(autouse=True)
