@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lapgs_plugin.adapters import gsplat_direct
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.field import GaussianField
@@ -70,6 +71,8 @@ class GsplatRasterizer:
         absgrad: offer `RenderResult.absgrad2d`, which costs a little of the backward pass.
         own_radii: let `RenderResult.radii` be gsplat's, which bound where alpha reaches 1/255, instead of computing
             those of three sigma; training looks at which are above 0 alone.
+        direct: call gsplat's kernels directly where that is known to be right, which takes half of the launches
+            (`gsplat_direct`); not while packing or antialiasing.
 
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
@@ -83,12 +86,15 @@ class GsplatRasterizer:
         packed: bool = False,
         absgrad: bool = True,
         own_radii: bool = False,
+        direct: bool = True,
     ) -> None:
         self._device = torch.device(device)
         if self._device.type == "cuda" and (reason := missing()):
             raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
         self._mode = "antialiased" if antialiasing else "classic"
         self._packed, self._absgrad, self._own_radii = packed, absgrad, own_radii
+        self._may_be_direct = direct and self._device.type == "cuda" and not (packed or antialiasing)
+        self._shots = _Shots()
 
     @property
     def name(self) -> str:
@@ -124,6 +130,8 @@ class GsplatRasterizer:
                 image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
             )
         degree = field.sh_degree if sh_degree is None else sh_degree
+        if self._direct:
+            return self._call_directly(field, camera, background, degree, differentiated)
         images, alphas, found = self._rasterize(field, [camera], background, degree, absgrad2d is not None)
         if differentiated:
             _hand_over_gradients(found, means2d, absgrad2d)
@@ -141,6 +149,9 @@ class GsplatRasterizer:
         if len(field) == 0:
             return self(field, camera, background=background, sh_degree=sh_degree).image
         degree = field.sh_degree if sh_degree is None else sh_degree
+        if self._direct:
+            shot = self._shots.of(camera, field.means)
+            return gsplat_direct.render(field, shot, background.to(field.means), degree, describes=False)[0]
         return _planes(self._rasterize(field, [camera], background, degree, absgrad=False)[0])
 
     @torch.no_grad()
@@ -149,8 +160,30 @@ class GsplatRasterizer:
         if len(field) == 0:
             shape = len(cameras), 3, cameras[0].height, cameras[0].width
             return background.to(field.means)[:, None, None].expand(shape)
+        if self._direct and len(cameras) == 1:
+            return self.render_image(field, cameras[0], background=background)[None]
         images, _, _ = self._rasterize(field, cameras, background, field.sh_degree, absgrad=False)
         return images.permute(0, 3, 1, 2)
+
+    @property
+    def _direct(self) -> bool:
+        return self._may_be_direct and gsplat_direct.works()
+
+    def _call_directly(
+        self, field: GaussianField, camera: Camera, background: Tensor, degree: int, differentiated: bool
+    ) -> RenderResult:
+        absgrad, shot = differentiated and self._absgrad, self._shots.of(camera, field.means)
+        image, seen, listeners = gsplat_direct.render(
+            field, shot, background.to(field.means), degree, describes=True, absgrad=absgrad
+        )
+        with torch.no_grad():
+            radii = seen.shown_radii
+            if not self._own_radii:
+                radii = torch.where(radii > 0, _three_sigma_radii(seen.conics[0]), 0).to(torch.int32)
+        means2d = seen.centres.requires_grad_(differentiated)
+        absgrad2d = means2d.new_zeros(means2d.shape) if absgrad else None
+        listeners += [weakref.ref(tensor) for tensor in (means2d, absgrad2d) if tensor is not None]
+        return RenderResult(image, None, radii, means2d, absgrad2d)
 
     def _rasterize(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, absgrad: bool
@@ -226,6 +259,24 @@ def _harmonics(field: GaussianField, degree: int, viewmats: Tensor, positions: T
 def _takes_cameras(spherical_harmonics: Callable[..., Tensor]) -> bool:
     """Whether it is gsplat's from 1.6.0 on, which wants means and poses where earlier ones want directions."""
     return "viewmats" in inspect.signature(spherical_harmonics).parameters
+
+
+class _Shots:
+    """Cameras as a GPU wants them, sent there once: a training view comes back some hundred times."""
+
+    def __init__(self) -> None:
+        self._sent: dict[int, tuple[weakref.ref[Camera], gsplat_direct.Shot]] = {}
+
+    def of(self, camera: Camera, like: Tensor) -> gsplat_direct.Shot:
+        """The camera beside `like`."""
+        known, shot = self._sent.get(id(camera), (None, None))
+        if known is None or shot is None or known() is not camera or shot.pose.device != like.device:
+            poses, intrinsics, centres = _on_device([camera], like)
+            intrinsics, poses = intrinsics.contiguous(), poses.contiguous()
+            shot = gsplat_direct.Shot(poses, intrinsics, centres[0].contiguous(), camera.width, camera.height)
+            place, sent = id(camera), self._sent
+            sent[place] = (weakref.ref(camera, lambda _: sent.pop(place, None)), shot)
+        return shot
 
 
 def _on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, Protocol
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
+from lapgs_plugin.kernel_check import is_right
 from lapgs_plugin.raster import RenderResult
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
@@ -116,14 +118,16 @@ class Densifier:
     def _accumulate(self, result: RenderResult, camera: Camera) -> None:
         """What gsplat's strategy does between two refinements, for all Gaussians: it selects visible ones, and to learn
         how many there are the processor waits for a GPU."""
-        gradient = self._gradient(result).clone()  # (n, 2)
-        gradient[:, 0] *= camera.width / 2.0
-        gradient[:, 1] *= camera.height / 2.0
-        shown = result.radii > 0
+        gradient = self._gradient(result)  # (n, 2)
         if self.state["grad2d"] is None:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
-        self.state["grad2d"] += torch.where(shown, gradient.norm(dim=-1), 0.0)
-        self.state["count"] += shown
+        given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
+        if gradient.device.type == "cuda" and _in_triton():
+            from lapgs_plugin.training.densification_triton import add_statistics
+
+            add_statistics(*given)
+        else:
+            _add_statistics(*given)
 
     def _gradient(self, result: RenderResult) -> Tensor:
         """(n, 2), by the centres on the image, absolute where so asked."""
@@ -134,6 +138,31 @@ class Densifier:
     def regularization(self, field: GaussianField) -> Tensor | None:
         """None: nothing is added to the loss."""
         return None
+
+
+def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
+    """`densification_triton.add_statistics` in PyTorch's operations."""
+    shown = radii > 0
+    scaled = gradient.clone()
+    scaled[:, 0] *= size[0] / 2.0
+    scaled[:, 1] *= size[1] / 2.0
+    norms += torch.where(shown, scaled.norm(dim=-1), 0.0)
+    counts += shown
+
+
+@lru_cache(maxsize=1)
+def _in_triton() -> bool:
+    def difference() -> float:
+        from lapgs_plugin.training.densification_triton import add_statistics
+
+        gradient = torch.linspace(-1, 1, 600, device="cuda").view(300, 2)
+        radii = torch.arange(300, dtype=torch.int32, device="cuda") % 3
+        sums = [torch.ones(2, 300, device="cuda") for _ in range(2)]
+        for add, both in zip((add_statistics, _add_statistics), sums, strict=True):
+            add(gradient, radii, (8, 6), both[0], both[1])
+        return float((sums[0] - sums[1]).abs().max())
+
+    return is_right("statistics of densification in several operations instead of one kernel", difference, 1e-5)
 
 
 class McmcDensifier:

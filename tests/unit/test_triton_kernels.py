@@ -1,0 +1,83 @@
+"""Our Triton kernels against PyTorch's autograd: interpreted on a CPU, compiled on a GPU."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+CHECKS = """
+import torch
+from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown, finish_gradients
+from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+from lapgs_plugin.supervision_triton import weighted_l1
+from lapgs_plugin.training.densification_triton import add_statistics
+
+def close(found, expected, absolute=1e-5, relative=1e-4):
+    torch.testing.assert_close(found, expected, atol=absolute, rtol=relative)
+
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+n = 300
+centre = torch.tensor([0.3, -0.2, 0.5])
+for degree, active, signed in ((3, 3, False), (3, 3, True), (3, 1, False), (2, 2, True), (3, 0, False), (0, 0, True)):
+    means, log_scales = (torch.randn(n, 3, requires_grad=True) for _ in range(2))
+    logits = torch.randn(n, requires_grad=True)
+    sh = (torch.randn(n, (degree + 1) ** 2, 3) / 2).requires_grad_()
+    radii, pixels = torch.randint(0, 3, (n, 2), dtype=torch.int32), torch.randn(n, 2)
+    shown = (radii > 0).all(-1)
+    scales, opacities = activated(log_scales.detach(), logits.detach())
+    close(scales, log_scales.exp())
+    close(opacities, logits.sigmoid())
+    given = means.detach(), centre, sh.detach(), active, signed, radii
+    colors, largest, centres = colors_of_shown(*given, pixels)
+    seen = sh_to_color(sh, torch.nn.functional.normalize(means - centre, dim=-1), active, signed=signed)
+    close(colors[shown], seen[shown])
+    assert (largest == torch.where(shown, radii.amax(-1), 0)).all()
+    close(centres, torch.where(shown[:, None], pixels - 0.5, 0.0))
+    assert colors_of_shown(*given, None)[1].numel() == 0
+
+    by_color, by_mean, by_scale = (torch.randn(n, 3) * shown[:, None] for _ in range(3))
+    by_opacity = torch.randn(n)
+    loss = (seen * by_color).sum() + (means * by_mean).sum()
+    loss = loss + (log_scales.exp() * by_scale).sum() + (logits.sigmoid() * by_opacity).sum()
+    expected = torch.autograd.grad(loss, (means, log_scales, logits, sh))
+    by_sh = finish_gradients(*given, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity)
+    for found, wanted in zip((by_mean, by_scale, by_opacity, by_sh), expected, strict=True):
+        close(found, wanted)
+
+prediction, target = torch.randn(3, 31, 45, requires_grad=True), torch.randn(3, 31, 45)
+losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
+close(*losses)
+close(*(torch.autograd.grad(3 * loss, prediction)[0] for loss in losses))
+broken = prediction.detach().clone()
+broken[1, 2, 3] = torch.nan
+assert weighted_l1(broken, target, 0.8, 0.2).isnan()
+
+norms, counts = torch.rand(n), torch.rand(n)
+expected = norms + torch.where(shown, (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1), 0.0), counts + shown
+add_statistics(pixels, torch.where(shown, 5, 0).int(), (40, 30), norms, counts)
+close(norms, expected[0])
+close(counts, expected[1])
+"""
+
+
+def run_checks(device: str, **environment: str) -> None:
+    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{CHECKS}"]
+    done = subprocess.run(command, check=False, env={**os.environ, **environment}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+def test_interpreted() -> None:
+    run_checks("cpu", TRITON_INTERPRET="1")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_compiled() -> None:
+    run_checks("cuda")
