@@ -71,8 +71,8 @@ class GsplatRasterizer:
         absgrad: offer `RenderResult.absgrad2d`, which costs a little of the backward pass.
         own_radii: let `RenderResult.radii` be gsplat's, which bound where alpha reaches 1/255, instead of computing
             those of three sigma; training looks at which are above 0 alone.
-        direct: call gsplat's kernels directly where that is known to be right, which takes half of the launches
-            (`gsplat_direct`); not while packing or antialiasing.
+        direct: call gsplat's kernels directly, which takes half of the launches (`gsplat_direct`). None: where that is
+            found to be right. Not while packing or antialiasing.
 
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
@@ -86,14 +86,15 @@ class GsplatRasterizer:
         packed: bool = False,
         absgrad: bool = True,
         own_radii: bool = False,
-        direct: bool = True,
+        direct: bool | None = None,
     ) -> None:
         self._device = torch.device(device)
         if self._device.type == "cuda" and (reason := missing()):
             raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
         self._mode = "antialiased" if antialiasing else "classic"
         self._packed, self._absgrad, self._own_radii = packed, absgrad, own_radii
-        self._may_be_direct = direct and self._device.type == "cuda" and not (packed or antialiasing)
+        self._may_be_direct = self._device.type == "cuda" and not (packed or antialiasing) and direct is not False
+        self._must_be_direct = bool(direct)
         self._shots = _Shots()
 
     @property
@@ -167,7 +168,7 @@ class GsplatRasterizer:
 
     @property
     def _direct(self) -> bool:
-        return self._may_be_direct and gsplat_direct.works()
+        return self._may_be_direct and (self._must_be_direct or gsplat_direct.works())
 
     def _call_directly(
         self, field: GaussianField, camera: Camera, background: Tensor, degree: int, differentiated: bool
