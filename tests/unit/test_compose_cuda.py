@@ -84,7 +84,7 @@ def test_fields_come_when_they_are_needed(renderer: HierarchyRenderer, keep: boo
     torch.cuda.synchronize()
     size = sum(value.nbytes for field in waiting.values() for value in field.parameters.values())
     taken = torch.cuda.memory_allocated() - before
-    # Besides the fields: two colours, and each of some twenty tensors rounded up to 512 bytes.
+    # Besides the fields: two colours and what the rasterizer keeps of cameras, each tensor rounded up to 512 bytes.
     assert abs(taken - (size if keep else 0)) < size / 20
 
 
