@@ -25,6 +25,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import SupportsInt
 
 import torch
 from torch import Tensor
@@ -363,6 +364,7 @@ class _PageLocked:
         address, portable = self._bytes.data_ptr(), 1
         result = runtime.cudaHostRegister(address, length, portable)
         if int(result) != 0:
+            _forget_refusal(device)
             raise UserInputError(
                 f"{num_bytes:,} more bytes of memory cannot be page-locked for images "
                 f"({runtime.cudaGetErrorString(result)}); expected room for all of them; "
@@ -376,11 +378,23 @@ class _PageLocked:
         return self._bytes[: math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
 
 
-def _release(room: Tensor, address: int, device: torch.device, unregister: Callable[[int], object]) -> None:
+def _release(room: Tensor, address: int, device: torch.device, unregister: Callable[[int], SupportsInt]) -> None:
     """Let go of page-locked memory; `room` is an argument so that it outlives its registration."""
     with contextlib.suppress(RuntimeError):  # a GPU that failed copies nothing any more
         torch.cuda.synchronize(device)  # a copy may be under way
-    unregister(address)
+    if int(unregister(address)) != 0:
+        _forget_refusal(device)
+
+
+def _forget_refusal(device: torch.device) -> None:
+    """Let the CUDA runtime forget that it refused a call of this thread.
+
+    It remembers until it is asked, and PyTorch asks after each of its launches: one that has nothing to do with it
+    would raise. PyTorch has no binding to ask by, and a second copy of the runtime would not know, so a launch of
+    nothing asks.
+    """
+    with contextlib.suppress(RuntimeError):
+        torch.ones((), device=device)
 
 
 def _buffer(tensor: Tensor) -> memoryview:

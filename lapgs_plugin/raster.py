@@ -46,12 +46,16 @@ class Semantics:
         expanded_conic_gradient: True where the backward pass takes the gradient of the inverse 2D covariance to that of
             the covariance by matrix products, as such or multiplied out. In float32 that loses the gradients of
             Gaussians that are very long on screen; see `evaluation.conformance.EXPANDED_CONIC`.
+        rebuilt_transmittance: True where the forward pass keeps a pixel's opacity, and the backward pass takes the
+            transmittance from that. In float32 little of a small one is left; see
+            `evaluation.conformance.REBUILT_TRANSMITTANCE`.
         departures: reasons by the name of the conformance case for which another image or gradient is right.
         note: the departures in words, for reports.
     """
 
     three_sigma_cut: bool = True
     expanded_conic_gradient: bool = False
+    rebuilt_transmittance: bool = False
     departures: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
 

@@ -34,6 +34,7 @@ LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
 SEMANTICS = Semantics(
     three_sigma_cut=False,
     expanded_conic_gradient=True,
+    rebuilt_transmittance=True,
     departures={
         "saturated": "alpha is capped at 0.999, without a gradient there",
         **dict.fromkeys(("off_centre", "outside_frustum", "same_plane"), LIMIT),
@@ -42,7 +43,7 @@ SEMANTICS = Semantics(
     "Jacobian's limit counts from the border of the image instead of 1.3 half sides from its centre, which differs for "
     "principal points off the centre, and beyond it depth has another gradient; footprints end where alpha = 1/255 "
     "instead of at three sigma; a depth of exactly 0.2 is not culled; gradients of needles are right to a few "
-    "thousandths",
+    "thousandths, and by way of pixels that are nearly opaque to 3e-4",
 )
 
 

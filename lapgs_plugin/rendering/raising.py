@@ -102,8 +102,13 @@ def _triton_works() -> bool:
     return True
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
-    """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1."""
+    """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1.
+
+    The gradient is checked whatever the caller is doing: the answer is kept for all who ask later.
+    """
     from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
 
     # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.

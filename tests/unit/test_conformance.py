@@ -74,7 +74,7 @@ def image_of(change: Callable[[Tensor], Tensor]) -> Callable[[RenderResult], Ren
     return lambda result: replace(result, image=change(result.image))
 
 
-def scaled_gradient(factor: float) -> Callable[[Tensor], Tensor]:
+def scaled_gradient(factor: float | Tensor) -> Callable[[Tensor], Tensor]:
     """The same values with another derivative."""
     return lambda value: factor * value + ((1 - factor) * value).detach()
 
@@ -239,6 +239,28 @@ def test_needles_alone_suffer_from_a_multiplied_out_conic_gradient(name: str, mo
         assert check_case(Subject("expanded", ORACLE, semantics=known), case).problems == ()
         unknown = check_case(Subject("expanded", ORACLE), case).problems
         assert any("gradient of log_scales is off" in problem for problem in unknown) == (name == "needles")
+
+
+def with_rebuilt_transmittance(result: RenderResult) -> RenderResult:
+    """With gradients that are, by way of each pixel, as much too long as a transmittance that was 1 - (1 - T)."""
+    assert result.transmittance is not None
+    left = result.transmittance.detach()  # (h, w), float32
+    factors = torch.where(left > 0, (1 - (1 - left)) / left, 1)  # (h, w)
+    return replace(result, image=scaled_gradient(factors)(result.image))
+
+
+@pytest.mark.parametrize("name", ["opaque_crowd", "crowd", "degree_2_coloured"])
+def test_opaque_pixels_alone_suffer_from_a_rebuilt_transmittance(name: str) -> None:
+    """What is granted to code that keeps opacities is what that costs in float32, and granted nowhere else."""
+    rebuilding = Mutant(after=with_rebuilt_transmittance)
+    known = Semantics(rebuilt_transmittance=True)
+    for signed in (False, True):
+        case = replace(by_name()[name], field=replace(by_name()[name].field, signed=signed))
+        assert check_case(Subject("rebuilding", rebuilding, semantics=known), case).problems == ()
+        unknown = check_case(Subject("rebuilding", rebuilding), case).problems
+        assert any("gradient of opacity_logits is off" in line for line in unknown) == (
+            name == "opaque_crowd" and not signed
+        )
 
 
 def test_without_the_cut_what_is_blended_nowhere_may_have_no_radius() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import mmap
 import random
 import threading
 import time
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from lapgs_plugin import imagestore
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
-from lapgs_plugin.imagestore import AHEAD, ImageStore, place
+from lapgs_plugin.imagestore import AHEAD, ImageStore, _PageLocked, _release, place
 
 ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
 
@@ -271,6 +272,77 @@ def test_a_gpu_keeps_what_is_small_beside_it(monkeypatch: pytest.MonkeyPatch, me
     assert [place(limit + more, "cuda") for more in (-1, 0, 1)] == ["gpu", "gpu", "memory"]
 
 
+class Runtime:
+    """CUDA's, as it is about page-locked memory: it remembers an error until a launch of this thread asks for it.
+
+    Attributes:
+        full: it refuses to register any more.
+        registered: bytes by address.
+        last_error: 0 for none.
+    """
+
+    def __init__(self) -> None:
+        self.full, self.registered, self.last_error = False, dict[int, int](), 0
+
+    def cudaHostRegister(self, address: int, length: int, flags: int) -> int:
+        assert address % mmap.PAGESIZE == length % mmap.PAGESIZE == 0
+        assert flags == 1
+        if self.full:
+            self.last_error = 2
+            return 2
+        for other, other_length in self.registered.items():
+            assert address + length <= other or other + other_length <= address
+        self.registered[address] = length
+        return 0
+
+    def cudaHostUnregister(self, address: int) -> int:
+        if self.registered.pop(address, None) is None:
+            self.last_error = 713
+            return 713
+        return 0
+
+    def cudaGetErrorString(self, error: int) -> str:
+        return {2: "out of memory"}[error]
+
+    def launch(self, *_: object, **__: object) -> None:
+        error, self.last_error = self.last_error, 0
+        if error:
+            raise RuntimeError("CUDA error")
+
+
+@pytest.fixture
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Runtime:
+    found = Runtime()
+    monkeypatch.setattr(torch.cuda, "cudart", lambda: found)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(torch, "ones", found.launch)
+    return found
+
+
+@pytest.mark.parametrize("num_bytes", [1, mmap.PAGESIZE - 1, mmap.PAGESIZE, mmap.PAGESIZE + 1, 1_000_003])
+def test_whole_pages_are_locked_and_let_go_once(runtime: Runtime, num_bytes: int) -> None:
+    every = [_PageLocked(num_bytes, torch.device("cpu")) for _ in range(4)]
+    addresses = [each.view(torch.Size([num_bytes]), torch.uint8).data_ptr() for each in every]
+    assert list(runtime.registered) == addresses
+    assert all(num_bytes <= length < num_bytes + mmap.PAGESIZE for length in runtime.registered.values())
+    del every
+    gc.collect()
+    assert (runtime.registered, runtime.last_error) == ({}, 0)
+
+
+def test_a_refusal_of_the_driver_is_one_line_and_forgotten(runtime: Runtime) -> None:
+    runtime.full = True
+    with pytest.raises(
+        UserInputError, match=r"5,000 more bytes .* \(out of memory\); expected room .* lower precision$"
+    ):
+        _PageLocked(5_000, torch.device("cpu"))
+    gc.collect()
+    assert runtime.last_error == 0
+    never = torch.empty(1, dtype=torch.uint8)
+    _release(never, never.data_ptr(), torch.device("cpu"), runtime.cudaHostUnregister)
+    assert runtime.last_error == 0
+
+
 # On a GPU
 
 
@@ -328,9 +400,29 @@ def test_memory_is_page_locked_and_let_go(tmp_path: Path) -> None:
         image = kept._images["a"]
         assert image.stored is not None
         assert image.page_locked is not None
-        # `is_pinned` asks about the first byte of a tensor's storage, and ours begins before the pages that are locked.
-        assert torch.from_numpy(image.stored.numpy()).is_pinned()
-        address = image.stored.data_ptr()
+        stored = image.stored
+        assert is_page_locked(stored)
         del image
     gc.collect()
-    assert int(torch.cuda.cudart().cudaHostUnregister(address)) != 0  # not registered any more
+    assert not is_page_locked(stored)  # memory that is still there, and is not registered any more
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_what_the_driver_refused_is_not_reported_by_what_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = torch.device("cuda")
+    kept = _PageLocked(10_000, device)
+    pages = kept.view(torch.Size([10_000]), torch.uint8)
+    with monkeypatch.context() as patched:
+        patched.setattr(torch, "empty", lambda *size, dtype: pages)
+        with pytest.raises(UserInputError, match="page-locked"):
+            _PageLocked(5_000, device)
+    assert float(torch.ones(3, device=device).sum()) == 3
+    never = torch.empty(10_000, dtype=torch.uint8)
+    _release(never, never.data_ptr(), device, torch.cuda.cudart().cudaHostUnregister)
+    assert float(torch.ones(3, device=device).sum()) == 3
+
+
+def is_page_locked(stored: Tensor) -> bool:
+    # `is_pinned` asks about the first byte of a tensor's storage, and ours begins before the pages that are locked.
+    return torch.from_numpy(stored.numpy()).is_pinned()

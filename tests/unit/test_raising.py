@@ -6,7 +6,10 @@ import importlib.util
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -98,17 +101,41 @@ def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
     torch.testing.assert_close(taken, leaf.grad[:, 0], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False)])
-def test_a_kernel_that_is_off_is_noticed(factor: float, right: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the difference that decides whether it is used at all; a stand-in on the CPU takes its place."""
+def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """What runs on a CPU in place of the kernels: PyTorch's operations, and of the sum so many times Up."""
     kernels = ModuleType("kernels")
     vars(kernels).update(
         raised_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
         add_raised_triton=lambda pyramid, coarse, fine: factor * pyramid.up(coarse, fine.shape[-2:]) + fine,
     )
     monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.raising_triton", kernels)
+
+
+@pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False)])
+def test_a_kernel_that_is_off_is_noticed(factor: float, right: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the difference that decides whether it is used at all."""
+    put_in_place(monkeypatch, factor)
     difference = raising._difference_in_triton(Pyramid(), torch.device("cpu"))
     assert (difference <= raising.LARGEST_DIFFERENCE) == right
+
+
+class _Asking(torch.autograd.Function):
+    """Asks while PyTorch is in a forward pass of ours, where gradients are off."""
+
+    @staticmethod
+    def forward(ctx: Any, answer: torch.Tensor) -> torch.Tensor:
+        return answer + raising._difference_in_triton(Pyramid(), torch.device("cpu"))
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_kernel_is_checked_whatever_the_caller_is_doing(
+    mode: Callable[[], AbstractContextManager[None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_in_place(monkeypatch, 1.0)
+    with mode():
+        assert raising._difference_in_triton(Pyramid(), torch.device("cpu")) == 0.0
+    difference = _Asking.apply(torch.zeros((), requires_grad=True))  # type: ignore[no-untyped-call]  # torch's
+    assert float(difference.detach()) == 0.0
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
