@@ -12,9 +12,9 @@ from torch import Tensor
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.adam import FieldAdam
 from lapgs_plugin.splats import SPLAT_NAMES, field_from_splats, splats_from_field
-from lapgs_plugin.training.settings import LearningRates
+from lapgs_plugin.training.gpu_adam import GpuFieldAdam, adam_in_triton, step_together
+from lapgs_plugin.training.settings import ADAM_EPS, LearningRates
 
-ADAM_EPS = 1e-15
 SH_REST_SCALE = 1 / 20
 """SH coefficients above degree 0 learn at a twentieth of the rate of degree 0, as in 3DGS."""
 
@@ -24,9 +24,9 @@ class TrainableField:
     """A field being optimized. `params` and `optimizers` are edited in place by densification.
 
     Attributes:
-        params: by the name that gsplat's strategies know it by, each (n, ...) with gradients. The coefficients of a
-            field on a GPU are two, "sh0" and "shN", because PyTorch's Adam has one learning rate for a tensor; our own
-            knows one a column, and they are "sh".
+        params: by the name that gsplat's strategies know it by, each (n, ...) with gradients. SH are one tensor, "sh",
+            where our own Adam steps, which knows a rate for columns. Where PyTorch's or gsplat's does, which have one
+            for a tensor, they are two, "sh0" and "shN".
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
         sparse: whether a step moves visible Gaussians alone.
@@ -49,24 +49,23 @@ class TrainableField:
             extent: of the scene, in world units; scales the steps of positions.
             sparse: with gsplat's `SelectiveAdam`, on a GPU.
         """
-        if field.means.device.type != "cpu":
-            return cls._on_gpu(field, rates, extent, sparse)
+        on_gpu = field.means.device.type != "cpu"
+        if sparse or (on_gpu and not adam_in_triton()):
+            return cls._in_two(field, rates, extent, sparse)
         names = {**SPLAT_NAMES, "sh": "sh"}
         params = {
             name: torch.nn.Parameter(getattr(field, attribute).detach().clone().contiguous())
             for name, attribute in names.items()
         }
-        sh_scale = torch.full(params["sh"].shape[1:], SH_REST_SCALE)
-        sh_scale[0] = 1.0
+        make = GpuFieldAdam if on_gpu else _cpu_adam
         rate = _rates(field, rates, extent)
         optimizers = {
-            name: FieldAdam([param], lr=rate[name], eps=ADAM_EPS, column_scale=sh_scale if name == "sh" else None)
-            for name, param in params.items()
+            name: make(param, rate[name], SH_REST_SCALE if name == "sh" else 1.0) for name, param in params.items()
         }
         return cls(params, optimizers, field.signed)
 
     @classmethod
-    def _on_gpu(cls, field: GaussianField, rates: LearningRates, extent: float, sparse: bool) -> TrainableField:
+    def _in_two(cls, field: GaussianField, rates: LearningRates, extent: float, sparse: bool) -> TrainableField:
         splats = splats_from_field(field)
         if field.sh_degree == 0:
             del splats["shN"]  # no coefficients, nothing to optimize
@@ -98,7 +97,9 @@ class TrainableField:
             every = self.params["sh"].shape[1]
             self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
         optimizers = list(self.optimizers.values())
-        if all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
+        if all(isinstance(optimizer, GpuFieldAdam) for optimizer in optimizers):
+            step_together(optimizers)
+        elif all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
             fused_steps(optimizers)
         else:
             for optimizer in optimizers:
@@ -111,7 +112,11 @@ class TrainableField:
         return {name: dict(opt.state[self.params[name]]) for name, opt in self.optimizers.items()}
 
     def adopt_moments(self, moments: dict[str, dict[str, Tensor]], kept: Tensor) -> None:
-        """Continue with the Adam moments of rows `kept` (m,) of an earlier field: full inheritance."""
+        """Continue with the Adam moments of rows `kept` (m,) of an earlier field: full inheritance.
+
+        They may be of a field whose SH were one tensor where these are two, or the reverse.
+        """
+        moments = _moments_of("sh" in self.optimizers, moments)
         for name, optimizer in self.optimizers.items():
             device = self.params[name].device
             optimizer.state[self.params[name]] = {
@@ -153,6 +158,33 @@ def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[st
         "opacities": rates.opacities,
         "sh": rates.residual_sh if field.signed else rates.sh,
     }
+
+
+def _moments_of(sh_in_one: bool, moments: dict[str, dict[str, Tensor]]) -> dict[str, dict[str, Tensor]]:
+    """Adam's state of SH as one tensor or as two, whichever way it is given; a field of degree 0 has one, always."""
+    others = {name: state for name, state in moments.items() if not name.startswith("sh")}
+    if sh_in_one and "shN" in moments:
+        sh0, rest = moments["sh0"], moments["shN"]
+        both = {key: value if key == "step" else torch.cat([value, rest[key]], 1) for key, value in sh0.items()}
+        return {**others, "sh": both}
+    if not sh_in_one and "sh" in moments:
+        parts = {"sh0": slice(0, 1), "shN": slice(1, None)}
+        return {
+            **others,
+            **{
+                name: {key: value if key == "step" else value[:, part] for key, value in moments["sh"].items()}
+                for name, part in parts.items()
+            },
+        }
+    return moments
+
+
+def _cpu_adam(param: torch.nn.Parameter, rate: float, rest_scale: float) -> FieldAdam:
+    scale = None
+    if rest_scale != 1.0:
+        scale = torch.full(param.shape[1:], rest_scale)
+        scale[0] = 1.0
+    return FieldAdam([param], lr=rate, eps=ADAM_EPS, column_scale=scale)
 
 
 def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:

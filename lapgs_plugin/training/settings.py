@@ -12,6 +12,8 @@ from lapgs_plugin.plan import Stage, check_joint_share
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import joint_from, parse_supervision
 
+ADAM_EPS = 1e-15
+"""Epsilon of Adam, 3DGS's."""
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 

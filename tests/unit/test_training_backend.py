@@ -207,7 +207,7 @@ def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
     """PyTorch's fused Adam, which exists for CPUs too."""
     field = replace(blob_field(20), sh=torch.randn(20, (degree + 1) ** 2, 3), signed=signed)
     ours = stepped(TrainableField.create(field, LearningRates(), 4.0))
-    theirs = stepped(TrainableField._on_gpu(field, LearningRates(), 4.0, sparse=False))
+    theirs = stepped(TrainableField._in_two(field, LearningRates(), 4.0, sparse=False))
     for name, value in theirs.field.parameters.items():
         # Rounding of five steps; worst seen 6e-7.
         torch.testing.assert_close(value, ours.field.parameters[name], rtol=0, atol=1e-5)
@@ -237,11 +237,27 @@ def test_fused_steps_have_the_bits_of_the_optimizers_own() -> None:
         assert all(torch.equal(one.state[param][name], other.state[expected][name]) for name in other.state[expected])
 
 
+def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
+    field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
+    in_one = stepped(TrainableField.create(field, LearningRates(), 4.0))
+    in_two = TrainableField._in_two(field, LearningRates(), 4.0, sparse=False)
+    back = TrainableField.create(field, LearningRates(), 4.0)
+    in_two.adopt_moments(in_one.optimizer_moments(), torch.arange(20))
+    assert set(in_two.optimizer_moments()) == {"means", "quats", "scales", "opacities", "sh0", "shN"}
+    back.adopt_moments(in_two.optimizer_moments(), torch.arange(20))
+    for name, state in in_one.optimizer_moments().items():
+        for key, value in state.items():
+            assert torch.equal(torch.as_tensor(back.optimizer_moments()[name][key]), torch.as_tensor(value)), (
+                name,
+                key,
+            )
+
+
 def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
 
     def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
-        return TrainableField._on_gpu(field, rates, extent, sparse)
+        return TrainableField._in_two(field, rates, extent, sparse)
 
     monkeypatch.setattr(TrainableField, "create", create)
     whole = stepped(create(field, LearningRates(), 4.0, sparse=False))
