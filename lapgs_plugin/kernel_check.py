@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
+from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
@@ -28,3 +29,8 @@ def is_right(otherwise: str, difference: Callable[[], float], limit: float) -> b
         logger.warning("%s, because our kernels are off by %g here", otherwise, found)
         return False
     return True
+
+
+def largest(values: Iterable[Tensor]) -> float:
+    """The largest number in tensors, of which none is empty; NaN where there is one."""
+    return float(torch.stack([value.detach().max() for value in values]).max())

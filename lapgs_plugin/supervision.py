@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.kernel_check import is_right
+from lapgs_plugin.kernel_check import is_right, largest
 from lapgs_plugin.plan import Stage
 
 DEFAULT_SSIM_WEIGHT = 0.2
@@ -118,7 +118,7 @@ def _l1_in_triton() -> bool:
         losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
         gradients = [torch.autograd.grad(3.0 * loss, prediction)[0] * len(target) for loss in losses]
         pairs = (losses, gradients)
-        return max(float((one - other).abs().max()) for one, other in pairs)
+        return largest((one - other).abs() for one, other in pairs)
 
     return is_right("L1 in several operations instead of one kernel", difference, 1e-4)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.kernel_check import is_right
+from lapgs_plugin.kernel_check import is_right, largest
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
 
 logger = logging.getLogger(__name__)
@@ -236,5 +236,5 @@ def _largest_difference(device: torch.device) -> float:
             found.append(
                 [result.image, shown, result.means2d, result.means2d.grad, result.absgrad2d, *(x.grad for x in leaves)]
             )
-        differences += [float((one - other).abs().max() / other.abs().max()) for other, one in zip(*found, strict=True)]
-    return max(differences)
+        differences += [(one - other).abs() / other.abs().max() for other, one in zip(*found, strict=True)]
+    return largest(differences)

@@ -7,7 +7,6 @@ both sides in one kernel, a CPU first across and then down.
 
 from __future__ import annotations
 
-import logging
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,9 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lapgs_plugin.kernel_check import is_right, largest
 from lapgs_plugin.pyramid import Pyramid
-
-logger = logging.getLogger(__name__)
 
 LARGEST_DIFFERENCE = 1e-4
 """From PyTorch's operations, of values of about 1, that still counts as rounding."""
@@ -91,24 +89,15 @@ def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> _NumpyTaps:
 @lru_cache(maxsize=1)
 def _triton_works() -> bool:
     """Whether there is Triton, which comes with PyTorch for CUDA on Linux, and can compile what is right."""
-    try:
-        difference = _difference_in_triton(Pyramid(), torch.device("cuda"))
-    except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
-        logger.info("Up in many small operations instead of one kernel: %s", str(error).strip().split("\n")[0])
-        return False
-    if difference > LARGEST_DIFFERENCE:
-        logger.warning("Up in many small operations instead of one kernel, which is off by %g here", difference)
-        return False
-    return True
+    return is_right(
+        "Up in many small operations instead of one kernel",
+        lambda: _difference_in_triton(Pyramid(), torch.device("cuda")),
+        LARGEST_DIFFERENCE,
+    )
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
-    """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1.
-
-    The gradient is checked whatever the caller is doing: the answer is kept for all who ask later.
-    """
+    """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1."""
     from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
 
     # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.
@@ -128,4 +117,4 @@ def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
         (gradient_in_triton, gradient),
         (add_raised_triton(pyramid, coarse, fine), image + fine),
     )
-    return max(float((one - other).abs().max()) for one, other in pairs)
+    return largest((one - other).abs() for one, other in pairs)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.kernel_check import is_right
+from lapgs_plugin.kernel_check import is_right, largest
 from lapgs_plugin.training.settings import ADAM_EPS
 
 
@@ -77,6 +77,7 @@ def largest_difference(device: torch.device) -> float:
         adam.step()
     expected = [param.detach() for param in theirs[:4]]
     expected.append(torch.cat([theirs[4].detach(), theirs[5].detach()], 1))
-    moved = [float((end - start).abs().max()) for end, start in zip(expected, starts, strict=True)]
-    apart = [float((end - found.detach()).abs().max()) for end, found in zip(expected, ours, strict=True)]
-    return max(one / other for one, other in zip(apart, moved, strict=True))
+    return largest(
+        (end - found.detach()).abs() / (end - start).abs().max()
+        for end, found, start in zip(expected, ours, starts, strict=True)
+    )

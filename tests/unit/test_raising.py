@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
+import math
 import os
 import subprocess
 import sys
@@ -16,6 +18,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lapgs_plugin.kernel_check import is_right
 from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
 from lapgs_plugin.rendering import raising
 from lapgs_plugin.rendering.raising import add_raised, raised
@@ -111,12 +114,30 @@ def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.raising_triton", kernels)
 
 
-@pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False)])
-def test_a_kernel_that_is_off_is_noticed(factor: float, right: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the difference that decides whether it is used at all."""
+def is_used() -> bool:
+    def difference() -> float:
+        return raising._difference_in_triton(Pyramid(), torch.device("cpu"))
+
+    return is_right("PyTorch's operations", difference, raising.LARGEST_DIFFERENCE)
+
+
+@pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False), (math.nan, False)])
+def test_a_kernel_that_is_off_is_not_used(
+    factor: float, right: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     put_in_place(monkeypatch, factor)
-    difference = raising._difference_in_triton(Pyramid(), torch.device("cpu"))
-    assert (difference <= raising.LARGEST_DIFFERENCE) == right
+    assert is_used() == right
+    assert ("PyTorch's operations, because our kernels are off by" in caplog.text) != right
+
+
+def test_a_kernel_that_does_not_compile_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
+    def difference() -> float:
+        raise RuntimeError("Failed to find C compiler\nat length")
+
+    caplog.set_level(logging.INFO)
+    assert not is_right("PyTorch's operations", difference, 1.0)
+    assert "PyTorch's operations: Failed to find C compiler" in caplog.text
+    assert "at length" not in caplog.text
 
 
 class _Asking(torch.autograd.Function):
@@ -124,7 +145,7 @@ class _Asking(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, answer: torch.Tensor) -> torch.Tensor:
-        return answer + raising._difference_in_triton(Pyramid(), torch.device("cpu"))
+        return answer + is_used()
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
@@ -133,9 +154,8 @@ def test_a_kernel_is_checked_whatever_the_caller_is_doing(
 ) -> None:
     put_in_place(monkeypatch, 1.0)
     with mode():
-        assert raising._difference_in_triton(Pyramid(), torch.device("cpu")) == 0.0
-    difference = _Asking.apply(torch.zeros((), requires_grad=True))  # type: ignore[no-untyped-call]  # torch's
-    assert float(difference.detach()) == 0.0
+        assert is_used()
+    assert _Asking.apply(torch.zeros((), requires_grad=True)) == 1.0  # type: ignore[no-untyped-call]  # torch's
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
