@@ -24,10 +24,9 @@ from lapgs_plugin.rendering.residence import Residence
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
 
-
 AT_ONCE_PIXELS = 4_000_000
-"""Of the finest level rendered, a choice: at 1.7 million pixels an H200 still waited for the processor to launch kernels,
-at 9.8 million fields in streams beat fields one after the other."""
+"""Of the finest level rendered, a choice: at 1.7 million pixels an H200 still waited for the processor to launch
+kernels, at 9.8 million fields in streams beat fields one after the other."""
 
 LARGEST_GAIN = 1000.0
 """Of a band. More is a slip: a residual of one step of 8 bits becomes 4 times the whole range with it."""
