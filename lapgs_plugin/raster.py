@@ -94,6 +94,37 @@ class ImageRasterizer(Protocol):
         ...
 
 
+class FieldStack(Protocol):
+    """Fields that are finished and ready on a device, to be rendered together; see `StackingRasterizer`."""
+
+    def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
+        """Images of the first fields, each as `Rasterizer` renders it from its own camera.
+
+        Args:
+            cameras: for the first field, the second, ..., at most as many as there are fields. All have the same pose;
+                sizes and intrinsics are their own.
+            background: (3,) behind fields that are not signed; None is black. Signed ones always lie over zero.
+
+        Returns:
+            (3, height, width) of each camera, in PyTorch's current stream.
+        """
+        ...
+
+
+@runtime_checkable
+class StackingRasterizer(Protocol):
+    """A rasterizer that may render several fields together, with hardly more launches than one alone."""
+
+    @property
+    def can_stack(self) -> bool:
+        """Whether it can with the options it was made with."""
+        ...
+
+    def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
+        """A copy of the fields, which may be anywhere, on its own device; only where `can_stack`."""
+        ...
+
+
 @runtime_checkable
 class PlainRasterizer(Protocol):
     """A rasterizer that is faster where nobody looks at radii and centres."""

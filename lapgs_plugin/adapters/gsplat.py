@@ -25,7 +25,7 @@ from lapgs_plugin.adapters import gsplat_direct
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import RenderResult, Semantics
+from lapgs_plugin.raster import FieldStack, RenderResult, Semantics
 from lapgs_plugin.reference_raster.oracle import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
 
 NAME = "gsplat"
@@ -166,6 +166,19 @@ class GsplatRasterizer:
             return self.render_image(field, cameras[0], background=background)[None]
         images, _, _ = self._rasterize(field, cameras, background, field.sh_degree, absgrad=False)
         return images.permute(0, 3, 1, 2)
+
+    @property
+    def can_stack(self) -> bool:
+        """See `lapgs_plugin.raster.StackingRasterizer`. Parts of gsplat's are called, which are those of 1.5.3."""
+        from gsplat import spherical_harmonics
+
+        return self._device.type == "cuda" and not self._packed and not _takes_cameras(spherical_harmonics)
+
+    def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
+        """Several fields, to be rendered together; see `lapgs_plugin.raster.StackingRasterizer`."""
+        from lapgs_plugin.adapters.gsplat_stack import GsplatStack
+
+        return GsplatStack(fields, self._device, antialiased=self._mode == "antialiased")
 
     @property
     def _direct(self) -> bool:

@@ -17,13 +17,16 @@ from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, UserInputErro
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import ImageRasterizer, Rasterizer, render_images
+from lapgs_plugin.raster import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
 from lapgs_plugin.rendering.raising import add_raised
 from lapgs_plugin.rendering.residence import Residence
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
 
+AT_ONCE_PIXELS = 4_000_000
+"""Of the finest level rendered, a choice: at 1.7 million pixels an H200 still waited for the processor to launch
+kernels, at 9.8 million fields in streams beat fields one after the other."""
 
 LARGEST_GAIN = 1000.0
 """Of a band. More is a slip: a residual of one step of 8 bits becomes 4 times the whole range with it."""
@@ -75,9 +78,11 @@ def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) ->
 class HierarchyRenderer:
     """Renders the finished levels of a hierarchy and adds them up.
 
-    On a GPU every field is rendered in a stream of its own: a coarse level, which leaves most of a GPU idle, costs
-    little beside a fine one. Up and the sum of a level are one kernel, in the stream that is current when `render` is
-    called, and that images are for. Nothing here waits for the GPU, but for a field that has to be brought there first.
+    On a GPU all fields of a view are rendered in one set of launches, where the rasterizer can and as long as launching
+    is what takes the time. Otherwise every field is rendered in a stream of its own: a coarse level, which leaves most
+    of a GPU idle, costs little beside a fine one. Up and the sum of a level are one kernel, in the stream that is
+    current when `render` is called, and that images are for. Nothing here waits for the GPU, but for a field that has
+    to be brought there first.
 
     Attributes:
         fields: by level; contiguous from `levels - 1` down to the finest that is finished. Wherever they are, with a
@@ -90,7 +95,10 @@ class HierarchyRenderer:
             paper authors' release does in training and rendering.
         concurrent: on a GPU, let fields be rendered beside each other instead of one after the other, where the
             rasterizer can. The extensions of 3DGS codebases cannot: their kernels all go to one stream of their own.
-        residence: brings fields to the device when they are needed; None where they are there.
+        at_once: with `concurrent`, the most pixels of the finest level rendered for which all fields of a view are
+            rendered in one set of launches; 0 for never. Only with a `residence` that keeps fields on the device: it
+            holds finished ones, and these are a copy.
+        residence: brings fields to the device when they are needed; None where they are there, and may still change.
 
     Raises:
         UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
@@ -104,6 +112,7 @@ class HierarchyRenderer:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clamped: bool = False
     concurrent: bool = True
+    at_once: int = AT_ONCE_PIXELS
     residence: Residence | None = None
 
     def __post_init__(self) -> None:
@@ -251,18 +260,16 @@ class HierarchyRenderer:
         if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
             found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
             raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
-        rendered: dict[int, Tensor] = {}
-        # The finest first: it takes longest, and coarser levels are rendered in its shadow.
-        for each in range(level, self.levels):
-            at_level = [level_camera(camera, each) for camera in cameras]
-            with self._beside(each):
-                rendered[each] = self._render_band(each, at_level, gains.get(each, 1.0))
-        base = self._for_current(self.levels - 1, rendered.pop(self.levels - 1))
-        residuals, composed = {}, {self.levels - 1: base}
-        for each in sorted(rendered, reverse=True):
-            residuals[each] = self._for_current(each, rendered[each])
-            composed[each] = add_raised(self.pyramid, composed[each + 1], residuals[each])
-        return Composition(base, residuals, composed)
+        bands = self._at_once if self._goes_at_once(cameras, level, gains) else self._field_by_field
+        residuals: dict[int, Tensor] = {}
+        composed: dict[int, Tensor] = {}
+        for each, images in bands(cameras, level, gains):
+            if each == self.levels - 1:
+                composed[each] = images
+                continue
+            residuals[each] = images
+            composed[each] = add_raised(self.pyramid, composed[each + 1], images)
+        return Composition(composed[self.levels - 1], residuals, composed)
 
     @torch.no_grad()
     def render_level(
@@ -296,6 +303,56 @@ class HierarchyRenderer:
                     f"{LARGEST_GAIN:g}; 1 is the band as trained"
                 )
         return gains or {}
+
+    @cached_property
+    def can_be_at_once(self) -> bool:
+        """Whether all fields of a view can be rendered in one set of launches, whatever `at_once` says."""
+        keeps = self.residence is not None and self.residence.keep
+        return keeps and isinstance(self.rasterizer, StackingRasterizer) and self.rasterizer.can_stack
+
+    def _goes_at_once(self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]) -> bool:
+        if not self.concurrent or len(cameras) > 1 or not self.can_be_at_once:
+            return False  # a batch shares its launches among its views
+        finest = level_camera(cameras[0], level)
+        return finest.width * finest.height <= self.at_once and all(gains.get(i, 1) for i in range(level, self.levels))
+
+    def _at_once(
+        self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]
+    ) -> Iterator[tuple[int, Tensor]]:
+        """As `_field_by_field`, of one camera, all fields together."""
+        levels = range(self.levels - 1, level - 1, -1)
+        with self._memory_for(levels, level_camera(cameras[0], level)):
+            background = self._colored if any(self.background) else None
+            images = self._stack(level).render([level_camera(cameras[0], each) for each in levels], background)
+            for each, image in zip(levels, images, strict=True):
+                yield each, self._weighed(each, image[None], gains.get(each, 1.0))
+
+    def _stack(self, finest: int) -> FieldStack:
+        """The fields from the coarsest on, at least down to `finest`, on the device."""
+        if all(each > finest for each in self._stacks):
+            assert isinstance(self.rasterizer, StackingRasterizer)
+            self._stacks.clear()  # first, so that they are not there twice
+            levels = range(self.levels - 1, finest - 1, -1)
+            self._stacks[finest] = self.rasterizer.stack([self.fields[each] for each in levels])
+        return next(iter(self._stacks.values()))
+
+    @cached_property
+    def _stacks(self) -> dict[int, FieldStack]:
+        """By the finest level in it, the one that has been needed so far."""
+        return {}
+
+    def _field_by_field(
+        self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]
+    ) -> Iterator[tuple[int, Tensor]]:
+        """From the coarsest level down to `level`: renders times their gain, (b, 3, h, w), for the current stream."""
+        rendered: dict[int, Tensor] = {}
+        # The finest first: it takes longest, and coarser levels are rendered in its shadow.
+        for each in range(level, self.levels):
+            at_level = [level_camera(camera, each) for camera in cameras]
+            with self._beside(each):
+                rendered[each] = self._render_band(each, at_level, gains.get(each, 1.0))
+        for each in range(self.levels - 1, level - 1, -1):
+            yield each, self._for_current(each, rendered[each])
 
     @property
     def can_be_concurrent(self) -> bool:
@@ -343,25 +400,35 @@ class HierarchyRenderer:
 
     @cached_property
     def _colored(self) -> Tensor:
-        """(3,) `background` beside the fields, sent there once: sending waits for a GPU."""
-        return torch.tensor(self.background).to(self.field(self.levels - 1).means)
+        """(3,) `background` where fields are rendered, sent there once: sending waits for a GPU."""
+        return torch.tensor(self.background, dtype=self.fields[self.levels - 1].means.dtype, device=self.device)
 
     def _render_band(self, level: int, at_level: Sequence[Camera], gain: float) -> Tensor:
         """A field's own renders times its gain, (b, 3, h, w) at the size of `at_level`."""
         if gain == 0.0:
             return self._black.new_zeros(len(at_level), 3, at_level[0].height, at_level[0].width)
+        with self._memory_for([level], at_level[0]):
+            images = render_images(self.rasterizer, self.field(level), at_level, self.behind(level))
+            return self._weighed(level, images, gain)
+
+    def _weighed(self, level: int, images: Tensor, gain: float) -> Tensor:
+        """A level's renders, clamped where its hierarchy is, times its gain."""
+        if self.clamped:
+            images = images.clamp(-1.0 if self.fields[level].signed else 0.0, 1.0)
+        return images if gain == 1.0 else gain * images
+
+    @contextmanager
+    def _memory_for(self, levels: Sequence[int], camera: Camera) -> Iterator[None]:
+        """Say in one line that what is inside, which renders these levels, finds the GPU full."""
         try:
-            field = self.field(level)
-            images = render_images(self.rasterizer, field, at_level, self.behind(level))
+            yield
         except torch.cuda.OutOfMemoryError as error:
-            size = f"{at_level[0].width}x{at_level[0].height}"
+            which = f"level {levels[0]}" if len(levels) == 1 else f"levels {levels[0]} to {levels[-1]}"
+            count = sum(len(self.fields[each]) for each in levels)
             raise DeviceMemoryError(
-                f"the GPU has no memory left to render level {level}, {len(self.fields[level]):,} Gaussians at {size}; "
+                f"the GPU has no memory left to render {which}, {count:,} Gaussians at {camera.width}x{camera.height}; "
                 "render a coarser --level, a smaller size, or with --device cpu"
             ) from error
-        if self.clamped:
-            images = images.clamp(-1.0 if field.signed else 0.0, 1.0)
-        return images if gain == 1.0 else gain * images
 
 
 def _with_what_is_left(error: RunFolderError, whole: Sequence[int]) -> RunFolderError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -95,17 +96,24 @@ def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera
 
 def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> Iterator[_Kind]:
     in_turn = replace(renderer, concurrent=False)
+    ways = {"one after the other": in_turn}
+    if renderer.can_be_concurrent:
+        ways["beside each other"] = replace(renderer, concurrent=True, at_once=0)
+    # Whatever the size: how large an image may be for it to pay is to be seen here.
+    at_once = replace(renderer, concurrent=True, at_once=sys.maxsize) if renderer.can_be_at_once else None
+    if at_once is not None:
+        ways["all at once"] = at_once
     coarsest = renderer.levels - 1
     for finest in range(level, coarsest):
         fields, what = range(finest, renderer.levels), f"levels {coarsest} to {finest}"
-        yield _Kind(f"{what}, one after the other", _composing(in_turn, finest), fields, finest)
-        if renderer.can_be_concurrent:
-            together = replace(renderer, concurrent=True)
-            yield _Kind(f"{what}, beside each other", _composing(together, finest), fields, finest)
+        for way, composer in ways.items():
+            yield _Kind(f"{what}, {way}", _composing(composer, finest), fields, finest)
     if batches:
         fields, what = range(level, renderer.levels), "all" if coarsest > level else "field"
         yield _Kind(f"{what}, {BATCH} views at once", _composing(renderer, level), fields, level, views=BATCH)
     yield _Kind("base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest)
+    if at_once is not None and coarsest == 0:
+        yield _Kind("field, at once", _composing(at_once, 0), [0], 0)  # what a hierarchy rendered so compares with
     if coarsest > level:
         # What it would cost to render it as large as it is shown, instead of bringing it up.
         yield _Kind(f"base as large as level {level}", _alone(in_turn, coarsest, level), [coarsest], level)

@@ -1,4 +1,5 @@
-"""Composition on a GPU with gsplat: streams, batches and streamed fields give the same images, and nothing waits."""
+"""Composition on a GPU with gsplat: streams, batches, streamed fields and all fields at once give the same images, and
+nothing waits."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
 from lapgs_plugin.rendering.residence import Residence
 from tests.training_scene import blob_field, ring_camera
 
@@ -99,3 +100,66 @@ def test_a_frame_waits_once_a_field_inside_of_gsplat(
     torch.cuda.set_sync_debug_mode("warn")
     renderer.render(CAMERAS[0])
     assert len(waits) <= len(renderer.fields), [f"{wait.filename}:{wait.lineno}" for wait in waits]
+
+
+def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
+    """The same, of fields that are finished and may be copied to be rendered together, whatever the size."""
+    together = replace(renderer, residence=Residence(torch.device("cuda")), at_once=10**9)
+    assert together.can_be_at_once
+    return together
+
+
+def assert_same(found: Composition, expected: Composition) -> None:
+    assert found.composed.keys() == expected.composed.keys()
+    for level, image in expected.composed.items():
+        # The same kernels; the background alone is blended by other operations.
+        torch.testing.assert_close(found.composed[level], image, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.1, 0.2, 0.3)])
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_all_at_once_is_one_after_the_other(
+    renderer: HierarchyRenderer, antialiasing: bool, background: tuple[float, float, float]
+) -> None:
+    renderer = replace(renderer, rasterizer=GsplatRasterizer(antialiasing=antialiasing), background=background)
+    together, in_turn = at_once(renderer), replace(renderer, concurrent=False)
+    for camera in CAMERAS * 4:
+        assert_same(together.render(camera), in_turn.render(camera))
+    for level in (2, 1, 0):
+        gains = {each: 0.5 + each for each in range(level, 3)}
+        assert_same(together.render(CAMERAS[0], level, gains), in_turn.render(CAMERAS[0], level, gains))
+
+
+@pytest.mark.parametrize(
+    "counts", [(5_000,), (10, 50_000), (50_000, 10), (3_000, 0, 2_000), (0, 0), (4, 5, 6, 7)], ids=str
+)
+def test_all_at_once_whatever_the_sizes_of_fields(counts: tuple[int, ...]) -> None:
+    top = len(counts) - 1
+    some = {i: replace(blob_field(n, seed=i), signed=i < top).to("cuda") for i, n in enumerate(counts)}
+    # Out of the view, too, and near: where gsplat's projection depends on the size of the image.
+    some = {i: each.with_parameters({"means": 3 * each.means}) for i, each in some.items()}
+    renderer = HierarchyRenderer(some, len(counts), Pyramid(), GsplatRasterizer(), (0.1, 0.2, 0.3))
+    for camera in CAMERAS:
+        assert_same(at_once(renderer).render(camera), replace(renderer, concurrent=False).render(camera))
+
+
+def test_a_frame_of_all_at_once_waits_once(renderer: HierarchyRenderer, waits: list[warnings.WarningMessage]) -> None:
+    together = at_once(renderer)
+    images(together, CAMERAS)
+    torch.cuda.synchronize()
+    waits.clear()
+    torch.cuda.set_sync_debug_mode("warn")
+    together.render(CAMERAS[0])
+    assert len(waits) <= 1, [f"{wait.filename}:{wait.lineno}" for wait in waits]
+
+
+def test_all_at_once_takes_the_place_of_the_fields(renderer: HierarchyRenderer) -> None:
+    waiting = {level: replace(blob_field(200_000), signed=level < 1) for level in (0, 1)}
+    size = sum(value.nbytes for field in waiting.values() for value in field.parameters.values())
+    far = HierarchyRenderer(waiting, 2, Pyramid(), GsplatRasterizer(), residence=Residence(torch.device("cuda")))
+    small = ring_camera(0.0, 64, 48)
+    before = torch.cuda.memory_allocated()
+    far.render(small)
+    torch.cuda.synchronize()
+    # And 8 bytes a Gaussian that say which image it is in: 1.15 of these, which have one coefficient a colour.
+    assert size <= torch.cuda.memory_allocated() - before < 1.3 * size
