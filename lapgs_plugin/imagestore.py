@@ -171,14 +171,13 @@ class ImageStore:
         if len(self._coming) > AHEAD:
             self._coming.pop(next(iter(self._coming))).cancel()
 
-    def get(self, name: str, dtype: torch.dtype | None = torch.float32) -> Tensor:
-        """An image on the device, for the stream that is current; not to be modified.
+    def get(self, name: str) -> Tensor:
+        """An image on the device, float32, for the stream that is current; not to be modified.
 
         The processor waits for nothing but a file that is still being read.
 
         Args:
             name: of the view.
-            dtype: of the result, a float type; None for the one it is stored as, float32 for images stored as uint8.
 
         Raises:
             KeyError: it was never put.
@@ -187,7 +186,7 @@ class ImageStore:
         image = self._images[name]
         if self._at_hand(image):
             assert image.stored is not None
-            return _decode(image.stored, image, dtype)
+            return _decode(image.stored, image)
         self.announce(name)
         arrival = self._coming.pop(name).result()
         if arrival.event is not None:
@@ -195,7 +194,7 @@ class ImageStore:
             stream.wait_event(arrival.event)
             # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
             arrival.stored.record_stream(stream)
-        return _decode(arrival.stored, image, dtype)
+        return _decode(arrival.stored, image)
 
     @property
     def where(self) -> str:
@@ -408,11 +407,11 @@ def _read_file(path: Path, stored: Tensor) -> None:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
-def _decode(stored: Tensor, image: _Image, dtype: torch.dtype | None) -> Tensor:
-    """An image from its stored bytes, in the current stream."""
+def _decode(stored: Tensor, image: _Image) -> Tensor:
+    """A float32 image from its stored bytes, in the current stream."""
     if image.divisor is None:
-        return stored if dtype is None else stored.to(dtype)
+        return stored.float()
     values = torch.div(stored, image.divisor)  # float32
     if image.low:
         values += image.low
-    return values.to(torch.float32 if dtype is None else dtype)
+    return values

@@ -71,12 +71,7 @@ class Pyramid:
         Raises:
             UserInputError: the image is not half of `size`.
         """
-        halved = tuple((side + 1) // 2 for side in size)
-        if tuple(image.shape[-2:]) != halved:
-            raise UserInputError(
-                f"Up to {size[0]}x{size[1]} (height x width) needs an image of {halved[0]}x{halved[1]}, "
-                f"got {image.shape[-2]}x{image.shape[-1]}"
-            )
+        require_half(image, size)
         values = _working_precision(image)
         for dim in (-1, -2):  # columns first, while there are half as many rows
             fine = size[dim]
@@ -149,6 +144,20 @@ class Pyramid:
         if self.grid == "even":
             return 0.0, 0.5, fine
         return 0.5 * coarse / fine - 0.5, coarse / fine, fine
+
+
+def require_half(image: Tensor, size: tuple[int, int]) -> None:
+    """Check that an image can be raised to (h, w) = `size`.
+
+    Raises:
+        UserInputError: it is not half of that, rounded up.
+    """
+    halved = tuple((side + 1) // 2 for side in size)
+    if tuple(image.shape[-2:]) != halved:
+        raise UserInputError(
+            f"Up to {size[0]}x{size[1]} (height x width) needs an image of {halved[0]}x{halved[1]}, "
+            f"got {image.shape[-2]}x{image.shape[-1]}"
+        )
 
 
 def transposed_taps(first: Tensor, weights: Tensor, samples: int) -> tuple[Tensor, Tensor]:

@@ -25,10 +25,11 @@ from lapgs_plugin.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.inheritance import inherit
 from lapgs_plugin.overhead import Overhead
+from lapgs_plugin.peak_memory import PeakMemory
 from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.signed_color import ColorPath
 
 logger = logging.getLogger(__name__)
@@ -71,6 +72,7 @@ class ActiveStage:
         self._began: float | None = None
         self._excluded = 0.0  # seconds since `_began` that are not optimization
         self._iteration = self._peak = 0
+        self._memory: PeakMemory  # of `train`
         self._gaussian_steps = 0  # Gaussians, summed over the iterations
         self._trained_along = 0  # Gaussians of finished fields, while these learn as well
         self._gaussians: Any = None
@@ -159,7 +161,9 @@ class ActiveStage:
             )
 
     def _train_jointly(self, gaussians: Any) -> None:
-        """From now on the finished fields learn as well."""
+        """From now on the finished fields learn as well, and what they predict is rendered."""
+        self._memory.note(self._images.bytes_on_device)
+        self._images.drop_predictions()
         self._joint = JointLevels(self._context, self._finished, self._archive, self._images, self._path)
         self._joint.follow(gaussians, self._options.residual_color_rate)
         self._trained_along = sum(record.num_gaussians for record in self._archive.manifest.records)
@@ -211,14 +215,13 @@ class ActiveStage:
             "level %d: %d iterations at %dx%d, images on the %s", stage.level, stage.iterations, width, height, place
         )
         self._hooks.stage_begins(stage, self._rendering)
-        if self._device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats()
+        self._memory = PeakMemory(self._device)
         self._context.parts.stage_begins()
         self._context.watcher.stage_started(stage)
         self._call.run()
         self._context.parts.breakdown.pause()
         self._synchronize()
-        seconds, memory = self._seconds(), self._memory()
+        seconds, memory = self._seconds(), self._memory.note(self._images.bytes_on_device)
         self._hooks.stage_ends(stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
@@ -318,13 +321,14 @@ class ActiveStage:
         return Finished(field, predictions, carried, moments)
 
     @torch.no_grad()
-    def _predict(self, gaussians: Any) -> ImageStore:
-        """Up of the composed image of every view, for the next level."""
-        store = self._images.new_predictions()
+    def _predict(self, gaussians: Any) -> RaisedImages:
+        """The composed image of every view, for the next level."""
+        predictions = self._images.new_predictions()
         for camera in self._images.cameras:
             width, height = self._images.size(camera, self.stage.level - 1)
-            store.put(self._images.key(camera), self._pyramid.up(self._composed(gaussians, camera), (height, width)))
-        return store
+            predictions.put(self._images.key(camera), self._composed(gaussians, camera), (height, width))
+        predictions.get(self._images.key(self._images.cameras[0]))  # compiles Up now, and not on the next stage's clock
+        return predictions
 
     @torch.no_grad()
     def _report_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
@@ -414,12 +418,6 @@ class ActiveStage:
             return views
         keys = {id(view): key for key, view in self._views.items()}
         return AnnouncingViews(views, lambda view: self._rendering.announce(keys[id(view)]))
-
-    def _memory(self) -> dict[str, int]:
-        """Peak bytes on the GPU during the stage, and how many of them were images."""
-        if self._device.type != "cuda":
-            return {}
-        return {"peak": torch.cuda.max_memory_allocated(), "images": self._images.bytes_on_device}
 
     def _synchronize(self) -> None:
         if self._device.type == "cuda":

@@ -91,7 +91,7 @@ class HookCaller:
             iteration=self._iteration,
             view=view_name(key),
             target=targets.get(key),
-            accumulated=None if below is None else below.float(),
+            accumulated=below,
             coarse_target=None if coarse is None else coarse.get(key),
         )
 

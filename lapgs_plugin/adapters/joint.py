@@ -119,7 +119,7 @@ class JointLevels:
     def announce(self, key: str) -> None:
         """Nothing has to be brought from anywhere."""
 
-    def get(self, key: str, dtype: torch.dtype | None = torch.float32) -> Tensor:
+    def get(self, key: str) -> Tensor:
         """(3, h, w) Up of what the finished fields make of a view, with gradients where they are recorded."""
         camera = self._cameras[key]
         composed: Tensor | None = None
@@ -129,7 +129,7 @@ class JointLevels:
             composed = image if composed is None else add_raised(self._pyramid, composed, image)
         assert composed is not None
         width, height = self._images.size(camera, self._fields[-1].of.stage.level - 1)
-        return raised(self._pyramid, composed, (height, width)).to(dtype or composed.dtype)
+        return raised(self._pyramid, composed, (height, width))
 
     def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
         """(3, h, w) of one field alone."""

@@ -18,9 +18,10 @@ from lapgs_plugin.adapters.level_views import PhotoAlbum
 from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore
+from lapgs_plugin.imagestore import PLACES, PRECISIONS
 from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, parse_split
 from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import joint_from, parse_supervision
 from lapgs_plugin.watching import Watcher
 
@@ -42,7 +43,7 @@ class HierarchyOptions:
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
         coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
-        prediction_precision: what cached predictions are stored as, a key of `imagestore.PRECISIONS`.
+        prediction_precision: what cached predictions are stored as before Up, a key of `imagestore.PRECISIONS`.
         fused_adam: let PyTorch's Adam step each tensor in one kernel.
         seed: of the draw of inherited Gaussians.
 
@@ -146,6 +147,6 @@ class Finished:
     """
 
     field: GaussianField
-    predictions: ImageStore | None
+    predictions: RaisedImages | None
     carried: Mapping[str, Any]
     moments: Mapping[str, dict[str, Tensor]]

@@ -22,13 +22,13 @@ GREY = 0.5
 
 
 class Predictions(Protocol):
-    """What the finished levels make of every view, by key: an `ImageStore` of it, or they themselves."""
+    """What lies below every view, by key: kept images, raised, or finished levels that render it."""
 
     def announce(self, key: str, /) -> None:
         """Told of a view that will be asked for soon."""
 
-    def get(self, key: str, /, dtype: torch.dtype | None = ...) -> Tensor:
-        """(3, h, w) on the device; `dtype` None for whatever it is there."""
+    def get(self, key: str, /) -> Tensor:
+        """(3, h, w) on the device, float32, at the size of what is rendered over it."""
 
 
 @dataclass
@@ -54,7 +54,7 @@ class StageRendering:
     views: Mapping[int, str]
     targets: ImageStore | None = None
     accumulated: Predictions | None = None
-    coarse: ImageStore | None = None
+    coarse: Predictions | None = None
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
@@ -85,7 +85,7 @@ class StageRendering:
             return image + GREY if self.signed else image
         below = None
         if self.accumulated is not None and key in self.composed:
-            below = self.accumulated.get(key, dtype=None)
+            below = self.accumulated.get(key)
             image = image + below
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)

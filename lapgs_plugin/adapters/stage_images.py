@@ -13,6 +13,7 @@ from lapgs_plugin.adapters.run_state import HierarchyOptions, LoadedScene
 from lapgs_plugin.imagestore import PRECISIONS, ImageStore, place
 from lapgs_plugin.plan import Stage, level_size
 from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import Supervision, parse_supervision
 
 
@@ -37,7 +38,7 @@ class StageImages:
         options: HierarchyOptions,
         device: torch.device,
         folder: Path,
-        accumulated: ImageStore | None,
+        accumulated: RaisedImages | None,
     ) -> None:
         self._album, self._stage, self._options = album, stage, options
         self._device, self._folder = device, folder
@@ -48,7 +49,7 @@ class StageImages:
         # Photos of 8 bits are themselves only at full size: averages need more.
         self.targets = self._store("uint8" if stage.level == 0 and album.exact else "float16", stage.level, "targets")
         of_laplacian = stage.signed and self._supervision is Supervision.GT_LAPLACIAN
-        self.coarse = self._store("float16", stage.level, "coarse") if of_laplacian else None
+        self.coarse = self._raised("float16", stage.level + 1, "coarse") if of_laplacian else None
 
     @property
     def cameras(self) -> list[Any]:
@@ -82,11 +83,16 @@ class StageImages:
             self.targets.put(key, images[level])
             if self.coarse is not None and key in of_laplacian:
                 height, width = images[level].shape[1:]
-                self.coarse.put(key, self._pyramid.up(images[level + 1], (height, width)))
+                self.coarse.put(key, images[level + 1], (height, width))
 
-    def new_predictions(self) -> ImageStore:
-        """An empty store for Up(I_hat^l) of every view."""
-        return self._store(self._options.prediction_precision, self._stage.level - 1, "predictions")
+    def new_predictions(self) -> RaisedImages:
+        """Room for I_hat^l of every view, from which the next stage will have Up(I_hat^l)."""
+        return self._raised(self._options.prediction_precision, self._stage.level, "predictions")
+
+    def drop_predictions(self) -> None:
+        """Let go of what the stages before predict: from here on it is rendered."""
+        if self.accumulated is not None:
+            self.accumulated.close()
 
     @property
     def bytes_on_device(self) -> int:
@@ -106,7 +112,12 @@ class StageImages:
 
     @property
     def _stores(self) -> tuple[ImageStore, ...]:
-        return tuple(store for store in (self.targets, self.coarse, self.accumulated) if store is not None)
+        raised = (images.store for images in (self.coarse, self.accumulated) if images is not None)
+        return (self.targets, *raised)
+
+    def _raised(self, precision: str, level: int, name: str) -> RaisedImages:
+        """The same as `_store` makes, for images of a level that will be looked at as Up of them."""
+        return RaisedImages(self._store(precision, level, name), self._pyramid)
 
     def _store(self, precision: str, level: int, name: str) -> ImageStore:
         """A store for an image of every view at a level, where the user wants it or where it fits."""

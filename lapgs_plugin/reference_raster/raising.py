@@ -1,4 +1,4 @@
-"""Up(coarse) + fine on the CPU: rows are raised across into a buffer in the cache, and summed from there.
+"""Up(coarse), with or without + fine, on the CPU: rows are raised across into a buffer in the cache and summed there.
 
 Across, the even and the odd fine samples 2 i and 2 i + 1 are sums over the same few coarse neighbours of i, which makes
 vectors of neighbouring i out of both.
@@ -74,13 +74,14 @@ def _raise_row(
 def _kernel(
     counter: Integers,
     coarse: Floats,  # (n, h / 2, w / 2)
-    fine: Floats,  # (n, h, w)
+    fine: Floats,  # (n, h, w), looked at if it is to be added
+    adds: bool,
     first_row: Integers,  # (h,)
     row_weights: Floats,  # (h, taps)
     column_weights: Floats,  # (2, NEIGHBOURS, pitch)
     out: Floats,  # (n, h, w)
 ) -> None:
-    planes, height, width = fine.shape
+    planes, height, width = out.shape
     coarse_height, coarse_width = coarse.shape[1:]
     taps, pitch = row_weights.shape[1], column_weights.shape[2]
     wide, whole, strips = 2 * pitch, width // WIDTH * WIDTH, -(-height // _STRIP_ROWS)
@@ -101,12 +102,12 @@ def _kernel(
         for y in range(top, bottom):
             place, first = (plane * height + y) * width, (first_row[y] - start) * wide
             for x in range(0, whole, WIDTH):
-                total = load(above, place + x)
+                total = load(above, place + x) if adds else splat(above, 0.0)
                 for tap in range(taps):
                     total = fma(load(raised, first + tap * wide + x), at(down, y * taps + tap), total)
                 store(result, place + x, total)
             for x in range(whole, width):
-                rest = at(above, place + x)
+                rest = at(above, place + x) if adds else fine.dtype.type(0)
                 for tap in range(taps):
                     rest += at(raised, first + tap * wide + x) * at(down, y * taps + tap)
                 put(result, place + x, rest)
@@ -129,5 +130,14 @@ def add_raised_cpu(
         (n, h, w).
     """
     out = empty(fine.size, fine.dtype).reshape(fine.shape)
-    parallel(_kernel, coarse, fine, first_row, row_weights, column_weights, out)
+    parallel(_kernel, coarse, fine, True, first_row, row_weights, column_weights, out)
+    return out
+
+
+def raised_cpu(
+    coarse: Floats, size: tuple[int, int], first_row: Integers, row_weights: Floats, column_weights: Floats
+) -> Floats:
+    """Up(coarse) to (n, *size); the other arguments as `add_raised_cpu` takes them."""
+    out = empty(len(coarse) * size[0] * size[1], coarse.dtype).reshape(len(coarse), *size)
+    parallel(_kernel, coarse, out, False, first_row, row_weights, column_weights, out)
     return out

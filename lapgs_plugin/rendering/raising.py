@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_plugin.kernel_check import is_right, largest
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.pyramid import Pyramid, require_half
 
 LARGEST_DIFFERENCE = 1e-4
 """From PyTorch's operations, of values of about 1, that still counts as rounding."""
@@ -31,8 +31,8 @@ def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     """
     if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
         return raised(pyramid, coarse, (fine.shape[-2], fine.shape[-1])) + fine
-    if fine.device.type == "cpu" and fine.dtype in (torch.float32, torch.float64):
-        return _on_cpu(pyramid, coarse, fine)
+    if _in_numba(fine):
+        return _added_on_cpu(pyramid, coarse, fine)
     if _in_triton(fine):
         from lapgs_plugin.rendering.raising_triton import add_raised_triton
 
@@ -47,7 +47,13 @@ def raised(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     Args:
         coarse: as `add_raised` takes it.
         size: (h, w), height first.
+
+    Raises:
+        UserInputError: the image is not half of `size`.
     """
+    require_half(coarse, size)
+    if _in_numba(coarse) and not (torch.is_grad_enabled() and coarse.requires_grad):
+        return _raised_on_cpu(pyramid, coarse, size)
     if not _in_triton(coarse):
         return pyramid.up(coarse, size)
     from lapgs_plugin.rendering.raising_triton import raised_triton
@@ -56,17 +62,33 @@ def raised(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
         return raised_triton(pyramid, coarse, size)
 
 
+def _in_numba(image: Tensor) -> bool:
+    return image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64)
+
+
 def _in_triton(image: Tensor) -> bool:
     return image.device.type == "cuda" and image.dtype == torch.float32 and _triton_works()
 
 
-def _on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+def _added_on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     from lapgs_plugin.reference_raster.raising import add_raised_cpu
 
-    rows, columns = (_numpy_taps(pyramid.grid, size, fine.dtype) for size in fine.shape[-2:])
-    below, above = (image.reshape(-1, *image.shape[-2:]).contiguous().numpy() for image in (coarse, fine))
-    result = add_raised_cpu(below, above, rows.first, rows.weights, columns.across)
+    rows, columns = (_numpy_taps(pyramid.grid, side, fine.dtype) for side in fine.shape[-2:])
+    result = add_raised_cpu(_planes(coarse), _planes(fine), rows.first, rows.weights, columns.across)
     return torch.from_numpy(result).view(fine.shape)
+
+
+def _raised_on_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    from lapgs_plugin.reference_raster.raising import raised_cpu
+
+    rows, columns = (_numpy_taps(pyramid.grid, side, coarse.dtype) for side in size)
+    result = raised_cpu(_planes(coarse), size, rows.first, rows.weights, columns.across)
+    return torch.from_numpy(result).view(*coarse.shape[:-2], *size)
+
+
+def _planes(image: Tensor) -> NDArray[np.floating[Any]]:
+    """(n, h, w) of all its channels."""
+    return image.detach().reshape(-1, *image.shape[-2:]).contiguous().numpy()
 
 
 class _NumpyTaps(NamedTuple):

@@ -15,9 +15,9 @@ from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageContext
-from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -77,7 +77,7 @@ class StageRun:
     settings: TrainSettings
     views: Sequence[LevelView]
     images: LevelImages
-    accumulated: ImageStore | None
+    accumulated: RaisedImages | None
     background: Tensor
     extent: float
     rasterizer: Rasterizer

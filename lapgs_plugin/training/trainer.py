@@ -20,10 +20,12 @@ from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.overhead import Overhead
+from lapgs_plugin.peak_memory import PeakMemory
 from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.rendering.raising import raised
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
@@ -37,6 +39,8 @@ from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
 from lapgs_plugin.watching import Watcher
 
+TRAIN, TEST = "train", "test"
+"""Folders of cached predictions, by the views that they are of."""
 LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
 
@@ -63,7 +67,12 @@ def check_cache(settings: TrainSettings, device: torch.device) -> None:
 
 
 def warm_up(
-    rasterizer: Rasterizer, device: torch.device | str = "cpu", *, sparse: bool = False, joint: bool = False
+    rasterizer: Rasterizer,
+    device: torch.device | str = "cpu",
+    *,
+    sparse: bool = False,
+    residuals: bool = False,
+    joint: bool = False,
 ) -> None:
     """Run every kernel of an iteration once, so that compiling them is not taken for training."""
     settings = TrainSettings(sh_degree=0)
@@ -74,9 +83,12 @@ def warm_up(
     result = rasterizer(model.field, camera, background=torch.zeros(3, device=device))
     photometric_loss(result.image, torch.zeros_like(result.image)).backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
+    coarse = torch.zeros(3, 8, 8, device=device)
+    if residuals:
+        raised(Pyramid(), coarse, (16, 16))
     if joint:
-        coarse = torch.zeros(3, 8, 8, device=device, requires_grad=True)
-        raised(Pyramid(), coarse, (16, 16)).square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
+        below = raised(Pyramid(), coarse.requires_grad_(), (16, 16))
+        below.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
 @dataclass
@@ -116,8 +128,9 @@ class Trainer:
         check_cache(self.settings, self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
-        self._train_cache: ImageStore | None = None
-        self._test_cache: ImageStore | None = None
+        self._train_cache: RaisedImages | None = None
+        self._test_cache: RaisedImages | None = None
+        self._memory = PeakMemory(self.device)
         self._last_tick = (0.0, 0)
 
     def run(self, resume: bool = False) -> None:
@@ -135,7 +148,10 @@ class Trainer:
         with stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
-                warm_up(self.rasterizer, self.device, sparse=self.settings.sparse_adam, joint=joint)
+                residuals = self.plan.levels > 1
+                warm_up(
+                    self.rasterizer, self.device, sparse=self.settings.sparse_adam, residuals=residuals, joint=joint
+                )
                 self.watcher.run_started(self.archive)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
@@ -152,8 +168,7 @@ class Trainer:
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
         self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
-        if self.device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self.device)
+        self._memory = PeakMemory(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint))
         if checkpoint is not None:
             run.restore(checkpoint)
@@ -227,7 +242,12 @@ class Trainer:
         )
 
     def _thaw(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
-        """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived."""
+        """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived.
+
+        What was kept of their predictions is let go of: from here on these are rendered.
+        """
+        self._memory.note(self._image_bytes)
+        self._close_caches()
         rates, extent, sparse = self.settings.learning_rates, self.scene.extent, self.settings.sparse_adam
 
         def model(level: int) -> TrainableField:
@@ -244,34 +264,37 @@ class Trainer:
         )
 
     def _fill_caches(self, stage: Stage) -> None:
-        """Keep Up of the finished levels' composed prediction of every view that this stage will look at."""
+        """Keep the finished levels' composed prediction of every view that this stage will look at."""
         self._close_caches()
         if not stage.signed:
             return
         with self._overhead.timed("cache"):
-            self._train_cache = self._predictions(stage, self.scene.train, "train")
+            self._train_cache = self._predictions(stage, self.scene.train, TRAIN)
         with self._overhead.timed("evaluation"):
-            self._test_cache = self._predictions(stage, self.scene.test, "test")
+            self._test_cache = self._predictions(stage, self.scene.test, TEST)
 
-    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> ImageStore:
+    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> RaisedImages:
         """Up(I_hat^(l+1)) of each view, for the stage of level l."""
         coarser = stage.level + 1
-        cache = self._empty_cache(stage.level, views, name)
+        cache = RaisedImages(self._empty_cache(coarser, views, name), self._pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
                 camera = level_camera(view.camera, stage.level)
                 composed = renderer.render(view.camera, level=coarser).composed[coarser]
-                cache.put(view.name, self._pyramid.up(composed, (camera.height, camera.width)))
+                cache.put(view.name, composed, (camera.height, camera.width))
         return cache
 
     def _empty_cache(self, level: int, views: Sequence[View], name: str) -> ImageStore:
-        """A store for the predictions that a level builds on; what is left to it is decided by the device."""
+        """A store for predictions of a level; what is left to it is decided by the device.
+
+        Those of held-out views are looked at now and then and outside the clock: a GPU has better use for its memory.
+        """
         where, precision = self.settings.cache, self.settings.cache_precision
         if precision == AUTO:
             precision = "float16" if self.device.type == "cuda" else "float32"
         if where == AUTO:
-            where = place(stored_bytes(views, level, precision), self.device)
+            where = "memory" if name == TEST else place(stored_bytes(views, level, precision), self.device)
         return ImageStore(where, precision, device=self.device, folder=self.archive.path(CACHE, name))
 
     def _out_of_memory(self) -> DeviceMemoryError:
@@ -360,7 +383,7 @@ class Trainer:
             train_seconds=run.progress.seconds,
             overhead_seconds=dict(self._overhead),
             image_size=run.stage.image_size,
-            memory_bytes=self._memory(run),
+            memory_bytes=self._memory.note(self._image_bytes),
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
         )
@@ -370,12 +393,12 @@ class Trainer:
         self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
-    def _memory(self, run: StageRun) -> dict[str, int]:
-        """What the stage took of a GPU, in bytes."""
-        if self.device.type != "cuda":
-            return {}
-        kept = run.images.bytes_on_device + (0 if run.accumulated is None else run.accumulated.bytes_on_device)
-        return {"peak": torch.cuda.max_memory_allocated(self.device), "images": kept}
+    @property
+    def _image_bytes(self) -> int:
+        """Bytes of the stage's images on the GPU."""
+        targets = 0 if self._images is None else self._images.bytes_on_device
+        caches = (cache for cache in (self._train_cache, self._test_cache) if cache is not None)
+        return targets + sum(cache.store.bytes_on_device for cache in caches)
 
 
 def _fields(run: StageRun) -> dict[int, GaussianField]:

@@ -14,6 +14,7 @@ from lapgs_plugin.imagestore import EIGHT_BIT_TOLERANCE, ImageStore, place
 from lapgs_plugin.plan import level_size
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.compose import level_camera
+from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.scenes.scene import View
 
 
@@ -33,68 +34,64 @@ class LevelView:
 class LevelImages:
     """The targets of a level's views, and of the next coarser one where a supervision looks at those.
 
-    On a CPU they are the views' own tensors. On a GPU an `ImageStore` brings them: 8-bit photographs as bytes, without
-    loss, everything else in float16.
+    On a CPU targets are the views' own tensors. On a GPU an `ImageStore` brings them: 8-bit photographs as bytes,
+    without loss, everything else in float16. Coarser ones wait at their own size.
 
     Args:
         views: at full resolution, their images on the CPU.
         level, levels: which one, of how many.
         pyramid: makes the targets, on `device`.
-        with_coarse: also keep Up of the coarser target, which only the `gt_laplacian` supervision looks at.
+        with_coarse: also give Up of the coarser target, which only the `gt_laplacian` supervision looks at.
         device: where they are wanted.
     """
 
     def __init__(
         self, views: Sequence[View], level: int, levels: int, pyramid: Pyramid, with_coarse: bool, device: torch.device
     ) -> None:
-        self._coarse_wanted = with_coarse and level < levels - 1
-        self._held: dict[str, tuple[Tensor, Tensor | None]] = {}
-        self._targets: ImageStore | None = None
-        self._coarse: ImageStore | None = None
-        if _wants_store(device):
-            self._targets = _empty_store(views, level, device)
-            self._coarse = _empty_store(views, level, device, precision="float16") if self._coarse_wanted else None
+        self._held: dict[str, Tensor] = {}
+        self._targets = _empty_store(views, level, device) if _wants_store(device) else None
+        self._coarse: RaisedImages | None = None
+        if with_coarse and level < levels - 1:
+            precision = "float16" if _wants_store(device) else "float32"
+            self._coarse = RaisedImages(_empty_store(views, level + 1, device, precision), pyramid)
         for view in views:
-            target, coarse = self._make(view, level, pyramid, device)
-            if self._targets is None:
-                self._held[view.name] = target.contiguous(), coarse
-                continue
-            self._targets.put(view.name, target)
-            if self._coarse is not None:
-                assert coarse is not None
-                self._coarse.put(view.name, coarse)
+            self._make(view, level, pyramid, device)
 
-    def _make(self, view: View, level: int, pyramid: Pyramid, device: torch.device) -> tuple[Tensor, Tensor | None]:
-        image = view.image.to(device)
-        if not self._coarse_wanted:
-            return pyramid.gaussian(image, level + 1)[level], None
-        images = pyramid.gaussian(image, level + 2)
+    def _make(self, view: View, level: int, pyramid: Pyramid, device: torch.device) -> None:
+        images = pyramid.gaussian(view.image.to(device), level + 1 + (self._coarse is not None))
         target = images[level]
-        return target, pyramid.up(images[level + 1], (target.shape[1], target.shape[2]))
+        if self._targets is None:
+            self._held[view.name] = target.contiguous()
+        else:
+            self._targets.put(view.name, target)
+        if self._coarse is not None:
+            self._coarse.put(view.name, images[level + 1], (target.shape[1], target.shape[2]))
 
     def announce(self, name: str) -> None:
         """Start bringing a view's images, which the next iteration will ask for."""
-        for store in (self._targets, self._coarse):
-            if store is not None:
-                store.announce(name)
+        for store in self._stores:
+            store.announce(name)
 
     def get(self, name: str) -> tuple[Tensor, Tensor | None]:
         """A view's target (3, h, w), and Up of the coarser one or None."""
-        if self._targets is None:
-            return self._held[name]
-        return self._targets.get(name), None if self._coarse is None else self._coarse.get(name)
+        target = self._held[name] if self._targets is None else self._targets.get(name)
+        return target, None if self._coarse is None else self._coarse.get(name)
 
     @property
     def bytes_on_device(self) -> int:
         """Bytes of them on a GPU."""
-        return sum(store.bytes_on_device for store in (self._targets, self._coarse) if store is not None)
+        return sum(store.bytes_on_device for store in self._stores)
 
     def close(self) -> None:
         """Let go of everything."""
         self._held.clear()
-        for store in (self._targets, self._coarse):
-            if store is not None:
-                store.close()
+        for store in self._stores:
+            store.close()
+
+    @property
+    def _stores(self) -> list[ImageStore]:
+        coarse = None if self._coarse is None else self._coarse.store
+        return [store for store in (self._targets, coarse) if store is not None]
 
 
 def _empty_store(views: Sequence[View], level: int, device: torch.device, precision: str | None = None) -> ImageStore:

@@ -98,9 +98,15 @@ class Inspected:
 
 
 def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before the first joint step, against fields that were archived, rendered by code that knows no checkout."""
+    """Before the first joint step, against fields that were archived, rendered by code that knows no checkout.
+
+    By then nothing is left of the predictions that were kept.
+    """
 
     def differences(levels: JointLevels) -> list[float]:
+        kept = levels._images.accumulated
+        assert kept is not None
+        assert len(kept.store) == 0
         renderer = run_renderer(RunArchive.open(tmp_path / "run"), device="cpu", rasterizer="cpu")
         found = []
         for view in load_scene(odd, progress=False).train[:3]:

@@ -155,6 +155,48 @@ def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_
         assert plys(archive) == plys(whole)
 
 
+class Below(StageHook):
+    """Notes what lies below each stage's first view, and the bytes of all that is kept of it and at the stage's end."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.first: dict[int, StageContext] = {}
+        self.bytes: dict[int, int] = {}
+        self.bytes_at_end: dict[int, int] = {}
+
+    def before_render(self, context: StageContext) -> None:
+        if context.iteration == 1 and context.stage.signed:
+            self.first[context.stage.level] = context
+            self.bytes[context.stage.level] = self._kept()
+
+    def on_stage_end(self, stage: Stage) -> None:
+        if stage.signed:
+            self.bytes_at_end[stage.level] = self._kept()
+
+    def _kept(self) -> int:
+        return sum(path.stat().st_size for path in self._folder.glob("cache/train/*"))
+
+
+@pytest.mark.parametrize("joint", [0.0, 0.25])
+def test_predictions_are_kept_at_their_own_size(joint: float, tmp_path: Path) -> None:
+    """And hooks see Up of them. Once finished fields are trained along, they are rendered and nothing is kept."""
+    scene, folder = ring_scene(size=(97, 65)), tmp_path / "run"
+    below = Below(folder)
+    settings = replace(SETTINGS, levels=3, cache="disk", joint=joint)
+    archive = train(folder, scene, settings, user_hooks=[below])
+    pixels = {1: 25 * 17, 0: 49 * 33}  # of the level below
+    assert below.bytes == {level: len(scene.train) * 3 * 4 * pixels[level] for level in (1, 0)}
+    assert below.bytes_at_end == ({1: 0, 0: 0} if joint else below.bytes)
+    if joint:
+        return  # the fields have learned on
+    renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
+    cameras = {view.name: view.camera for view in scene.train}
+    for level, context in below.first.items():
+        composed = renderer.render(cameras[context.view], level + 1).composed[level + 1]
+        expected = renderer.pyramid.up(composed, tuple(context.target.shape[1:]))
+        torch.testing.assert_close(context.accumulated, expected, rtol=0, atol=5e-6)
+
+
 def test_predictions_read_ahead_from_the_disk_change_no_bit(scene: Scene, tmp_path: Path) -> None:
     runs = [train(tmp_path / cache, scene, replace(SETTINGS, cache=cache)) for cache in ("memory", "disk")]
     assert plys(runs[0]) == plys(runs[1])

@@ -103,21 +103,6 @@ def test_a_constant_image_is_exact(tmp_path: Path, device: str, where: str, prec
 
 @on_every_device
 @in_every_precision
-def test_the_type_of_the_result_is_chosen_by_the_caller(
-    tmp_path: Path, device: str, where: str, precision: str
-) -> None:
-    as_stored = torch.float16 if precision == "float16" else torch.float32
-    image = eight_bit(3, 4, 5) / 255
-    with store(tmp_path, where, precision, device) as kept:
-        kept.put("a", image)
-        for dtype, expected in ((None, as_stored), (torch.float16, torch.float16), (torch.float64, torch.float64)):
-            got = kept.get("a", dtype)
-            assert got.dtype == expected
-            torch.testing.assert_close(got.cpu().float(), image, rtol=2**-11, atol=0)
-
-
-@on_every_device
-@in_every_precision
 def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, where: str, precision: str) -> None:
     with store(tmp_path, where, precision, device) as kept:
         image = torch.ones(3, 2, 2, requires_grad=True, device=device)

@@ -18,6 +18,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.kernel_check import is_right
 from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
 from lapgs_plugin.rendering import raising
@@ -65,12 +66,20 @@ def test_on_a_cpu_it_is_up_and_the_sum(grid: str, shape: tuple[int, int, int], d
     # Sums in another order; worst seen 9e-7 and 2e-15.
     tolerance = 5e-6 if dtype == torch.float32 else 1e-14
     torch.testing.assert_close(add_raised(Pyramid(grid), coarse, fine), expected, rtol=0, atol=tolerance)
+    up = raised(Pyramid(grid), coarse, (shape[1], shape[2]))
+    torch.testing.assert_close(up, expected - fine, rtol=0, atol=tolerance)
 
 
 def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     coarse, fine, expected = images("camera", (2, 3, 33, 50), torch.float32)
     turned = [image.movedim(1, -1).contiguous().movedim(-1, 1) for image in (coarse, fine)]
     torch.testing.assert_close(add_raised(Pyramid(), *turned), expected, rtol=0, atol=5e-6)
+    torch.testing.assert_close(raised(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
+
+
+def test_what_is_not_half_of_the_size_is_refused() -> None:
+    with pytest.raises(UserInputError, match=r"Up to 33x50 .* needs an image of 17x25, got 16x25"):
+        raised(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
 
 
 def test_gradients_go_through() -> None:
