@@ -122,7 +122,7 @@ class Densifier:
         if self.state["grad2d"] is None:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
         given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
-        if gradient.device.type == "cuda" and _in_triton():
+        if gradient.device.type == "cuda" and statistics_in_triton():
             from lapgs_plugin.training.densification_triton import add_statistics
 
             add_statistics(*given)
@@ -151,7 +151,9 @@ def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norm
 
 
 @lru_cache(maxsize=1)
-def _in_triton() -> bool:
+def statistics_in_triton() -> bool:
+    """Whether our kernel sums up what PyTorch's operations do."""
+
     def difference() -> float:
         from lapgs_plugin.training.densification_triton import add_statistics
 

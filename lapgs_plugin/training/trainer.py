@@ -29,7 +29,7 @@ from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.rendering.raising import raised
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
-from lapgs_plugin.training.densification import density_control, mcmc_start
+from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -83,6 +83,8 @@ def warm_up(
     result = rasterizer(model.field, camera, background=torch.zeros(3, device=device))
     photometric_loss(result.image, torch.zeros_like(result.image)).backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
+    if torch.device(device).type == "cuda":
+        statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
     if residuals:
         raised(Pyramid(), coarse, (16, 16))
