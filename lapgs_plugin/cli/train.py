@@ -133,8 +133,8 @@ def train(
         str,
         typer.Option(
             rich_help_panel=RUN,
-            help="Where finished levels' predictions are kept: gpu, memory or disk. auto: a GPU while those of training "
-            "views are a small part of it, else memory.",
+            help="Where finished levels' predictions are kept: gpu, memory or disk. auto: a GPU while those of "
+            "training views are a small part of it, else memory.",
         ),
     ] = "auto",
     cache_precision: Annotated[
