@@ -115,7 +115,7 @@ def run(
         ),
     ] = "auto",
     prediction_precision: Annotated[
-        str, typer.Option(rich_help_panel=MEMORY, help="Of cached predictions: float32, float16 or uint8.")
+        str, typer.Option(rich_help_panel=MEMORY, help="Of cached predictions before Up: float32, float16 or uint8.")
     ] = "float16",
     fused_adam: Annotated[
         bool,

@@ -133,15 +133,16 @@ def train(
         str,
         typer.Option(
             rich_help_panel=RUN,
-            help="Where finished levels' predictions are kept: gpu, memory or disk. auto: a GPU while they are a small "
-            "part of it, else memory.",
+            help="Where finished levels' predictions are kept: gpu, memory or disk. auto: a GPU while those of "
+            "training views are a small part of it, else memory.",
         ),
     ] = "auto",
     cache_precision: Annotated[
         str,
         typer.Option(
             rich_help_panel=RUN,
-            help="How they are stored: float32, float16 or uint8. auto: float16 on a GPU, else float32.",
+            help="How they are stored, at their own size and before Up: float32, float16 or uint8. auto: float16 on "
+            "a GPU, else float32.",
         ),
     ] = "auto",
     test_every: Annotated[

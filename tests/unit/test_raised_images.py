@@ -11,6 +11,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.imagestore import ImageStore
 from lapgs_plugin.pyramid import GRIDS, Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
+from tests.unit.test_imagestore import on_every_device
 
 SIZES = {"a": (6, 10), "b": (7, 9)}
 WORST = {"float32": 1e-6, "float16": 2.5e-4, "uint8": 3e-3}
@@ -19,19 +20,19 @@ Seen: 1.8e-7, 2.1e-4 and 2.8e-3."""
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-@pytest.mark.parametrize("where", ["memory", "disk"])
+@on_every_device
 @pytest.mark.parametrize("precision", WORST)
-def test_it_is_up_of_what_was_put(grid: str, where: str, precision: str, tmp_path: Path) -> None:
-    images = RaisedImages(ImageStore(where, precision, folder=tmp_path / "images"), Pyramid(grid))
+def test_it_is_up_of_what_was_put(grid: str, device: str, where: str, precision: str, tmp_path: Path) -> None:
+    images = RaisedImages(ImageStore(where, precision, device=device, folder=tmp_path / "images"), Pyramid(grid))
     coarse = {name: torch.rand(3, -(-h // 2), -(-w // 2)) * 1.5 - 0.5 for name, (h, w) in SIZES.items()}
     for name, size in SIZES.items():
         images.put(name, coarse[name].requires_grad_(), size)
     images.announce("b")
     for name, size in SIZES.items():
         got = images.get(name)
-        assert (got.dtype, got.requires_grad) == (torch.float32, False)
+        assert (got.dtype, got.device.type, got.requires_grad) == (torch.float32, device, False)
         expected = Pyramid(grid).up(coarse[name].detach(), size)
-        torch.testing.assert_close(got, expected, rtol=0, atol=WORST[precision])
+        torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=WORST[precision])
     images.close()
     assert not list(tmp_path.iterdir())
 
