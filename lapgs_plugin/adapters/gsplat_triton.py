@@ -16,6 +16,10 @@ from torch import Tensor
 GAUSSIANS = 128
 """In a block. A row of 4 threads takes one: its 3 channels and, which is what Triton's powers of 2 cost, nothing."""
 
+# Compiled anew, for half a second each, is what differs in the number of coefficients alone: the degree in use grows
+# while a stage is trained, and bases and residuals come by turns.
+OF_ANY_VALUE = ("n", "active", "signed")
+
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911, PLR0912  # a return for each k, of which Triton compiles one
@@ -163,12 +167,11 @@ def _activate_kernel(
         tl.store(scales + places, tl.exp(tl.load(log_scales + places, places < 3 * n, 0.0)), places < 3 * n)
 
 
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _color_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, pixels: tl.tensor,
     colors: tl.tensor, shown_radii: tl.tensor, shown_pixels: tl.tensor,
-    n: int, coefficients: tl.constexpr, active: tl.constexpr, signed: tl.constexpr, describes: tl.constexpr,
-    block: tl.constexpr,
+    n: int, active: int, signed: int, coefficients: tl.constexpr, describes: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
@@ -177,11 +180,10 @@ def _color_kernel(
     shown = (across > 0) & (down > 0)
     x, y, z, _ = _towards(means, centre, rows, shown)
     color = tl.zeros((block, 4), tl.float32)
-    for k in tl.static_range(active):
-        coefficient = tl.load(sh + (rows * coefficients + k) * 3 + channel, shown & (channel < 3), 0.0)
-        color += _basis(k, x, y, z) * coefficient
-    if not signed:
-        color = tl.maximum(color + 0.5, 0.0)
+    for k in tl.static_range(coefficients):
+        wanted = shown & (channel < 3) & (k < active)
+        color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
+    color = tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
     tl.store(colors + rows * 3 + channel, color, here & (channel < 3))
     if describes:
         tl.store(shown_radii + rows, tl.where(shown, tl.maximum(across, down), 0), here)
@@ -190,12 +192,12 @@ def _color_kernel(
             tl.store(shown_pixels + 2 * rows + side, centred, here)
 
 
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _gradient_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
     scales: tl.tensor, opacities: tl.tensor,
     by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor, by_sh: tl.tensor,
-    n: int, coefficients: tl.constexpr, active: tl.constexpr, signed: tl.constexpr, block: tl.constexpr,
+    n: int, active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
@@ -203,21 +205,18 @@ def _gradient_kernel(
     shown = (tl.load(radii + 2 * rows, here, 0) > 0) & (tl.load(radii + 2 * rows + 1, here, 0) > 0)
     x, y, z, inverse = _towards(means, centre, rows, shown)
     flow = tl.load(by_color + 3 * rows + channel, shown & (channel < 3), 0.0)  # (g, 4)
-    if not signed:
-        flow = tl.where(tl.load(colors + 3 * rows + channel, shown & (channel < 3), 0.0) > 0.0, flow, 0.0)
+    color = tl.load(colors + 3 * rows + channel, shown & (channel < 3), 0.0)
+    flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
     along_x, along_y, along_z = tl.zeros_like(flow), tl.zeros_like(flow), tl.zeros_like(flow)
     for k in tl.static_range(coefficients):
         there = (rows * coefficients + k) * 3 + channel
-        if k < active:
-            tl.store(by_sh + there, _basis(k, x, y, z) * flow, in_channel)
-            if k > 0:
-                weighed = flow * tl.load(sh + there, shown & (channel < 3), 0.0)
-                along_x += _basis_x(k, x, y, z) * weighed
-                along_y += _basis_y(k, x, y, z) * weighed
-                along_z += _basis_z(k, x, y, z) * weighed
-        else:
-            tl.store(by_sh + there, tl.zeros_like(flow), in_channel)
-    if active > 1:
+        used = tl.where(k < active, flow, 0.0)
+        tl.store(by_sh + there, _basis(k, x, y, z) * used, in_channel)
+        weighed = used * tl.load(sh + there, shown & (channel < 3) & (k < active), 0.0)
+        along_x += _basis_x(k, x, y, z) * weighed
+        along_y += _basis_y(k, x, y, z) * weighed
+        along_z += _basis_z(k, x, y, z) * weighed
+    if coefficients > 1:
         in_x = tl.sum(along_x, 1)[:, None]
         in_y = tl.sum(along_y, 1)[:, None]
         in_z = tl.sum(along_z, 1)[:, None]
@@ -265,9 +264,8 @@ def colors_of_shown(
         _color_kernel,
         n,
         (means, centre, sh, radii, means if pixels is None else pixels, colors, shown_radii, shown_pixels),
+        ((degree + 1) ** 2, int(signed)),
         coefficients=sh.shape[1],
-        active=(degree + 1) ** 2,
-        signed=signed,
         describes=describes,
     )
     return colors, shown_radii, shown_pixels
@@ -291,12 +289,11 @@ def finish_gradients(
         _gradient_kernel,
         len(means),
         (means, centre, sh, radii, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity, by_sh),
+        ((degree + 1) ** 2, int(signed)),
         coefficients=sh.shape[1],
-        active=(degree + 1) ** 2,
-        signed=signed,
     )
     return by_sh
 
 
-def _launch(kernel: Any, n: int, given: tuple[Tensor, ...], **constants: int | bool) -> None:
-    kernel[(triton.cdiv(n, GAUSSIANS),)](*given, n, block=GAUSSIANS, **constants)
+def _launch(kernel: Any, n: int, given: tuple[Tensor, ...], numbers: tuple[int, ...] = (), **constants: int) -> None:
+    kernel[(triton.cdiv(n, GAUSSIANS),)](*given, n, *numbers, block=GAUSSIANS, **constants)

@@ -23,7 +23,7 @@ from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.peak_memory import PeakMemory
 from lapgs_plugin.plan import Stage, StagePlan, parse_split
 from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.raster import Rasterizer, render_image
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.rendering.raising import raised
@@ -68,20 +68,20 @@ def check_cache(settings: TrainSettings, device: torch.device) -> None:
 
 def warm_up(
     rasterizer: Rasterizer,
+    settings: TrainSettings,
     device: torch.device | str = "cpu",
     *,
-    sparse: bool = False,
     residuals: bool = False,
     joint: bool = False,
 ) -> None:
     """Run every kernel of an iteration once, so that compiling them is not taken for training."""
-    settings = TrainSettings(sh_degree=0)
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
-    first = field_from_points(ahead, ahead, 0).to(device)
-    model = TrainableField.create(first, settings.learning_rates, extent=1.0, sparse=sparse)
-    camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
-    result = rasterizer(model.field, camera, background=torch.zeros(3, device=device))
-    photometric_loss(result.image, torch.zeros_like(result.image)).backward()  # type: ignore[no-untyped-call]  # torch's
+    first = field_from_points(ahead, ahead, settings.sh_degree).to(device)
+    model = TrainableField.create(first, settings.learning_rates, extent=1.0, sparse=settings.sparse_adam)
+    camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
+    result = rasterizer(model.field, camera, background=black)
+    image = result.image + render_image(rasterizer, model.field, camera, black)
+    photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
     if torch.device(device).type == "cuda":
         statistics_in_triton()
@@ -151,9 +151,7 @@ class Trainer:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
                 residuals = self.plan.levels > 1
-                warm_up(
-                    self.rasterizer, self.device, sparse=self.settings.sparse_adam, residuals=residuals, joint=joint
-                )
+                warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
