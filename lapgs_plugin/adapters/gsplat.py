@@ -207,7 +207,7 @@ class GsplatRasterizer:
         from gsplat import rasterization
 
         means = field.means
-        viewmats, intrinsics, positions = _on_device(cameras, means)
+        viewmats, intrinsics, positions = cameras_on_device(cameras, means)
         colors = _harmonics(field, degree, viewmats, positions)
         if not field.signed:
             colors = torch.clamp_min(colors + 0.5, 0.0)
@@ -286,7 +286,7 @@ class _Shots:
         """The camera beside `like`."""
         known, shot = self._sent.get(id(camera), (None, None))
         if known is None or shot is None or known() is not camera or shot.pose.device != like.device:
-            poses, intrinsics, centres = _on_device([camera], like)
+            poses, intrinsics, centres = cameras_on_device([camera], like)
             intrinsics, poses = intrinsics.contiguous(), poses.contiguous()
             shot = gsplat_direct.Shot(poses, intrinsics, centres[0].contiguous(), camera.width, camera.height)
             place, sent = id(camera), self._sent
@@ -294,7 +294,7 @@ class _Shots:
         return shot
 
 
-def _on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU."""
     poses = [camera.world_to_camera for camera in cameras]
     elsewhere = any(pose.device.type != "cpu" for pose in poses)

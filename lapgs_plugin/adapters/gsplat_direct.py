@@ -117,7 +117,7 @@ class _View(torch.autograd.Function):
         from lapgs_plugin.adapters.gsplat_triton import finish_gradients
 
         means, quaternions, sh, background, pose, intrinsics, centre, *rest = ctx.saved_tensors
-        seen, (width, height), compiled = Seen(*rest), ctx.size, _compiled()
+        seen, (width, height), compiled = Seen(*rest), ctx.size, compiled_functions()
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = compiled.rasterize_to_pixels_3dgs_bwd(
             seen.means2d, seen.conics, seen.colors[None], seen.opacities[None], background[None], None,
             width, height, TILE, seen.offsets, seen.flat, seen.alphas, seen.last,
@@ -143,7 +143,7 @@ def _forward(
     """Images (1, h, w, 3), and what is known of the Gaussians."""
     from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown
 
-    compiled = _compiled()
+    compiled = compiled_functions()
     width, height = shot.width, shot.height
     scales, opacities = activated(log_scales, logits)
     radii, means2d, depths, conics, _ = compiled.projection_ewa_3dgs_fused_fwd(
@@ -183,7 +183,7 @@ def _zeros(shape: torch.Size, device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def _compiled() -> Any:
+def compiled_functions() -> Any:
     """gsplat's compiled functions."""
     from gsplat.cuda._backend import _C
 

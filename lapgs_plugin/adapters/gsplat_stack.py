@@ -20,7 +20,8 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.gsplat import _on_device
+from lapgs_plugin.adapters import gsplat_direct
+from lapgs_plugin.adapters.gsplat import cameras_on_device
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
@@ -51,6 +52,9 @@ class GsplatStack:
         self._sh = _joined([field.sh for field in fields], device)  # (n, k, 3)
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
+        self._direct = device.type == "cuda" and not antialiased and gsplat_direct.works()
+        parts = self._means, self._quaternions, self._scales, self._opacities, self._sh
+        self._parts = [[part[self._rows(i)] for part in parts] for i in range(len(fields))]
         if device.type == "cuda":
             torch.cuda.synchronize(device)  # once: from now on every stream may use it
 
@@ -58,9 +62,13 @@ class GsplatStack:
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         """Images of the first fields; see `raster.FieldStack.render`."""
         height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
-        viewmats, intrinsics, positions = _on_device(cameras, self._means)
+        viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
         if self._starts[len(cameras)] == 0:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
+        elif self._direct:
+            images, alphas = self._blend_directly(
+                *self._see_directly(cameras, viewmats, intrinsics, positions[0]), len(cameras), (height, width)
+            )
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
@@ -74,6 +82,47 @@ class GsplatStack:
 
     def _rows(self, index: int) -> slice:
         return slice(self._starts[index], self._starts[index + 1])
+
+    def _see_directly(
+        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """What `_project` and `_colors` give, in two launches a field."""
+        from lapgs_plugin.adapters.gsplat_triton import place_seen
+
+        count, like = self._starts[len(cameras)], self._means
+        radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
+        means2d, depths, conics, colors = (like.new_empty(count, *columns) for columns in ((2,), (), (3,), (3,)))
+        compiled = gsplat_direct.compiled_functions()
+        for i, camera in enumerate(cameras):
+            means, quaternions, scales, opacities, sh = self._parts[i]
+            if len(means) == 0:
+                continue  # gsplat divides by their number
+            *found, _ = compiled.projection_ewa_3dgs_fused_fwd(
+                means, None, quaternions, scales, opacities, viewmats[i : i + 1], intrinsics[i : i + 1],
+                camera.width, camera.height, PIXEL_VARIANCE, NEAR_DEPTH, gsplat_direct.FAR_PLANE, 0.0, False,
+                compiled.CameraModelType.PINHOLE,
+            )  # fmt: skip
+            placed = radii, means2d, depths, conics, colors
+            place_seen(means, position, sh, self._signed[i], found, placed, self._starts[i])
+        return [radii, means2d, depths, conics, self._opacities[:count]], colors
+
+    def _blend_directly(
+        self, projected: Sequence[Tensor], colors: Tensor, count: int, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """What `_blend` gives."""
+        compiled = gsplat_direct.compiled_functions()
+        radii, means2d, depths, conics, opacities = projected
+        height, width = size
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        of_image = self._images[: len(depths)]
+        _, keys, order = compiled.intersect_tile(
+            means2d, radii, depths, of_image, of_image, count, TILE, columns, rows, True, False
+        )
+        offsets = compiled.intersect_offset(keys, count, columns, rows)
+        images, alphas, _ = compiled.rasterize_to_pixels_3dgs_fwd(
+            means2d, conics, colors, opacities, None, None, width, height, TILE, offsets, order
+        )
+        return images, alphas
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
         """Radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields' n."""

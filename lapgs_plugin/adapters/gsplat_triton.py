@@ -6,6 +6,7 @@ processor launches for longer than a GPU computes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -155,6 +156,20 @@ def _towards(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.ten
     return x * inverse, y * inverse, z * inverse, inverse
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _colored(
+    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, rows: tl.tensor, channel: tl.tensor, shown: tl.tensor,
+    active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Colours (g, 4) of a block, the last channel of no meaning."""
+    x, y, z, _ = _towards(means, centre, rows, shown)
+    color = tl.zeros((block, 4), tl.float32)
+    for k in tl.static_range(coefficients):
+        wanted = shown & (channel < 3) & (k < active)
+        color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
+    return tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
+
+
 @triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _activate_kernel(
     log_scales: tl.tensor, logits: tl.tensor, scales: tl.tensor, opacities: tl.tensor, n: int, block: tl.constexpr
@@ -178,18 +193,34 @@ def _color_kernel(
     here = rows < n
     across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
     shown = (across > 0) & (down > 0)
-    x, y, z, _ = _towards(means, centre, rows, shown)
-    color = tl.zeros((block, 4), tl.float32)
-    for k in tl.static_range(coefficients):
-        wanted = shown & (channel < 3) & (k < active)
-        color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
-    color = tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
+    color = _colored(means, centre, sh, rows, channel, shown, active, signed, coefficients, block)
     tl.store(colors + rows * 3 + channel, color, here & (channel < 3))
     if describes:
         tl.store(shown_radii + rows, tl.where(shown, tl.maximum(across, down), 0), here)
         for side in tl.static_range(2):
             centred = tl.load(pixels + 2 * rows + side, shown, 0.5) - 0.5
             tl.store(shown_pixels + 2 * rows + side, centred, here)
+
+
+@triton.jit(do_not_specialize=(*OF_ANY_VALUE, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _place_kernel(
+    means: tl.tensor, centre: tl.tensor, sh: tl.tensor,
+    radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, conics: tl.tensor,
+    all_radii: tl.tensor, all_pixels: tl.tensor, all_depths: tl.tensor, all_conics: tl.tensor, all_colors: tl.tensor,
+    n: int, active: int, signed: int, start: int, coefficients: tl.constexpr, block: tl.constexpr,
+) -> None:  # fmt: skip
+    rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
+    channel = tl.arange(0, 4)[None, :]
+    here, pair, triple = rows < n, (rows < n) & (channel < 2), (rows < n) & (channel < 3)
+    placed = rows + start
+    across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
+    shown = (across > 0) & (down > 0)
+    color = _colored(means, centre, sh, rows, channel, shown, active, signed, coefficients, block)
+    tl.store(all_colors + 3 * placed + channel, color, triple)
+    tl.store(all_radii + 2 * placed + channel, tl.load(radii + 2 * rows + channel, pair, 0), pair)
+    tl.store(all_pixels + 2 * placed + channel, tl.load(pixels + 2 * rows + channel, pair, 0.0), pair)
+    tl.store(all_conics + 3 * placed + channel, tl.load(conics + 3 * rows + channel, triple, 0.0), triple)
+    tl.store(all_depths + placed, tl.load(depths + rows, here, 0.0), here)
 
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -269,6 +300,31 @@ def colors_of_shown(
         describes=describes,
     )
     return colors, shown_radii, shown_pixels
+
+
+def place_seen(
+    means: Tensor,
+    centre: Tensor,
+    sh: Tensor,
+    signed: bool,
+    found: Sequence[Tensor],
+    placed: Sequence[Tensor],
+    start: int,
+) -> None:
+    """Put what a camera sees of one field, and its colours, where the fields of a view are in one list.
+
+    Args:
+        means, centre, sh, signed: as `colors_of_shown` takes them; all coefficients are evaluated.
+        found: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
+        placed: the same of all fields, and colours (m, 3); written from row `start` on.
+    """
+    _launch(
+        _place_kernel,
+        len(means),
+        (means, centre, sh, *found, *placed),
+        (sh.shape[1], int(signed), start),
+        coefficients=sh.shape[1],
+    )
 
 
 def finish_gradients(

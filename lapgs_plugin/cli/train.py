@@ -160,8 +160,13 @@ def train(
         ),
     ] = False,
     checkpoint_every: Annotated[
-        int, typer.Option(rich_help_panel=RUN, min=1, help="Iterations between checkpoints; Ctrl-C writes one too.")
-    ] = 1000,
+        int | None,
+        typer.Option(
+            rich_help_panel=RUN,
+            min=1,
+            help="Iterations between checkpoints; by default one is written every minute. Ctrl-C writes one too.",
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out where it stopped, with its settings.")
     ] = False,
@@ -350,7 +355,7 @@ def _run(
     threads: int | None,
     test_every: int | None,
     breakdown: bool,
-    checkpoint_every: int,
+    checkpoint_every: int | None,
     resume: bool,
     watcher: Watcher,
 ) -> None:

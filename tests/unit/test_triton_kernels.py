@@ -12,7 +12,7 @@ import torch
 
 CHECKS = """
 import torch
-from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown, finish_gradients
+from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown, finish_gradients, place_seen
 from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 from lapgs_plugin.supervision_triton import weighted_l1
 from lapgs_plugin.training.densification_triton import add_statistics
@@ -40,6 +40,14 @@ for degree, active, signed in ((3, 3, False), (3, 3, True), (3, 1, False), (2, 2
     assert (largest == torch.where(shown, radii.amax(-1), 0)).all()
     close(centres, torch.where(shown[:, None], pixels - 0.5, 0.0))
     assert colors_of_shown(*given, None)[1].numel() == 0
+    if active == degree:
+        found = radii, pixels, torch.randn(n), torch.randn(n, 3)
+        placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors)]
+        place_seen(means.detach(), centre, sh.detach(), signed, found, placed, 30)
+        for part, whole in zip((*found, colors), placed, strict=True):
+            assert (whole[30 : 30 + n] == part).all()
+            assert (whole[:30] == -7).all()
+            assert (whole[30 + n :] == -7).all()
 
     by_color, by_mean, by_scale = (torch.randn(n, 3) * shown[:, None] for _ in range(3))
     by_opacity = torch.randn(n)
