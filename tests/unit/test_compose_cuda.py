@@ -50,7 +50,7 @@ def images(renderer: HierarchyRenderer, cameras: list[Camera]) -> list[torch.Ten
 
 
 def assert_alike(found: torch.Tensor, expected: torch.Tensor) -> None:
-    """The same but for rounding, which lets a Gaussian of 1/255 be left out in a pixel, or blending stop one earlier."""
+    """The same but for rounding, by which a Gaussian of 1/255 is left out in a pixel, or blending stops one earlier."""
     apart = (found - expected).abs()
     assert float((apart > 2e-5).float().mean()) < 1e-4, float(apart.max())  # worst seen: 3 of 246,402
     assert float(apart.max()) < 1e-2  # worst seen 1.7e-3
