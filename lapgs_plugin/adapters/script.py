@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,5 +106,8 @@ def _is_main_block(node: ast.stmt) -> bool:
 
 
 def _is_under(module: ModuleType | None, folder: Path) -> bool:
-    places = [getattr(module, "__file__", None), *getattr(module, "__path__", [])]
-    return any(place is not None and Path(place).is_relative_to(folder) for place in places)
+    # What lies in `sys.modules` need not be a module: there are objects that answer to any name, `__path__` included.
+    known = getattr(module, "__dict__", {})
+    package = known.get("__path__")
+    places = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
+    return any(isinstance(place, str) and Path(place).is_relative_to(folder) for place in places)

@@ -136,3 +136,21 @@ def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
             definitions.run_main()
         assert caught.traceback[-1].path == script
         assert caught.traceback[-1].lineno == 2
+
+
+def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
+    """Packages put objects into `sys.modules` that answer to any name, and end a finished run when they are asked."""
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import sys\nimport beside\n"
+        "class Anything:\n    def __getattr__(self, name):\n        return 7\n"
+        'sys.modules["lapgs_anything"] = Anything()\n'
+        'if __name__ == "__main__":\n    pass\n'
+    )
+    (tmp_path / "beside.py").write_text("")
+    try:
+        with loaded_script(script, []) as definitions:
+            definitions.run_main()
+        assert "beside" not in sys.modules
+    finally:
+        del sys.modules["lapgs_anything"]
