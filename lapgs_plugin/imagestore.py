@@ -37,7 +37,7 @@ PLACES = ("gpu", "memory", "disk")
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "uint8": torch.uint8}
 
 GPU_LIMIT = 1 << 30
-"""Bytes of images that `place` keeps on a GPU at most, however large it is."""
+"""Bytes of a stage's images that `place` keeps on a GPU at most, however large it is."""
 GPU_SHARE = 0.1
 """The same as a share of the GPU's memory: the rest is for Gaussians and what they need to be trained."""
 
@@ -50,7 +50,8 @@ LOADERS = 2
 
 
 def place(total_bytes: int, device: torch.device | str) -> str:
-    """Where images of that many stored bytes cost least: "gpu" while they are a small part of it, or "memory"."""
+    """Where images of that many stored bytes, with all that are needed beside them, cost least: "gpu" while they are a
+    small part of it, or "memory"."""
     if torch.device(device).type != "cuda":
         return "memory"
     available = torch.cuda.get_device_properties(torch.device(device)).total_memory

@@ -46,8 +46,7 @@ class StageImages:
         self.train, self.test = scene.train, scene.test
         self._keys = {id(camera): album.key(camera) for camera in self.cameras}
         self.accumulated = accumulated
-        # Photos of 8 bits are themselves only at full size: averages need more.
-        self.targets = self._store("uint8" if stage.level == 0 and album.exact else "float16", stage.level, "targets")
+        self.targets = self._store(self._target_precision(stage.level), stage.level, "targets")
         of_laplacian = stage.signed and self._supervision is Supervision.GT_LAPLACIAN
         self.coarse = self._raised("float16", stage.level + 1, "coarse") if of_laplacian else None
 
@@ -115,16 +114,24 @@ class StageImages:
         raised = (images.store for images in (self.coarse, self.accumulated) if images is not None)
         return (self.targets, *raised)
 
-    def _raised(self, precision: str, level: int, name: str) -> RaisedImages:
-        """The same as `_store` makes, for images of a level that will be looked at as Up of them."""
-        return RaisedImages(self._store(precision, level, name), self._pyramid)
+    def _target_precision(self, level: int) -> str:
+        """Photos of 8 bits are themselves only at full size: averages need more."""
+        return "uint8" if level == 0 and self._album.exact else "float16"
 
-    def _store(self, precision: str, level: int, name: str) -> ImageStore:
+    def _raised(self, precision: str, level: int, name: str) -> RaisedImages:
+        """Room for images of a level that the next finer one will look at as Up of them, beside its targets."""
+        targets = self._bytes(self._target_precision(level - 1), level - 1)
+        return RaisedImages(self._store(precision, level, name, beside=targets), self._pyramid)
+
+    def _bytes(self, precision: str, level: int) -> int:
+        """Of an image of every view at a level."""
+        return 3 * sum(math.prod(self.size(camera, level)) for camera in self.cameras) * PRECISIONS[precision].itemsize
+
+    def _store(self, precision: str, level: int, name: str, beside: int = 0) -> ImageStore:
         """A store for an image of every view at a level, where the user wants it or where it fits."""
         where = self._options.images_on
         if where == "auto":
-            values = 3 * sum(math.prod(self.size(camera, level)) for camera in self.cameras)
-            where = place(values * PRECISIONS[precision].itemsize, self._device)
+            where = place(self._bytes(precision, level) + beside, self._device)
         elif where == "gpu" and self._device.type == "cpu":
             where = "memory"
         folder = self._folder / f"{name}_{self._stage.level}"

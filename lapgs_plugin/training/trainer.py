@@ -299,7 +299,9 @@ class Trainer:
         if precision == AUTO:
             precision = "float16" if self.device.type == "cuda" else "float32"
         if where == AUTO:
-            where = "memory" if name == TEST else place(stored_bytes(views, level, precision), self.device)
+            targets = 0 if self._images is None else self._images.stored_bytes
+            fits = place(stored_bytes(views, level, precision) + targets, self.device)
+            where = "memory" if name == TEST else fits
         return ImageStore(where, precision, device=self.device, folder=self.archive.path(CACHE, name))
 
     def _out_of_memory(self) -> DeviceMemoryError:

@@ -82,6 +82,11 @@ class LevelImages:
         """Bytes of them on a GPU."""
         return sum(store.bytes_on_device for store in self._stores)
 
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of them wherever they wait to be brought."""
+        return sum(store.bytes_on_device + store.bytes_in_memory for store in self._stores)
+
     def close(self) -> None:
         """Let go of everything."""
         self._held.clear()
