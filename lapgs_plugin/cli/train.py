@@ -83,6 +83,15 @@ def train(
         ),
     ] = "camera",
     sh_degree: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, help="Highest SH degree, 0 to 3.")] = 3,
+    gather: Annotated[
+        int,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            min=1,
+            help="Views whose gradients make one step in the last quarter of a stage; fewer in short stages, 1 steps "
+            "with every view as 3DGS does.",
+        ),
+    ] = 8,
     densify_from: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, help="First densification. Default: 500 of 30000.")
     ] = None,
@@ -204,6 +213,7 @@ def train(
         inherit=mode,
         inherit_ratio=ratio,
         joint=joint,
+        gather=gather,
         sh_degree=sh_degree,
         seed=seed,
         cache=cache,
@@ -286,7 +296,7 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         **{
             name: getattr(settings, name)
             for name in (
-                *("iterations", "levels", "split", "supervision", "grid", "joint", "sh_degree", "seed"),
+                *("iterations", "levels", "split", "supervision", "grid", "joint", "gather", "sh_degree", "seed"),
                 *("packed", "sparse_adam"),
             )
         },

@@ -195,7 +195,9 @@ class McmcDensifier:
 
     def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
         """See `DensityControl`."""
-        rate = model.optimizers["means"].param_groups[0]["lr"]
+        # Positions get their noise beside a step: none while gradients still wait for those of other views.
+        waits = model.params["means"].grad is not None
+        rate = 0.0 if waits else model.optimizers["means"].param_groups[0]["lr"]
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
         return iteration < self._schedule.densify_until and _refines(self._schedule, iteration)
 

@@ -7,7 +7,7 @@ cache, and the fields that they are made of step with the residual.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -38,7 +38,6 @@ class JointFields:
     rasterizer: Rasterizer
     background: Tensor
     pyramid: Pyramid
-    _visible: dict[int, Tensor] = field(default_factory=dict)
 
     def predict(self, name: str) -> Tensor:
         """(3, h, w) Up of what the fields make of a view, at the size of the level below them, with gradients."""
@@ -46,27 +45,20 @@ class JointFields:
         for level, model in self.models.items():
             camera = level_camera(self.cameras[name], level)
             background = self.background.new_zeros(3) if model.signed else self.background
-            image = self._render(level, model, camera, background)
+            image = render_image(self.rasterizer, model.field, camera, background)
             composed = image if composed is None else add_raised(self.pyramid, composed, image)
         assert composed is not None
         camera = level_camera(self.cameras[name], min(self.models) - 1)
         return raised(self.pyramid, composed, (camera.height, camera.width))
 
-    def _render(self, level: int, model: TrainableField, camera: Camera, background: Tensor) -> Tensor:
-        if not model.sparse:
-            return render_image(self.rasterizer, model.field, camera, background)
-        result = self.rasterizer(model.field, camera, background=background)
-        self._visible[level] = result.radii > 0
-        return result.image
-
     def step(self, means_rate: float) -> None:
-        """One Adam step on every field, after a backward pass through what `predict` gave.
+        """One Adam step on every field, after backward passes through what `predict` gave.
 
         Args:
             means_rate: step size of the positions, in world units.
         """
-        for level, model in self.models.items():
-            model.step(means_rate, visible=self._visible.get(level))
+        for model in self.models.values():
+            model.step(means_rate, visible=model.touched if model.sparse else None)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

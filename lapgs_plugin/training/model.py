@@ -107,6 +107,13 @@ class TrainableField:
         for param in self.params.values():
             param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
 
+    @property
+    def touched(self) -> Tensor:
+        """(n,) which Gaussians the views since the last step had anything to say about."""
+        gradient = self.params["opacities"].grad
+        assert gradient is not None, "no backward pass since the last step"
+        return gradient != 0
+
     def optimizer_moments(self) -> dict[str, dict[str, Tensor]]:
         """Adam's state of every parameter, by strategy name: step and both moments."""
         return {name: dict(opt.state[self.params[name]]) for name, opt in self.optimizers.items()}
@@ -129,6 +136,7 @@ class TrainableField:
         return {
             "params": {name: param.detach() for name, param in self.params.items()},
             "moments": self.optimizer_moments(),
+            "gradients": {name: param.grad for name, param in self.params.items() if param.grad is not None},
             "signed": self.signed,
         }
 
@@ -146,6 +154,8 @@ class TrainableField:
         field = field_from_splats(state["params"], state["signed"]).to(device)
         model = cls.create(field, rates, extent, sparse=sparse)
         model.adopt_moments(state["moments"], torch.arange(len(field)))
+        for name, gradient in state.get("gradients", {}).items():  # of views whose step has not come yet
+            model.params[name].grad = gradient.to(device)
         return model
 
 

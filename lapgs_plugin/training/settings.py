@@ -14,6 +14,11 @@ from lapgs_plugin.supervision import joint_from, parse_supervision
 
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""
+LATE_SHARE = 0.25
+"""Of a stage, its last, in which the gradients of some views make one step; with joint training, from where that begins
+if that is earlier. Positions hardly move any more, and what single views disagree about is noise."""
+LEAST_STEPS = 40
+"""In that share: fewer views make a step in stages that are too short."""
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
@@ -71,6 +76,7 @@ class TrainSettings:
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
     joint: float = 0.0  # share of a residual stage, its last, in which finished fields are trained along
+    gather: int = 8  # views whose gradients make one step late in a stage
     sh_degree: int = 3
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
@@ -95,6 +101,8 @@ class TrainSettings:
                 f"--inherit {self.inherit_ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)"
             )
         check_joint_share(self.joint)
+        if self.gather < 1:
+            raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -114,8 +122,8 @@ class TrainSettings:
         Raises:
             RunFolderError: they hold a key this version does not know or lack one.
         """
-        # Runs of the first weeks know neither what came with gsplat nor joint training.
-        later = {"packed": False, "sparse_adam": False, "joint": 0.0}
+        # Runs of the first weeks know neither what came with gsplat, nor joint training, nor gathered views.
+        later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1}
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
@@ -134,6 +142,7 @@ class StageSchedule:
 
     Inside a stage of n of N iterations densification stops at `until` scaled by n/N and the position learning rate
     decays to its last value at n; the other constants stay as the user set them. Iterations count from 1 in each stage.
+    From `gather_from` on the gradients of `gather` views make one step.
     """
 
     iterations: int
@@ -145,6 +154,8 @@ class StageSchedule:
     sh_degree: int
     means_first: float
     means_last: float
+    gather_from: int
+    gather: int
 
     @classmethod
     def create(cls, settings: TrainSettings, stage: Stage) -> StageSchedule:
@@ -154,6 +165,9 @@ class StageSchedule:
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
+        late = stage.iterations - round(stage.iterations * LATE_SHARE) + 1
+        late = min(late, settings.joint_from(stage) or late)
+        steps = (stage.iterations - late + 1) // LEAST_STEPS
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         return cls(
             iterations=stage.iterations,
@@ -165,7 +179,14 @@ class StageSchedule:
             sh_degree=settings.sh_degree,
             means_first=settings.learning_rates.means_first,
             means_last=settings.learning_rates.means_last,
+            gather_from=late,
+            gather=max(1, min(settings.gather, steps)),
         )
+
+    def steps(self, iteration: int) -> bool:
+        """Whether the optimizers step after this iteration."""
+        late = iteration - self.gather_from + 1
+        return late < 1 or late % self.gather == 0 or iteration == self.iterations
 
     def means_learning_rate(self, iteration: int) -> float:
         """Log-linear decay from the first iteration to the last, in units of the scene's extent."""

@@ -173,11 +173,12 @@ class StageRun:
         self.breakdown.mark("other")
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
-        visible = result.radii > 0 if self.model.sparse and result is not None else None
-        means_rate = self.schedule.means_learning_rate(iteration) * self.extent
-        self.model.step(means_rate, (degree + 1) ** 2, visible)
-        if self.joint is not None:
-            self.joint.step(means_rate)
+        if self.schedule.steps(iteration):
+            visible = self.model.touched if self.model.sparse else None
+            means_rate = self.schedule.means_learning_rate(iteration) * self.extent
+            self.model.step(means_rate, (degree + 1) ** 2, visible)
+            if self.joint is not None:
+                self.joint.step(means_rate)
         self.breakdown.mark("densification")
         self._densify(context, result, view)
         self.breakdown.mark("other")
@@ -188,7 +189,7 @@ class StageRun:
         self, gaussians: GaussianField, view: LevelView, iteration: int, degree: int
     ) -> tuple[Tensor, RenderResult | None]:
         """The image, and what else is known of the render where somebody looks at it."""
-        if self.model.sparse or self.densifier.looks_at(iteration):
+        if self.densifier.looks_at(iteration):
             result = self.rasterizer(gaussians, view.camera, background=self.background, sh_degree=degree)
             return result.image, result
         return render_image(self.rasterizer, gaussians, view.camera, self.background, degree), None

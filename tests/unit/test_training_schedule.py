@@ -48,6 +48,23 @@ def test_given_constants_are_kept_in_short_runs() -> None:
         assert schedule.active_sh_degree(14) == 2
 
 
+def test_late_in_a_stage_eight_views_make_a_step() -> None:
+    base, residual = schedules(TrainSettings(iterations=30_000))
+    for schedule in (base, residual):
+        assert (schedule.gather_from, schedule.gather) == (11_251, 8)
+        stepping = [i for i in range(1, 15_001) if schedule.steps(i)]
+        assert stepping[:11_250] == list(range(1, 11_251))
+        assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
+        assert stepping[-1] == 15_000
+    assert schedules(TrainSettings(iterations=3000))[1].gather == 8
+    assert schedules(TrainSettings(iterations=1000))[1].gather == 3  # 40 steps of the last 125 iterations
+    assert schedules(TrainSettings(iterations=200))[1].gather == 1
+    assert all(schedule.gather == 1 for schedule in schedules(TrainSettings(gather=1)))
+    base, residual = schedules(TrainSettings(joint=0.5))
+    assert (base.gather_from, residual.gather_from) == (11_251, 7_501)
+    assert schedules(TrainSettings(joint=0.1))[1].gather_from == 11_251
+
+
 @given(st.integers(1, 400), st.integers(0, 10), st.integers(0, 3), st.integers(0, 5))
 def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epoch: int) -> None:
     seen = Counter(view_index(epoch * count + i + 1, count, seed, level) for i in range(count))
