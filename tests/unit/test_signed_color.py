@@ -306,8 +306,8 @@ def test_some_tile_always_has_a_gaussian_and_the_image_is_the_oracles(
     with brittle(variant) as extension:
         subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
         problems = check_case(subject, case).problems
-    # Of a sphere in the middle of a pixel most gradients are zero, and only rounding is left of them; of any sphere that
-    # by its rotation is.
+    # Of a sphere in the middle of a pixel most gradients are zero, and only rounding is left of them; of any sphere the
+    # one by its rotation is.
     rounding = ("is off by", "gradient of quaternions")
     assert [line for line in problems if "gradient" not in line or not any(words in line for words in rounding)] == []
 
