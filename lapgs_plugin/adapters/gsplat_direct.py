@@ -73,7 +73,7 @@ def render(
     """A field of at least one Gaussian, float32 on the device.
 
     Args:
-        gaussians: contiguous parameters.
+        gaussians: on the camera's device.
         shot: the camera.
         background: (3,) on the device.
         degree: highest SH degree to evaluate.
@@ -83,15 +83,19 @@ def render(
     Returns:
         The image (3, h, w), what was seen, and a list that takes the tensors to leave gradients in.
     """
-    of = gaussians
-    given = of.means, of.quaternions, of.log_scales, of.opacity_logits, of.sh
+    of, background = gaussians, background.contiguous()
+    parameters = of.means, of.quaternions, of.log_scales, of.opacity_logits, of.sh
+    means, quaternions, log_scales, logits, sh = (value.contiguous() for value in parameters)  # kernels count on it
     listeners: Listeners = []
-    if torch.is_grad_enabled() and any(value.requires_grad for value in given):
-        box: list[Seen] = []
-        options = shot, background, degree, gaussians.signed, describes, absgrad, box, listeners
-        image: Tensor = _View.apply(*given, *options)  # type: ignore[no-untyped-call]  # torch's
-        return image, box[0], listeners
-    images, seen = _forward(*given, shot, background, degree, gaussians.signed, describes)
+    with torch.cuda.device(means.device):  # Triton launches on the current one
+        if torch.is_grad_enabled() and any(value.requires_grad for value in parameters):
+            box: list[Seen] = []
+            options = shot, background, degree, of.signed, describes, absgrad, box, listeners
+            image: Tensor = _View.apply(means, quaternions, log_scales, logits, sh, *options)  # type: ignore[no-untyped-call]  # torch's
+            return image, box[0], listeners
+        images, seen = _forward(
+            means, quaternions, log_scales, logits, sh, shot, background, degree, of.signed, describes
+        )
     return images[0].permute(2, 0, 1), seen, listeners
 
 

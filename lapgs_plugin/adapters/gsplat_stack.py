@@ -66,9 +66,9 @@ class GsplatStack:
         if self._starts[len(cameras)] == 0:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
-            images, alphas = self._blend_directly(
-                *self._see_directly(cameras, viewmats, intrinsics, positions[0]), len(cameras), (height, width)
-            )
+            with torch.cuda.device(self._means.device):  # Triton launches on the current one
+                seen = self._see_directly(cameras, viewmats, intrinsics, positions[0])
+                images, alphas = self._blend_directly(*seen, len(cameras), (height, width))
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
