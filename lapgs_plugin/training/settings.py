@@ -15,8 +15,8 @@ from lapgs_plugin.supervision import joint_from, parse_supervision
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""
 LATE_SHARE = 0.25
-"""Of a stage, its last, in which the gradients of some views make one step; with joint training, from where that begins
-if that is earlier. Positions hardly move any more, and what single views disagree about is noise."""
+"""Of a stage, its last, in which the gradients of some views make one step. Positions hardly move any more, and what
+single views disagree about is noise; earlier, steps are what is short."""
 LEAST_STEPS = 40
 """In that share: fewer views make a step in stages that are too short."""
 REFERENCE_ITERATIONS = 30_000
@@ -165,9 +165,7 @@ class StageSchedule:
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
-        late = stage.iterations - round(stage.iterations * LATE_SHARE) + 1
-        late = min(late, settings.joint_from(stage) or late)
-        steps = (stage.iterations - late + 1) // LEAST_STEPS
+        late = round(stage.iterations * LATE_SHARE)
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         return cls(
             iterations=stage.iterations,
@@ -179,8 +177,8 @@ class StageSchedule:
             sh_degree=settings.sh_degree,
             means_first=settings.learning_rates.means_first,
             means_last=settings.learning_rates.means_last,
-            gather_from=late,
-            gather=max(1, min(settings.gather, steps)),
+            gather_from=stage.iterations - late + 1,
+            gather=max(1, min(settings.gather, late // LEAST_STEPS)),
         )
 
     def steps(self, iteration: int) -> bool:

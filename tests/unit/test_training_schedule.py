@@ -60,9 +60,6 @@ def test_late_in_a_stage_eight_views_make_a_step() -> None:
     assert schedules(TrainSettings(iterations=1000))[1].gather == 3  # 40 steps of the last 125 iterations
     assert schedules(TrainSettings(iterations=200))[1].gather == 1
     assert all(schedule.gather == 1 for schedule in schedules(TrainSettings(gather=1)))
-    base, residual = schedules(TrainSettings(joint=0.5))
-    assert (base.gather_from, residual.gather_from) == (11_251, 7_501)
-    assert schedules(TrainSettings(joint=0.1))[1].gather_from == 11_251
 
 
 @given(st.integers(1, 400), st.integers(0, 10), st.integers(0, 3), st.integers(0, 5))
