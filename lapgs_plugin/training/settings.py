@@ -18,7 +18,8 @@ LATE_SHARE = 0.25
 """Of a stage, its last, in which the gradients of some views make one step. Positions hardly move any more, and what
 single views disagree about is noise; earlier, steps are what is short."""
 LEAST_STEPS = 40
-"""In that share: fewer views make a step in stages that are too short."""
+"""In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views lost
+0.08 dB, of one field 0.13."""
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
@@ -178,7 +179,7 @@ class StageSchedule:
             means_first=settings.learning_rates.means_first,
             means_last=settings.learning_rates.means_last,
             gather_from=stage.iterations - late + 1,
-            gather=max(1, min(settings.gather, late // LEAST_STEPS)),
+            gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
         )
 
     def steps(self, iteration: int) -> bool:

@@ -57,8 +57,9 @@ def test_late_in_a_stage_eight_views_make_a_step() -> None:
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
     assert schedules(TrainSettings(iterations=3000))[1].gather == 8
-    assert schedules(TrainSettings(iterations=1000))[1].gather == 3  # 40 steps of the last 125 iterations
-    assert schedules(TrainSettings(iterations=200))[1].gather == 1
+    assert schedules(TrainSettings(iterations=2560))[1].gather == 8  # 40 steps of the last 320 iterations
+    assert schedules(TrainSettings(iterations=2550))[1].gather == 1
+    assert schedules(TrainSettings(iterations=2550, gather=4))[1].gather == 4
     assert all(schedule.gather == 1 for schedule in schedules(TrainSettings(gather=1)))
 
 
