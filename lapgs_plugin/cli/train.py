@@ -88,8 +88,8 @@ def train(
         typer.Option(
             rich_help_panel=SCHEDULE,
             min=1,
-            help="Views whose gradients make one step in the last quarter of a stage that is long enough for 40 of them; "
-            "1 steps with every view as 3DGS does.",
+            help="Views whose gradients make one step in the last quarter of a stage, if it is long enough for 40 of "
+            "them; 1 steps with every view as 3DGS does.",
         ),
     ] = 8,
     densify_from: Annotated[
