@@ -204,6 +204,7 @@ def _blur(image: Tensor, dim: int) -> Tensor:
 
 
 @lru_cache(maxsize=256)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _mirrored(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Which samples stand for those just before and after the n of a side; sides of 1 and 2 mirror repeatedly."""
     before, after = _reflected(torch.tensor([[-2, -1], [n, n + 1]]), n).to(device)
@@ -233,6 +234,7 @@ def _take(image: Tensor, dim: int, index: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=256)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _neighbours(
     n: int, centres: tuple[float, float, int], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor | None]:

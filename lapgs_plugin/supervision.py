@@ -170,6 +170,7 @@ def _window_mean(images: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))

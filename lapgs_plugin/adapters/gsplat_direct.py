@@ -181,6 +181,7 @@ def _tell(listeners: Listeners, by_centre: Tensor, by_absolute: Tensor | None) -
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _zeros(shape: torch.Size, device: torch.device) -> Tensor:
     """Gradients of what no loss looks at; nobody writes to them."""
     return torch.zeros(shape, device=device)

@@ -120,16 +120,19 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _up(grid: str, size: int, device: torch.device) -> _Taps:
     return _sent(*Pyramid(grid).up_taps(size), (size + 1) // 2, MOST_TAPS, device)
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _up_transposed(grid: str, size: int, device: torch.device) -> _Taps:
     return _sent(*transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2), size, MOST_TRANSPOSED, device)
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # kept for others, who may need gradients
 def _as_they_are(size: int, device: torch.device) -> _Taps:
     return _Taps(torch.arange(size, dtype=torch.int32, device=device), torch.ones(size, 1, device=device))
 

@@ -261,3 +261,16 @@ def test_real_photos_leave_a_small_residual(shared_data: Path) -> None:
         residual = Pyramid(grid).laplacian(image, 2)[0]
         assert residual.var() < 0.03 * image.var()
         assert abs(residual.mean()) < 1e-3
+
+
+def test_what_is_kept_from_inference_mode_serves_training() -> None:
+    """Sizes no other test has: what is cached by size is made here first."""
+    fine, coarse = torch.randn(3, 137, 241), torch.randn(3, 69, 121)
+    with torch.inference_mode():
+        Pyramid().down(fine.clone())
+        Pyramid().up(coarse.clone(), (137, 241))
+    for leaf in (fine.requires_grad_(), coarse.requires_grad_()):
+        image = Pyramid().down(leaf) if leaf is fine else Pyramid().up(leaf, (137, 241))
+        image.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
+        assert leaf.grad is not None
+        assert bool(leaf.grad.isfinite().all())
