@@ -6,6 +6,7 @@ put together for every render and taken apart in every backward pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,9 +14,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.training.settings import ADAM_EPS
+
 BLOCK = 512
-BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
-LOG_BETA1, LOG_BETA2 = tl.constexpr(-0.10536051565782628), tl.constexpr(-0.0010005003335835335)
+BETA1, BETA2, EPS = tl.constexpr(0.9), tl.constexpr(0.999), tl.constexpr(ADAM_EPS)
+LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(0.9)), tl.constexpr(math.log(0.999))
 
 
 class Moving(NamedTuple):
@@ -51,12 +54,12 @@ def _move(
         places = start + part * block + tl.arange(0, block)
         here = places < n.to(tl.int64) * columns
         gradient = tl.load(gradients + places, here, 0.0)
-        mean = 0.9 * tl.load(means + places, here, 0.0) + 0.1 * gradient
-        square = 0.999 * tl.load(squares + places, here, 0.0) + 0.001 * gradient * gradient
+        mean = BETA1 * tl.load(means + places, here, 0.0) + (1 - BETA1) * gradient
+        square = BETA2 * tl.load(squares + places, here, 0.0) + (1 - BETA2) * gradient * gradient
         size = rate * unbias1
         if columns > 4:
             size = tl.where(places % columns < 3, rate, rest) * unbias1
-        moved = tl.load(values + places, here, 0.0) - size * mean / (tl.sqrt(square) * unbias2 + 1e-15)
+        moved = tl.load(values + places, here, 0.0) - size * mean / (tl.sqrt(square) * unbias2 + EPS)
         tl.store(means + places, mean, here)
         tl.store(squares + places, square, here)
         tl.store(values + places, moved, here)
