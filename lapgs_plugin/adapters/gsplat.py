@@ -122,6 +122,9 @@ class GsplatRasterizer:
             )
         n, width, height = len(field), camera.width, camera.height
         differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        if n and self._direct:
+            return self._call_directly(field, camera, background, degree, differentiated)
         means2d = means.new_zeros(n, 2).requires_grad_(differentiated)  # (n, 2)
         absgrad2d = means.new_zeros(n, 2) if differentiated and self._absgrad else None
         if n == 0:
@@ -131,9 +134,6 @@ class GsplatRasterizer:
             return RenderResult(
                 image, means.new_ones(height, width), torch.zeros(0, dtype=torch.int32, device=means.device), means2d
             )
-        degree = field.sh_degree if sh_degree is None else sh_degree
-        if self._direct:
-            return self._call_directly(field, camera, background, degree, differentiated)
         images, alphas, found = self._rasterize(field, [camera], background, degree, absgrad2d is not None)
         if differentiated:
             _hand_over_gradients(found, means2d, absgrad2d)
