@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import weakref
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -147,28 +148,67 @@ def _forward(
     """Images (1, h, w, 3), and what is known of the Gaussians."""
     from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown
 
-    compiled = compiled_functions()
-    width, height = shot.width, shot.height
+    size = shot.width, shot.height
     scales, opacities = activated(log_scales, logits)
-    radii, means2d, depths, conics, _ = compiled.projection_ewa_3dgs_fused_fwd(
-        means, None, quaternions, scales, opacities, shot.pose, shot.intrinsics, width, height,
-        PIXEL_VARIANCE, NEAR_DEPTH, FAR_PLANE, 0.0, False, compiled.CameraModelType.PINHOLE,
-    )  # fmt: skip
+    radii, means2d, depths, conics = project(means, quaternions, scales, opacities, shot.pose, shot.intrinsics, size)
     colors, shown_radii, centres = colors_of_shown(
         means, shot.centre, sh, degree, signed, radii, means2d if describes else None
     )
-    across, down = math.ceil(width / TILE), math.ceil(height / TILE)
-    _, pairs, flat = compiled.intersect_tile(
-        means2d, radii, depths, None, None, 1, TILE, across, down, True, False
-    )  # waits for the GPU, to learn how many pairs there are
-    offsets = compiled.intersect_offset(pairs, 1, across, down)
-    images, alphas, last = compiled.rasterize_to_pixels_3dgs_fwd(
-        means2d, conics, colors[None], opacities[None], background[None], None, width, height, TILE, offsets, flat
-    )
+    projected = radii, means2d, depths, conics
+    images, alphas, last, offsets, flat = blend(projected, colors[None], opacities[None], background[None], size)
     seen = Seen(
         radii, means2d, depths, conics, colors, scales, opacities, offsets, flat, alphas, last, shown_radii, centres
     )
     return images, seen
+
+
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, pose: Tensor, intrinsics: Tensor,
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Radii (1, n, 2), centres (1, n, 2), depths (1, n) and conics (1, n, 3) of activated Gaussians, at least one.
+
+    Args:
+        pose, intrinsics: (1, 4, 4) and (1, 3, 3).
+        size: (width, height) of the image.
+    """
+    compiled = compiled_functions()
+    radii, means2d, depths, conics, _ = compiled.projection_ewa_3dgs_fused_fwd(
+        means, None, quaternions, scales, opacities, pose, intrinsics, *size,
+        PIXEL_VARIANCE, NEAR_DEPTH, FAR_PLANE, 0.0, False, compiled.CameraModelType.PINHOLE,
+    )  # fmt: skip
+    return radii, means2d, depths, conics
+
+
+def blend(
+    projected: Sequence[Tensor], colors: Tensor, opacities: Tensor, background: Tensor | None, size: tuple[int, int],
+    count: int = 1, of_image: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Sort Gaussians into tiles and blend them. Waits for the GPU, to learn how many pairs with tiles there are.
+
+    Args:
+        projected: what `project` gives; or of several images in one list, without the leading dimension.
+        colors, opacities: (1, n, 3) and (1, n), or (n, 3) and (n,) in such a list.
+        background: (1, 3), None for black.
+        size: (width, height) of all images.
+        count, of_image: how many images there are, and in a list the number (n,) of each Gaussian's.
+
+    Returns:
+        Images (count, h, w, 3), opacities (count, h, w, 1), the last Gaussian of each pixel, the first pair of each
+        tile, and the Gaussians of pairs.
+    """
+    compiled = compiled_functions()
+    radii, means2d, depths, conics = projected
+    across, down = (math.ceil(side / TILE) for side in size)
+    # gsplat asks for the number of each Gaussian, too, and makes no use of it.
+    _, pairs, flat = compiled.intersect_tile(
+        means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
+    )
+    offsets = compiled.intersect_offset(pairs, count, across, down)
+    images, alphas, last = compiled.rasterize_to_pixels_3dgs_fwd(
+        means2d, conics, colors, opacities, background, None, *size, TILE, offsets, flat
+    )
+    return images, alphas, last, offsets, flat
 
 
 def _tell(listeners: Listeners, by_centre: Tensor, by_absolute: Tensor | None) -> None:

@@ -22,12 +22,10 @@ from torch import Tensor
 
 from lapgs_plugin.adapters import gsplat_direct
 from lapgs_plugin.adapters.gsplat import cameras_on_device
+from lapgs_plugin.adapters.gsplat_direct import TILE
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
-
-TILE = 16
-"""Side in pixels; gsplat is tested with no other."""
 
 
 class GsplatStack:
@@ -67,8 +65,11 @@ class GsplatStack:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
             with torch.cuda.device(self._means.device):  # Triton launches on the current one
-                seen = self._see_directly(cameras, viewmats, intrinsics, positions[0])
-                images, alphas = self._blend_directly(*seen, len(cameras), (height, width))
+                projected, colors = self._see_directly(cameras, viewmats, intrinsics, positions[0])
+                count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
+                images, alphas, *_ = gsplat_direct.blend(
+                    projected, colors, self._opacities[:count], None, size, len(cameras), of_image
+                )
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
@@ -86,43 +87,21 @@ class GsplatStack:
     def _see_directly(
         self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """What `_project` and `_colors` give, in two launches a field."""
+        """What `_project` and `_colors` give, but for opacities, in two launches a field."""
         from lapgs_plugin.adapters.gsplat_triton import place_seen
 
         count, like = self._starts[len(cameras)], self._means
         radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
         means2d, depths, conics, colors = (like.new_empty(count, *columns) for columns in ((2,), (), (3,), (3,)))
-        compiled = gsplat_direct.compiled_functions()
         for i, camera in enumerate(cameras):
             means, quaternions, scales, opacities, sh = self._parts[i]
             if len(means) == 0:
                 continue  # gsplat divides by their number
-            *found, _ = compiled.projection_ewa_3dgs_fused_fwd(
-                means, None, quaternions, scales, opacities, viewmats[i : i + 1], intrinsics[i : i + 1],
-                camera.width, camera.height, PIXEL_VARIANCE, NEAR_DEPTH, gsplat_direct.FAR_PLANE, 0.0, False,
-                compiled.CameraModelType.PINHOLE,
-            )  # fmt: skip
+            pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], (camera.width, camera.height)
+            found = gsplat_direct.project(means, quaternions, scales, opacities, pose, matrix, size)
             placed = radii, means2d, depths, conics, colors
             place_seen(means, position, sh, self._signed[i], found, placed, self._starts[i])
-        return [radii, means2d, depths, conics, self._opacities[:count]], colors
-
-    def _blend_directly(
-        self, projected: Sequence[Tensor], colors: Tensor, count: int, size: tuple[int, int]
-    ) -> tuple[Tensor, Tensor]:
-        """What `_blend` gives."""
-        compiled = gsplat_direct.compiled_functions()
-        radii, means2d, depths, conics, opacities = projected
-        height, width = size
-        columns, rows = -(-width // TILE), -(-height // TILE)
-        of_image = self._images[: len(depths)]
-        _, keys, order = compiled.intersect_tile(
-            means2d, radii, depths, of_image, of_image, count, TILE, columns, rows, True, False
-        )
-        offsets = compiled.intersect_offset(keys, count, columns, rows)
-        images, alphas, _ = compiled.rasterize_to_pixels_3dgs_fwd(
-            means2d, conics, colors, opacities, None, None, width, height, TILE, offsets, order
-        )
-        return images, alphas
+        return [radii, means2d, depths, conics], colors
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
         """Radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields' n."""
