@@ -58,7 +58,7 @@ class JointFields:
             means_rate: step size of the positions, in world units.
         """
         for model in self.models.values():
-            model.step(means_rate, visible=model.touched if model.sparse else None)
+            model.step(means_rate)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

@@ -29,7 +29,7 @@ class TrainableField:
             for a tensor, they are two, "sh0" and "shN".
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
-        sparse: whether a step moves visible Gaussians alone.
+        sparse: whether a step moves those Gaussians alone that have a gradient.
     """
 
     params: dict[str, torch.nn.Parameter]
@@ -84,13 +84,12 @@ class TrainableField:
         """The current parameters, sharing their memory and gradients."""
         return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int | None = None, visible: Tensor | None = None) -> None:
+    def step(self, means_rate: float, active_coefficients: int | None = None) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
             means_rate: step size of the positions, already scaled by the extent.
             active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
-            visible: (n,) bool, the Gaussians that were rendered; looked at by sparse steps alone.
         """
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
         if isinstance(self.optimizers.get("sh"), FieldAdam):
@@ -103,12 +102,12 @@ class TrainableField:
             fused_steps(optimizers)
         else:
             for optimizer in optimizers:
-                optimizer.step(*([visible] if self.sparse else []))
+                optimizer.step(*([self._touched] if self.sparse else []))
         for param in self.params.values():
             param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
 
     @property
-    def touched(self) -> Tensor:
+    def _touched(self) -> Tensor:
         """(n,) which Gaussians the views since the last step had anything to say about."""
         gradient = self.params["opacities"].grad
         assert gradient is not None, "no backward pass since the last step"

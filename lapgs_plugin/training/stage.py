@@ -174,9 +174,8 @@ class StageRun:
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
         if self.schedule.steps(iteration):
-            visible = self.model.touched if self.model.sparse else None
             means_rate = self.schedule.means_learning_rate(iteration) * self.extent
-            self.model.step(means_rate, (degree + 1) ** 2, visible)
+            self.model.step(means_rate, (degree + 1) ** 2)
             if self.joint is not None:
                 self.joint.step(means_rate)
         self.breakdown.mark("densification")

@@ -85,7 +85,7 @@ def warm_up(
     result = rasterizer(model.field, camera, background=black)
     image = result.image + render_image(rasterizer, model.field, camera, black)
     photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
-    model.step(means_rate=0.0, active_coefficients=1, visible=result.radii > 0)
+    model.step(means_rate=0.0, active_coefficients=1)
     if torch.device(device).type == "cuda":
         statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
