@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from fractions import Fraction
 
 from lapgs_plugin.errors import UserInputError
@@ -31,6 +32,28 @@ FastGS on bonsai: 31.06 dB without, 31.48 with it, 31.55 bare. The built-in trai
 """
 
 
+class Hierarchy(str, Enum):
+    """What the field of a level is for, if not of the coarsest."""
+
+    LAPLACIAN = "laplacian"
+    """A signed residual, added to what the coarser fields make: the paper's, and the default."""
+    NESTED = "nested"
+    """The whole image: the coarser level's field, trained on at the finer size."""
+
+
+def parse_hierarchy(name: str) -> Hierarchy:
+    """The hierarchy called `name`.
+
+    Raises:
+        UserInputError: there is none of that name.
+    """
+    try:
+        return Hierarchy(name)
+    except ValueError as error:
+        known = " or ".join(hierarchy.value for hierarchy in Hierarchy)
+        raise UserInputError(f"--hierarchy {name}: expected {known}") from error
+
+
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
     """Size (width, height) of a pyramid level: halved `level` times, odd sizes rounded up.
 
@@ -51,7 +74,7 @@ class Stage:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
         image_size: (width, height) in pixels of this level for an image of the plan's size.
         iterations: optimizer steps of this stage, at least 1.
-        signed: True for a residual (raw SH value, zero background), False for the base.
+        signed: True for a residual (raw SH value, zero background), False for the base and where levels are nested.
     """
 
     level: int
@@ -64,11 +87,17 @@ class Stage:
 class StagePlan:
     """The stages in training order, coarsest first; contiguous and validated.
 
+    Attributes:
+        stages: one a level.
+        hierarchy: what the fields after the first are for.
+
     Raises:
-        UserInputError: the stages do not run from the coarsest level down to 0, or one is too small to train.
+        UserInputError: the stages do not run from the coarsest level down to 0, one is too small to train, or one is
+            signed that should not be or the reverse.
     """
 
     stages: tuple[Stage, ...]
+    hierarchy: Hierarchy = Hierarchy.LAPLACIAN
 
     def __post_init__(self) -> None:
         levels = [stage.level for stage in self.stages]
@@ -80,8 +109,11 @@ class StagePlan:
                     f"level {stage.level} would train for {stage.iterations} iterations, expected at least 1; "
                     "raise --iterations or change --split"
                 )
-            if stage.signed != (stage.level != len(levels) - 1):
-                raise UserInputError("exactly the coarsest level is unsigned (the base); all others are residuals")
+            if stage.signed != (self.hierarchy is Hierarchy.LAPLACIAN and stage.level != len(levels) - 1):
+                raise UserInputError(
+                    "exactly the coarsest level is unsigned (the base), all others are residuals; of nested levels all "
+                    "are unsigned"
+                )
             if stage.level > 0 and min(stage.image_size) < MIN_LEVEL_SIDE:
                 width, height = stage.image_size
                 raise UserInputError(
@@ -106,7 +138,12 @@ class StagePlan:
 
     @classmethod
     def create(
-        cls, image_size: tuple[int, int], iterations: int, levels: int = 2, split: Sequence[Fraction] | None = None
+        cls,
+        image_size: tuple[int, int],
+        iterations: int,
+        levels: int = 2,
+        split: Sequence[Fraction] | None = None,
+        hierarchy: Hierarchy = Hierarchy.LAPLACIAN,
     ) -> StagePlan:
         """A plan for `levels` levels whose stages share `iterations` as `split` says.
 
@@ -116,6 +153,7 @@ class StagePlan:
             levels: number of levels L, at least 1.
             split: share of each stage, coarsest first, summing to 1; None takes `DEFAULT_SPLITS`, and for more than
                 four levels thirds at both ends with the middle shared evenly.
+            hierarchy: what the fields after the first are for.
         """
         if levels < 1:
             raise UserInputError(f"--levels {levels}: expected at least 1")
@@ -134,11 +172,13 @@ class StagePlan:
             )
         ends = [round(iterations * sum(split[: i + 1], Fraction(0))) for i in range(levels)]
         counts = [end - start for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        adds = hierarchy is Hierarchy.LAPLACIAN
         return cls(
             tuple(
-                Stage(level, level_size(image_size, level), count, signed=level != levels - 1)
+                Stage(level, level_size(image_size, level), count, signed=adds and level != levels - 1)
                 for level, count in zip(range(levels - 1, -1, -1), counts, strict=True)
-            )
+            ),
+            hierarchy,
         )
 
 

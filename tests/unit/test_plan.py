@@ -11,7 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import DEFAULT_SPLITS, MIN_LEVEL_SIDE, Stage, StagePlan, level_size, parse_split
+from lapgs_plugin.plan import (
+    DEFAULT_SPLITS,
+    MIN_LEVEL_SIDE,
+    Hierarchy,
+    Stage,
+    StagePlan,
+    level_size,
+    parse_hierarchy,
+    parse_split,
+)
 
 
 @given(st.integers(16, 5000), st.integers(16, 5000), st.integers(0, 8))
@@ -29,6 +38,29 @@ def test_default_splits(levels: int, counts: list[int]) -> None:
     assert [stage.iterations for stage in plan] == counts
     assert [stage.level for stage in plan] == list(range(levels - 1, -1, -1))
     assert [stage.signed for stage in plan] == [False] + [True] * (levels - 1)
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_nested_levels_are_all_unsigned(levels: int) -> None:
+    plan = StagePlan.create((1600, 1066), 30_000, levels, hierarchy=Hierarchy.NESTED)
+    other = StagePlan.create((1600, 1066), 30_000, levels)
+    assert not any(stage.signed for stage in plan)
+    assert [(s.level, s.image_size, s.iterations) for s in plan] == [
+        (s.level, s.image_size, s.iterations) for s in other
+    ]
+
+
+@pytest.mark.parametrize("hierarchy", Hierarchy)
+def test_a_signed_level_where_none_belongs_is_refused(hierarchy: Hierarchy) -> None:
+    stages = tuple(Stage(level, (100, 100), 10, hierarchy is Hierarchy.NESTED) for level in (1, 0))
+    with pytest.raises(UserInputError, match="nested levels"):
+        StagePlan(stages, hierarchy)
+
+
+def test_parse_hierarchy() -> None:
+    assert [parse_hierarchy(name) for name in ("laplacian", "nested")] == [Hierarchy.LAPLACIAN, Hierarchy.NESTED]
+    with pytest.raises(UserInputError, match="--hierarchy gaussian: expected laplacian or nested"):
+        parse_hierarchy("gaussian")
 
 
 def test_stages_are_found_by_level() -> None:
