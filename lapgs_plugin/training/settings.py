@@ -173,7 +173,8 @@ class StageSchedule:
     Inside a stage of n of N iterations densification stops at `until` scaled by n/N and the position learning rate
     decays to its last value at n; the other constants stay as the user set them. Iterations count from 1 in each stage.
     From `gather_from` on the gradients of `gather` views make one step. A field that was trained before, in `before`
-    iterations of coarser nested levels, keeps its SH degree.
+    iterations of coarser nested levels, keeps its SH degree, and its opacities are not reset unless the user says when:
+    what resets are for, floaters near the cameras, was done at the coarser size, and recovering takes iterations.
     """
 
     iterations: int
@@ -198,13 +199,14 @@ class StageSchedule:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
         late = round(stage.iterations * LATE_SHARE)
+        resets = constant(given.reset_every, 3000, 300)
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         return cls(
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),
             densify_until=round(until * stage.iterations / settings.iterations),
             densify_every=given.every,
-            reset_every=constant(given.reset_every, 3000, 300),
+            reset_every=stage.iterations + 1 if before and given.reset_every is None else resets,
             sh_every=constant(settings.sh_every, 1000, 1),
             sh_degree=settings.sh_degree,
             means_first=settings.learning_rates.means_first,

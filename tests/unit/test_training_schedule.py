@@ -97,6 +97,15 @@ def test_a_nested_field_keeps_its_sh_degree() -> None:
     assert [schedule.active_sh_degree(i) for i in (1, 499, 500, 1499, 1500)] == [1, 1, 2, 2, 3]
 
 
+@pytest.mark.parametrize(("given", "resets"), [(None, []), (4000, [4000, 8000, 12_000])])
+def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | None, resets: list[int]) -> None:
+    settings = TrainSettings(hierarchy="nested", densification=Densification(reset_every=given))
+    base, finer = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)
+    schedule = StageSchedule.create(settings, finer, before=base.iterations)
+    assert [i for i in range(1, finer.iterations + 1) if i % schedule.reset_every == 0] == resets
+    assert StageSchedule.create(settings, base).reset_every == (given or 3000)
+
+
 @pytest.mark.parametrize(
     ("hierarchy", "given", "factors"),
     [
