@@ -28,6 +28,10 @@ NESTED_COARSE_THRESHOLD = 2.0
 """What nested levels multiply thresholds for densification by, for each time that images are halved: a coarse image has
 less to say than it has gradients, and every Gaussian it adds is carried to the end."""
 
+NESTED_DENSIFY_SHARE = 2 / 3
+"""Of the iterations in which a stage would densify, those in which a field that goes on does: it has its surfaces, and
+what it adds late costs more time than it is worth."""
+
 JOINT_SHARE = 0.25
 """Share of a residual stage of `lapgs run`, its last, in which the finished fields are trained along.
 

@@ -106,6 +106,13 @@ def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | N
     assert StageSchedule.create(settings, base).reset_every == (given or 3000)
 
 
+def test_a_nested_field_densifies_for_a_third_of_its_stage() -> None:
+    base, finer = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)
+    settings = TrainSettings(hierarchy="nested")
+    assert StageSchedule.create(settings, base).densify_until == 7500
+    assert StageSchedule.create(settings, finer, before=base.iterations).densify_until == 5000
+
+
 @pytest.mark.parametrize(
     ("hierarchy", "given", "factors"),
     [
