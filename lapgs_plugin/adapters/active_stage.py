@@ -225,7 +225,7 @@ class ActiveStage:
         self._hooks.stage_ends(stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
-        finished = self._finish(gaussians, field, self._adapter.carried_over(gaussians), self._moments(gaussians))
+        finished = self._finish(gaussians, field, self._carried(gaussians), self._moments(gaussians))
         if self._joint is not None:
             self._joint.archive_fields()  # before their residual: that one builds on what they are now
         self._archive_level(finished, seconds, memory)
@@ -239,7 +239,10 @@ class ActiveStage:
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.field_path(self.stage.level).with_name(OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
-        carried = {name: torch.nn.Parameter(value.detach().to(self._device)) for name, value in left["carried"].items()}
+        carried = {
+            name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
+            for name, value in left["carried"].items()
+        }
         return self._finish(gaussians, field, carried, left["moments"])
 
     def close(self) -> None:
@@ -315,7 +318,7 @@ class ActiveStage:
         if self._images.test and (self.stage.level == 0 or self._context.test_every is not None):
             with self.overhead.timed("evaluation"):
                 self._report_held_out(gaussians, self.stage.iterations)
-        if self.stage.level > 0:
+        if self.stage.level > 0 and not self._options.nested:
             with self.overhead.timed("cache"):
                 predictions = self._predict(gaussians)
         return Finished(field, predictions, carried, moments)
@@ -363,7 +366,7 @@ class ActiveStage:
             rendering.composed, rendering.capture, rendering.captured = composed, False, None
 
     def _initialise(self, gaussians: Any) -> None:
-        """Points for the base; for a residual the field of the level before."""
+        """Points for the base; for a finer level what is inherited of the field before."""
         points, others = self._loaded.points, self._loaded.others
         if self._before is None:
             gaussians.create_from_pcd(points, *others)
@@ -390,6 +393,11 @@ class ActiveStage:
                 optimizer.state[group["params"][0]] = {
                     name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
                 }
+
+    def _carried(self, gaussians: Any) -> dict[str, Any]:
+        """Attributes for the next model besides its Gaussians. A residual's SH start again at degree 0."""
+        degree = {"active_sh_degree": gaussians.active_sh_degree} if self._options.nested else {}
+        return {**self._adapter.carried_over(gaussians), **degree}
 
     def _moments(self, gaussians: Any) -> dict[str, dict[str, Tensor]]:
         """Optimizer state by parameter group on the CPU, if the next stage inherits it."""

@@ -19,7 +19,15 @@ from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS
-from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, parse_split
+from lapgs_plugin.plan import (
+    JOINT_SHARE,
+    RESIDUAL_COLOR_RATE,
+    Hierarchy,
+    Stage,
+    check_joint_share,
+    parse_hierarchy,
+    parse_split,
+)
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import joint_from, parse_supervision
@@ -28,12 +36,22 @@ from lapgs_plugin.watching import Watcher
 PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
 """10k and 20k of 30k iterations for two levels, as in the paper's main tables; more levels take `StagePlan`'s."""
 
+OF_NESTED: dict[str, Any] = {
+    "supervision": "reconstructed",
+    "inherit": "full",
+    "inherit_ratio": 1.0,
+    "joint": 0.0,
+    "residual_color_rate": RESIDUAL_COLOR_RATE,
+}
+"""The only values of those options that are about residuals, where levels are nested."""
+
 
 @dataclass(frozen=True)
 class HierarchyOptions:
     """What a user can choose about the hierarchy; everything else is the backbone's.
 
     Attributes:
+        hierarchy: "laplacian", or "nested", which leaves a choice in none of `OF_NESTED`.
         levels: number of levels; 1 is the plain backbone, archived as a run.
         split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
         grid: of the pyramid.
@@ -51,6 +69,7 @@ class HierarchyOptions:
         UserInputError: one of them is none of what it can be.
     """
 
+    hierarchy: str = Hierarchy.LAPLACIAN.value
     levels: int = 2
     split: str | None = None
     grid: str = "camera"
@@ -58,7 +77,7 @@ class HierarchyOptions:
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
     joint: float = JOINT_SHARE
-    residual_color_rate: float = 4.0
+    residual_color_rate: float = RESIDUAL_COLOR_RATE
     coarse_threshold: float = 1.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
@@ -66,6 +85,7 @@ class HierarchyOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        parse_hierarchy(self.hierarchy)
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         self.shares()
@@ -79,6 +99,25 @@ class HierarchyOptions:
             raise UserInputError(
                 f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
             )
+        if self.nested:
+            self._check_residuals()
+
+    def _check_residuals(self) -> None:
+        """Refuse what is about residuals, of which nested levels have none."""
+        for name, only in OF_NESTED.items():
+            if (value := getattr(self, name)) != only:
+                option = name.replace("_", "-")
+                if name.startswith("inherit"):
+                    option, value = "inherit", f"{self.inherit}:{self.inherit_ratio:g}"
+                raise UserInputError(
+                    f"--{option} {value}: is for residuals, and nested levels have none; leave it out, or train with "
+                    f"--hierarchy {Hierarchy.LAPLACIAN.value}"
+                )
+
+    @property
+    def nested(self) -> bool:
+        """Whether each level trains the field of the coarser one on."""
+        return parse_hierarchy(self.hierarchy) is Hierarchy.NESTED
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""
@@ -141,7 +180,7 @@ class Finished:
 
     Attributes:
         field: its Gaussians, on the CPU.
-        predictions: Up(I_hat^l) of every view by key; None after the finest level.
+        predictions: Up(I_hat^l) of every view by key; None after the finest level, and where levels are nested.
         carried: attributes for the next model.
         moments: optimizer state by parameter group, for full inheritance.
     """
