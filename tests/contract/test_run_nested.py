@@ -74,7 +74,7 @@ class Seen(StageHook):
 
 def watch(adapter: Any, seen: Seen) -> None:
     model = adapter.train.GaussianModel
-    renderer = sys.modules["gaussian_renderer"]
+    renderer: Any = sys.modules["gaussian_renderer"]
     update, rasterizer = model.update_learning_rate, renderer.GaussianRasterizer
 
     def update_learning_rate(self: Any, iteration: int) -> Any:
