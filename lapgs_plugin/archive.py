@@ -423,9 +423,9 @@ class RunArchive:
         path = self.field_path(level).with_name(OPTIMIZER)
         if not path.exists():
             raise RunFolderError(
-                f"{path} does not exist, and --inherit full needs it; start again with --overwrite or inherit xyz"
+                f"{path} does not exist, and the next level goes on with it; start again with --overwrite"
             )
-        return _read_tensors(path, "start again with --overwrite or inherit xyz")
+        return _read_tensors(path, "start again with --overwrite")
 
     def append_history(self, entry: dict[str, Any]) -> None:
         """Add one entry to the history: JSON with finite numbers, having "level" and "iteration"."""

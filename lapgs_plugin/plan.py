@@ -24,6 +24,10 @@ Three and four levels are split as in the paper. Its main tables give two levels
 in 3.5 % more time (its ablation on the split). On the one scene of docs/training.md: +0.55 dB at 1/4, -0.29 at 1/8.
 """
 
+NESTED_COARSE_THRESHOLD = 2.0
+"""What nested levels multiply thresholds for densification by, for each time that images are halved: a coarse image has
+less to say than it has gradients, and every Gaussian it adds is carried to the end."""
+
 JOINT_SHARE = 0.25
 """Share of a residual stage of `lapgs run`, its last, in which the finished fields are trained along.
 

@@ -24,11 +24,12 @@ def export(
     level: Annotated[int | None, typer.Option(help="This level alone. Default: every finished one.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/export.")] = None,
 ) -> None:
-    """Write each level of RUN as a file for other viewers: level_<l>_base or level_<l>_residual.
+    """Write each level of RUN as a file for other viewers: level_<l>_base, level_<l>_residual or level_<l>_field.
 
     The base is an ordinary field and opens in any 3DGS viewer. A residual is none: it holds what its level adds to the
     upsampled image of the levels above it, in signed colours over zero. Its file says so, in a comment of the PLY's or
-    gzip's header; what another viewer shows of it is not the composition.
+    gzip's header; what another viewer shows of it is not the composition. Where levels are nested every one is an
+    ordinary field.
 
     Examples:
 
@@ -48,7 +49,8 @@ def export(
         folder.mkdir(parents=True, exist_ok=True)
     for each in levels:
         field, note = archive.field(each), _note(archive, each)
-        path = folder / f"level_{each}_{'residual' if field.signed else 'base'}.{file_format}"
+        kind = "base" if each == archive.manifest.levels - 1 else "residual" if field.signed else "field"
+        path = folder / f"level_{each}_{kind}.{file_format}"
         with one_line_errors(path):
             if file_format == "spz":
                 save_spz(field, path, note)
@@ -73,6 +75,8 @@ def _note(archive: RunArchive, level: int) -> str:
     name, levels = archive.path().name, archive.manifest.levels
     if level == levels - 1:
         return f"base of {name}, a hierarchy of {levels} levels" if levels > 1 else f"field of {name}"
+    if not archive.manifest.record(level).signed:
+        return f"field of level {level} of {name}, a hierarchy of {levels} nested levels"
     return (
         f"residual of level {level} of {name}: signed colours over zero, to be added to the upsampled image of level "
         f"{level + 1}; not a scene by itself"

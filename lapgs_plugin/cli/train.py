@@ -52,6 +52,15 @@ def train(
             help="Share of the iterations of each stage, coarsest first. Two levels: 1/2,1/2 (paper: 1/3,2/3).",
         ),
     ] = None,
+    hierarchy: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="laplacian (a base and residuals that are added up, as in the paper) or nested (each level trains the "
+            "coarser one's field on at its own size; the last one renders alone: as fast as a single field, nearly its "
+            "quality, less of the time saved).",
+        ),
+    ] = "laplacian",
     supervision: Annotated[
         str,
         typer.Option(
@@ -99,6 +108,14 @@ def train(
         int | None,
         typer.Option(
             rich_help_panel=SCHEDULE, help="Last one, of the whole run; stages scale it. Default: 15000 of 30000."
+        ),
+    ] = None,
+    coarse_threshold: Annotated[
+        float | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Factor on the gradient threshold of densification for each time that images are halved: above 1 "
+            "gives coarse levels fewer Gaussians. Default: 1, or 2 where levels are nested.",
         ),
     ] = None,
     densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
@@ -207,6 +224,7 @@ def train(
     settings = TrainSettings(
         iterations=iterations,
         levels=levels,
+        hierarchy=hierarchy,
         split=None if split is None else tuple(part.strip() for part in split.split(",")),
         grid=grid,
         supervision=supervision,
@@ -226,6 +244,7 @@ def train(
             strategy=strategy,
             absgrad=absgrad,
             cap_max=cap_max,
+            coarse_threshold=coarse_threshold,
             **({"grow_grad2d": ABSGRAD_THRESHOLD} if absgrad else {}),
         ),
         packed=packed,
@@ -288,6 +307,7 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         "densify_from": densification.start,
         "densify_until": densification.until,
         "densify_every": densification.every,
+        "coarse_threshold": densification.coarse_threshold,
         "opacity_reset_every": densification.reset_every,
         "strategy": densification.strategy,
         "cap_max": densification.cap_max,
@@ -296,7 +316,8 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         **{
             name: getattr(settings, name)
             for name in (
-                *("iterations", "levels", "split", "supervision", "grid", "joint", "gather", "sh_degree", "seed"),
+                *("iterations", "levels", "hierarchy", "split", "supervision", "grid", "joint", "gather", "sh_degree"),
+                "seed",
                 *("packed", "sparse_adam"),
             )
         },

@@ -16,7 +16,7 @@ from torch import Tensor
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.trajectory import with_size
 from lapgs_plugin.rendering.video import FrameSink, video_writer
@@ -99,25 +99,25 @@ def render_clip(
         task = progress.add_task(f"Rendering {out.name}", total=len(cameras))
         for camera in cameras:
             sized = with_size(camera, size)
-            composition = renderer.render(sized, level)
-            write(_panels(renderer, composition, sized, raw) if panels else _whole(renderer, composition, sized))
+            write(_panels(renderer, sized, level, raw) if panels else _whole(renderer, sized, level))
             progress.advance(task)
 
 
-def _whole(renderer: HierarchyRenderer, composition: Composition, camera: Camera) -> Tensor:
-    """The composition at the size of the view, (3, h, w)."""
-    finest = min(composition.composed)
-    return to_full_size(composition.composed[finest], camera, finest, renderer.pyramid)
+def _whole(renderer: HierarchyRenderer, camera: Camera, level: int) -> Tensor:
+    """The composition down to `level` at the size of the view, (3, h, w)."""
+    return to_full_size(renderer.images([camera], level)[0], camera, level, renderer.pyramid)
 
 
-def _panels(renderer: HierarchyRenderer, composition: Composition, camera: Camera, raw: bool) -> Tensor:
+def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) -> Tensor:
     """Base, residuals and composition side by side at the size of the view, (3, h, panels * w)."""
+    composition = renderer.render(camera, level)
+    whole = to_full_size(composition.composed[level], camera, level, renderer.pyramid)
     base = to_full_size(composition.base, camera, renderer.levels - 1, renderer.pyramid)
     residuals = [
-        to_full_size(residual, camera, level, renderer.pyramid) for level, residual in composition.residuals.items()
+        to_full_size(residual, camera, each, renderer.pyramid) for each, residual in composition.residuals.items()
     ]
     shown = residuals if raw else [around_grey(residual) for residual in residuals]
-    return torch.cat([base, *shown, _whole(renderer, composition, camera)], dim=2)
+    return torch.cat([base, *shown, whole], dim=2)
 
 
 @contextmanager

@@ -38,8 +38,9 @@ class Composition:
 
     Attributes:
         base: (3, h, w) the coarsest level's render, background blended in; of a batch (b, 3, h, w), as all images.
-        residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size. Base and residuals
-            include their gains, where any were asked for.
+        residuals: by level, finest last: (3, h, w) signed render R_hat^l at that level's size, or of nested levels what
+            one adds to the coarser ones, I_hat^l - Up(I_hat^(l+1)). Base and residuals include their gains, where any
+            were asked for.
         composed: by level, finest last: (3, h, w) I_hat^l at that level's size; at the coarsest level it is `base`.
     """
 
@@ -78,6 +79,9 @@ def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) ->
 class HierarchyRenderer:
     """Renders the finished levels of a hierarchy and adds them up.
 
+    A signed field is added to what the coarser ones make. Where levels are nested (`plan.Hierarchy`) no field is
+    signed: each makes its level's whole image, and an image takes the rendering of one field alone.
+
     On a GPU all fields of a view are rendered in one set of launches, where the rasterizer can and as long as launching
     is what takes the time. Otherwise every field is rendered in a stream of its own: a coarse level, which leaves most
     of a GPU idle, costs little beside a fine one. Up and the sum of a level are one kernel, in the stream that is
@@ -101,8 +105,8 @@ class HierarchyRenderer:
         residence: brings fields to the device when they are needed; None where they are there, and may still change.
 
     Raises:
-        UserInputError: a level between the coarsest and the finest given is missing, or a field is signed where the
-            base should be or the reverse.
+        UserInputError: a level between the coarsest and the finest given is missing, the base is signed, or some of
+            the finer fields are and others not.
     """
 
     fields: Mapping[int, GaussianField]
@@ -122,13 +126,14 @@ class HierarchyRenderer:
             raise UserInputError(
                 f"fields of levels {given}, expected {self.levels - 1}, ..., 0 or the first of these without gaps"
             )
-        for level, field in self.fields.items():
-            if field.signed != (level != self.levels - 1):
-                kind = "signed (a residual)" if field.signed else "unsigned (a base)"
-                raise UserInputError(
-                    f"the field of level {level} is {kind}; expected the coarsest level, {self.levels - 1}, unsigned "
-                    "and all others signed"
-                )
+        signed = [self.fields[level].signed for level in expected]
+        if signed[0] or len(set(signed[1:])) > 1:
+            kinds = zip(given, ("signed" if one else "unsigned" for one in signed), strict=True)
+            found = ", ".join(f"{level} {kind}" for level, kind in kinds)
+            raise UserInputError(
+                f"fields of levels {found}; expected the coarsest, {self.levels - 1}, unsigned (the base), and the "
+                "others all signed (residuals) or, where levels are nested, all unsigned"
+            )
 
     @classmethod
     def from_archive(
@@ -197,6 +202,25 @@ class HierarchyRenderer:
         """The finest level that can be rendered; 0 for a complete hierarchy."""
         return min(self.fields)
 
+    @property
+    def nested(self) -> bool:
+        """Whether each field makes its level's whole image."""
+        return self.finest < self.levels - 1 and not self.fields[self.finest].signed
+
+    def fields_for(self, level: int, gains: Mapping[int, float] | None = None) -> list[int]:
+        """The levels whose fields `images` renders, coarsest first; arguments as it takes them."""
+        gains = gains or {}
+        levels = range(self.levels - 1, level - 1, -1)
+        if not self.nested:
+            return [each for each in levels if gains.get(each, 1.0) != 0.0]
+        return [level] if all(gains.get(each, 1.0) == 1.0 for each in levels) else list(levels)
+
+    def fields_for_band(self, level: int, gain: float = 1.0) -> list[int]:
+        """The levels whose fields `band` renders, coarsest first; arguments as it takes them."""
+        if self.nested and level < self.levels - 1:
+            return [level + 1, level]
+        return [level] if gain != 0.0 else []
+
     def require_level(self, level: int) -> None:
         """Check that `level` can be rendered.
 
@@ -232,7 +256,7 @@ class HierarchyRenderer:
             camera: of the full-resolution view.
             level: finest level to add.
             gains: by level, what its band is multiplied by, at least 0; 1 where nothing is said, which is the image as
-                trained. A level with gain 0 is not rendered.
+                trained. A residual of gain 0 is not rendered.
 
         Raises:
             UserInputError: that level is not there, or a gain is out of range or for a level that is not there.
@@ -256,42 +280,62 @@ class HierarchyRenderer:
         Raises:
             UserInputError: as `render`, or the cameras differ in size.
         """
-        gains = self._checked(level, gains)
-        if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
-            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
-            raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
-        bands = self._at_once if self._goes_at_once(cameras, level, gains) else self._field_by_field
-        residuals: dict[int, Tensor] = {}
-        composed: dict[int, Tensor] = {}
-        for each, images in bands(cameras, level, gains):
-            if each == self.levels - 1:
-                composed[each] = images
-                continue
-            residuals[each] = images
-            composed[each] = add_raised(self.pyramid, composed[each + 1], images)
-        return Composition(composed[self.levels - 1], residuals, composed)
+        return self._compose(cameras, range(self.levels - 1, level - 1, -1), self._checked(level, gains))
 
     @torch.no_grad()
-    def render_level(
-        self, camera: Camera, level: int, coarser: Tensor | None, gain: float = 1.0
-    ) -> tuple[Tensor, Tensor]:
-        """Render one level and add it to what the coarser levels made: I_hat^l = Up(I_hat^(l+1)) + gain * R_hat^l.
+    def images(self, cameras: Sequence[Camera], level: int = 0, gains: Mapping[int, float] | None = None) -> Tensor:
+        """(b, 3, h, w) I_hat of `level`, without the bands it is made of: of nested levels one field is rendered.
+
+        Args, Raises:
+            As `render_batch`.
+        """
+        gains = self._checked(level, gains)
+        needed = self.fields_for(level, gains) if self.nested else range(self.levels - 1, level - 1, -1)
+        return self._compose(cameras, needed, gains).composed[level]
+
+    @torch.no_grad()
+    def band(self, camera: Camera, level: int, gain: float = 1.0) -> Tensor:
+        """(3, h, w) what one level adds to the coarser ones, at its size; of the coarsest, its image.
 
         Args:
             camera: of the full-resolution view.
-            level: which field to render.
-            coarser: (3, h, w) I_hat^(l+1) of the same view, None for the coarsest level.
-            gain: what the render is multiplied by, at least 0; 0 gives zeros without rendering.
-
-        Returns:
-            The field's own render times its gain and the composed image I_hat^l, both (3, h, w) at the level's size.
+            level: whose band.
+            gain: what the band is multiplied by, at least 0; 0 gives zeros.
 
         Raises:
             UserInputError: as `render`.
         """
-        self._checked(level, {level: gain})
-        image = self._render_band(level, [level_camera(camera, level)], gain)[0]
-        return image, image if coarser is None else add_raised(self.pyramid, coarser, image)
+        gains = self._checked(level, {level: gain})
+        if len(needed := self.fields_for_band(level, gain)) > 1:
+            return self._compose([camera], needed, gains).residuals[level][0]
+        return self._render_band(level, [level_camera(camera, level)], gain)[0]
+
+    def _compose(self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]) -> Composition:
+        """Of these levels, coarsest first; a base that is finer than the hierarchy's makes its image by itself."""
+        if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
+            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
+            raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
+        nested = self.nested
+        weights = {} if nested else gains  # a nested field's image has the coarser bands in it
+        renders = self._at_once if self._goes_at_once(cameras, levels, weights) else self._field_by_field
+        residuals: dict[int, Tensor] = {}
+        composed: dict[int, Tensor] = {}
+        coarser: Tensor | None = None  # of nested levels, the last image before its gains
+        for each, images in renders(cameras, levels, weights):
+            if each == levels[0]:
+                base_gain = gains.get(each, 1.0) if nested and each == self.levels - 1 else 1.0
+                composed[each] = _times(base_gain, images)
+            elif not nested:
+                residuals[each] = images
+                composed[each] = add_raised(self.pyramid, composed[each + 1], images)
+            else:
+                assert coarser is not None, "the first level was another one"
+                adds = images - self.pyramid.up(coarser, (images.shape[-2], images.shape[-1]))
+                residuals[each] = _times(gains.get(each, 1.0), adds)
+                as_trained = all(gain == 1.0 for gain in gains.values())
+                composed[each] = images if as_trained else add_raised(self.pyramid, composed[each + 1], residuals[each])
+            coarser = images
+        return Composition(composed[levels[0]], residuals, composed)
 
     def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:
         self.require_level(level)
@@ -310,48 +354,47 @@ class HierarchyRenderer:
         keeps = self.residence is not None and self.residence.keep
         return keeps and isinstance(self.rasterizer, StackingRasterizer) and self.rasterizer.can_stack
 
-    def _goes_at_once(self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]) -> bool:
+    def _goes_at_once(self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]) -> bool:
         if not self.concurrent or len(cameras) > 1 or not self.can_be_at_once:
             return False  # a batch shares its launches among its views
-        finest = level_camera(cameras[0], level)
-        return finest.width * finest.height <= self.at_once and all(gains.get(i, 1) for i in range(level, self.levels))
+        finest = level_camera(cameras[0], levels[-1])
+        return finest.width * finest.height <= self.at_once and all(gains.get(each, 1) for each in levels)
 
     def _at_once(
-        self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]
+        self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]
     ) -> Iterator[tuple[int, Tensor]]:
         """As `_field_by_field`, of one camera, all fields together."""
-        levels = range(self.levels - 1, level - 1, -1)
-        with self._memory_for(levels, level_camera(cameras[0], level)):
+        with self._memory_for(levels, level_camera(cameras[0], levels[-1])):
             background = self._colored if any(self.background) else None
-            images = self._stack(level).render([level_camera(cameras[0], each) for each in levels], background)
+            images = self._stack(levels).render([level_camera(cameras[0], each) for each in levels], background)
             for each, image in zip(levels, images, strict=True):
                 yield each, self._weighed(each, image[None], gains.get(each, 1.0))
 
-    def _stack(self, finest: int) -> FieldStack:
-        """The fields from the coarsest on, at least down to `finest`, on the device."""
-        if all(each > finest for each in self._stacks):
+    def _stack(self, levels: Sequence[int]) -> FieldStack:
+        """The fields of these levels on the device, with finer ones after them or none."""
+        wanted = tuple(levels)
+        if all(there[: len(wanted)] != wanted for there in self._stacks):
             assert isinstance(self.rasterizer, StackingRasterizer)
             self._stacks.clear()  # first, so that they are not there twice
-            levels = range(self.levels - 1, finest - 1, -1)
-            self._stacks[finest] = self.rasterizer.stack([self.fields[each] for each in levels])
+            self._stacks[wanted] = self.rasterizer.stack([self.fields[each] for each in wanted])
         return next(iter(self._stacks.values()))
 
     @cached_property
-    def _stacks(self) -> dict[int, FieldStack]:
-        """By the finest level in it, the one that has been needed so far."""
+    def _stacks(self) -> dict[tuple[int, ...], FieldStack]:
+        """By the levels in it, the one that was needed last."""
         return {}
 
     def _field_by_field(
-        self, cameras: Sequence[Camera], level: int, gains: Mapping[int, float]
+        self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]
     ) -> Iterator[tuple[int, Tensor]]:
-        """From the coarsest level down to `level`: renders times their gain, (b, 3, h, w), for the current stream."""
+        """Levels, coarsest first, with their renders times their gain, (b, 3, h, w), for the current stream."""
         rendered: dict[int, Tensor] = {}
         # The finest first: it takes longest, and coarser levels are rendered in its shadow.
-        for each in range(level, self.levels):
+        for each in reversed(levels):
             at_level = [level_camera(camera, each) for camera in cameras]
             with self._beside(each):
                 rendered[each] = self._render_band(each, at_level, gains.get(each, 1.0))
-        for each in range(self.levels - 1, level - 1, -1):
+        for each in levels:
             yield each, self._for_current(each, rendered[each])
 
     @property
@@ -415,7 +458,7 @@ class HierarchyRenderer:
         """A level's renders, clamped where its hierarchy is, times its gain."""
         if self.clamped:
             images = images.clamp(-1.0 if self.fields[level].signed else 0.0, 1.0)
-        return images if gain == 1.0 else gain * images
+        return _times(gain, images)
 
     @contextmanager
     def _memory_for(self, levels: Sequence[int], camera: Camera) -> Iterator[None]:
@@ -429,6 +472,10 @@ class HierarchyRenderer:
                 f"the GPU has no memory left to render {which}, {count:,} Gaussians at {camera.width}x{camera.height}; "
                 "render a coarser --level, a smaller size, or with --device cpu"
             ) from error
+
+
+def _times(gain: float, images: Tensor) -> Tensor:
+    return images if gain == 1.0 else gain * images
 
 
 def _with_what_is_left(error: RunFolderError, whole: Sequence[int]) -> RunFolderError:

@@ -64,7 +64,7 @@ def measure_speed(
 
 def composed_speed(renderer: HierarchyRenderer, cameras: Sequence[Camera], rounds: int = ROUNDS) -> Speed:
     """The fastest of the ways in which all levels are composed, otherwise as `measure_speed`."""
-    kinds = [kind for kind in _kinds(renderer, 0) if len(kind.fields) == renderer.levels]
+    kinds = [kind for kind in _kinds(renderer, 0) if kind.whole]
     return max((_measured(renderer, kind, cameras, rounds) for kind in kinds), key=lambda speed: speed.fps)
 
 
@@ -77,6 +77,8 @@ class _Kind:
         frame: renders `views` cameras.
         fields: levels whose fields are rendered.
         size_level: level whose size a frame has.
+        views: of a frame.
+        whole: whether a frame is what the hierarchy makes of a view, at full resolution.
     """
 
     what: str
@@ -84,6 +86,7 @@ class _Kind:
     fields: Sequence[int]
     size_level: int
     views: int = 1
+    whole: bool = False
 
 
 def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera], rounds: int) -> Speed:
@@ -105,24 +108,32 @@ def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> It
         ways["all at once"] = at_once
     coarsest = renderer.levels - 1
     for finest in range(level, coarsest):
-        fields, what = range(finest, renderer.levels), f"levels {coarsest} to {finest}"
-        for way, composer in ways.items():
-            yield _Kind(f"{what}, {way}", _composing(composer, finest), fields, finest)
+        fields = renderer.fields_for(finest)
+        if len(fields) == 1:  # nested levels: there is nothing to be rendered beside it
+            what, of_field = f"level {finest}", {"": in_turn, **({", at once": at_once} if at_once is not None else {})}
+        else:
+            what, of_field = f"levels {coarsest} to {finest}", {f", {way}": composer for way, composer in ways.items()}
+        for way, composer in of_field.items():
+            yield _Kind(f"{what}{way}", _composing(composer, finest), fields, finest, whole=finest == 0)
     if batches:
-        fields, what = range(level, renderer.levels), "all" if coarsest > level else "field"
+        fields = renderer.fields_for(level)
+        what = "all" if len(fields) > 1 else "field" if coarsest == 0 else f"level {level}"
         yield _Kind(f"{what}, {BATCH} views at once", _composing(renderer, level), fields, level, views=BATCH)
-    yield _Kind("base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest)
+    yield _Kind(
+        "base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest, whole=coarsest == 0
+    )
     if at_once is not None and coarsest == 0:
-        yield _Kind("field, at once", _composing(at_once, 0), [0], 0)  # what a hierarchy rendered so compares with
+        # What a hierarchy rendered so compares with.
+        yield _Kind("field, at once", _composing(at_once, 0), [0], 0, whole=True)
     if coarsest > level:
         # What it would cost to render it as large as it is shown, instead of bringing it up.
         yield _Kind(f"base as large as level {level}", _alone(in_turn, coarsest, level), [coarsest], level)
-    for residual in range(coarsest - 1, level - 1, -1):
+    for residual in range(coarsest - 1, level - 1, -1) if not renderer.nested else ():
         yield _Kind(f"residual {residual} alone", _alone(in_turn, residual, residual), [residual], residual)
 
 
 def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
-    return lambda cameras: renderer.render_batch(cameras, level).composed[level].clamp(0.0, 1.0)
+    return lambda cameras: renderer.images(cameras, level).clamp(0.0, 1.0)
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:

@@ -75,7 +75,8 @@ class ProgressMonitor(Monitor):
 
     def stage_started(self, stage: Stage, first_iteration: int) -> None:
         width, height = stage.image_size
-        name = "field" if self._levels == 1 else "residual" if stage.signed else "base"
+        base = self._levels > 1 and stage.level == self._levels - 1
+        name = "base" if base else "residual" if stage.signed else "field"
         self._psnr = None
         self._task = self._progress.add_task(
             f"{name} {width}x{height}",

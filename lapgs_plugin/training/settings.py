@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.plan import Stage, check_joint_share
+from lapgs_plugin.plan import NESTED_COARSE_THRESHOLD, Hierarchy, Stage, check_joint_share, parse_hierarchy
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import joint_from, parse_supervision
 
@@ -60,6 +60,7 @@ class Densification:
     every: int = 100
     reset_every: int | None = None
     grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
+    coarse_threshold: float | None = None  # factor on it each time that images are halved; None: by the hierarchy
     strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
     absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
     cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
@@ -71,6 +72,7 @@ class TrainSettings:
 
     iterations: int = 30_000
     levels: int = 2
+    hierarchy: str = "laplacian"
     split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
     grid: str = "camera"
     supervision: str = "reconstructed"
@@ -102,10 +104,37 @@ class TrainSettings:
                 f"--inherit {self.inherit_ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)"
             )
         check_joint_share(self.joint)
+        if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED:
+            self._require_no_residuals()
+        factor = self.densification.coarse_threshold
+        if factor is not None and not (factor > 0.0 and math.isfinite(factor)):
+            raise UserInputError(f"--coarse-threshold {factor}: expected a positive factor")
         if self.gather < 1:
             raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+
+    def _require_no_residuals(self) -> None:
+        """Refuse what is about residuals, of which nested levels have none."""
+        asked = {
+            "--supervision": (self.supervision, "reconstructed"),
+            "--inherit": (self.inherit, "geometry"),
+            "--inherit ratio": (self.inherit_ratio, 1.0),
+            "--joint": (self.joint, 0.0),
+        }
+        for option, (value, default) in asked.items():
+            if value != default:
+                raise UserInputError(
+                    f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
+                    "train a laplacian hierarchy"
+                )
+
+    def densification_of(self, stage: Stage) -> Densification:
+        """Density control of a stage: as set, with a threshold for its size."""
+        factor = self.densification.coarse_threshold
+        if factor is None:
+            factor = NESTED_COARSE_THRESHOLD if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED else 1.0
+        return replace(self.densification, grow_grad2d=self.densification.grow_grad2d * factor**stage.level)
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""
@@ -123,8 +152,8 @@ class TrainSettings:
         Raises:
             RunFolderError: they hold a key this version does not know or lack one.
         """
-        # Runs of the first weeks know neither what came with gsplat, nor joint training, nor gathered views.
-        later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1}
+        # Runs of the first weeks know nothing of what came with gsplat, of joint training, gathered views and nesting.
+        later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"}
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
@@ -132,7 +161,7 @@ class TrainSettings:
                 f"match); continue it with {manifest.created_by}"
             )
         values["learning_rates"] = LearningRates(**values["learning_rates"])
-        values["densification"] = Densification(**values["densification"])
+        values["densification"] = Densification(**{"coarse_threshold": None, **values["densification"]})
         values["split"] = None if values["split"] is None else tuple(values["split"])
         return cls(**values)
 
@@ -143,7 +172,9 @@ class StageSchedule:
 
     Inside a stage of n of N iterations densification stops at `until` scaled by n/N and the position learning rate
     decays to its last value at n; the other constants stay as the user set them. Iterations count from 1 in each stage.
-    From `gather_from` on the gradients of `gather` views make one step.
+    From `gather_from` on the gradients of `gather` views make one step. A field that was trained before, in `before`
+    iterations of coarser nested levels, keeps its SH degree, and its opacities are not reset unless the user says when:
+    what resets are for, floaters near the cameras, was done at the coarser size, and recovering takes iterations.
     """
 
     iterations: int
@@ -157,9 +188,10 @@ class StageSchedule:
     means_last: float
     gather_from: int
     gather: int
+    before: int
 
     @classmethod
-    def create(cls, settings: TrainSettings, stage: Stage) -> StageSchedule:
+    def create(cls, settings: TrainSettings, stage: Stage, before: int = 0) -> StageSchedule:
         shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
         given = settings.densification
 
@@ -167,19 +199,21 @@ class StageSchedule:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
         late = round(stage.iterations * LATE_SHARE)
+        resets = constant(given.reset_every, 3000, 300)
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         return cls(
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),
             densify_until=round(until * stage.iterations / settings.iterations),
             densify_every=given.every,
-            reset_every=constant(given.reset_every, 3000, 300),
+            reset_every=stage.iterations + 1 if before and given.reset_every is None else resets,
             sh_every=constant(settings.sh_every, 1000, 1),
             sh_degree=settings.sh_degree,
             means_first=settings.learning_rates.means_first,
             means_last=settings.learning_rates.means_last,
             gather_from=stage.iterations - late + 1,
             gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
+            before=before,
         )
 
     def steps(self, iteration: int) -> bool:
@@ -193,4 +227,4 @@ class StageSchedule:
         return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
 
     def active_sh_degree(self, iteration: int) -> int:
-        return min(self.sh_degree, iteration // self.sh_every)
+        return min(self.sh_degree, (self.before + iteration) // self.sh_every)

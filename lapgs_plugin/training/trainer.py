@@ -22,7 +22,7 @@ from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.peak_memory import PeakMemory
-from lapgs_plugin.plan import Stage, StagePlan, parse_split
+from lapgs_plugin.plan import Hierarchy, Stage, StagePlan, parse_hierarchy, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer, render_image
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
@@ -55,7 +55,8 @@ def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
         UserInputError: levels, split and image size do not go together.
     """
     split = None if settings.split is None else parse_split(",".join(settings.split))
-    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split)
+    hierarchy = parse_hierarchy(settings.hierarchy)
+    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split, hierarchy)
 
 
 def check_cache(settings: TrainSettings, device: torch.device) -> None:
@@ -155,7 +156,7 @@ class Trainer:
         with stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
-                residuals = self.plan.levels > 1
+                residuals = any(stage.signed for stage in self.plan)
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
                 for stage in self.plan:
@@ -200,6 +201,11 @@ class Trainer:
         if checkpoint is not None:
             return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
         with self._overhead.timed("inheritance"):
+            if self._goes_on(stage):
+                field = self.archive.field(stage.level + 1)
+                model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
+                model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
+                return model
             if not stage.signed:
                 points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
                 if self.settings.densification.strategy == "mcmc":
@@ -214,8 +220,17 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
+    def _goes_on(self, stage: Stage) -> bool:
+        """Whether a stage trains the field of the one before on."""
+        return self.plan.hierarchy is Hierarchy.NESTED and stage.level < self.plan.levels - 1
+
+    def _heir_wants_moments(self, stage: Stage) -> bool:
+        """Whether the stage after this one goes on with Adam's state."""
+        return stage.level > 0 and (self.plan.hierarchy is Hierarchy.NESTED or self.settings.inherit == "full")
+
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
-        schedule = StageSchedule.create(self.settings, stage)
+        coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
+        schedule = StageSchedule.create(self.settings, stage, coarser if self._goes_on(stage) else 0)
         if self._images is not None:
             self._images.close()
         with self._overhead.timed("pyramid"):
@@ -240,7 +255,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=density_control(schedule, self.settings.densification, self.scene.extent),
+            densifier=density_control(schedule, self.settings.densification_of(stage), self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             thaw=self._thaw,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
@@ -286,8 +301,7 @@ class Trainer:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
                 camera = level_camera(view.camera, stage.level)
-                composed = renderer.render(view.camera, level=coarser).composed[coarser]
-                cache.put(view.name, composed, (camera.height, camera.width))
+                cache.put(view.name, renderer.images([view.camera], coarser)[0], (camera.height, camera.width))
         return cache
 
     def _empty_cache(self, level: int, views: Sequence[View], name: str) -> ImageStore:
@@ -402,8 +416,8 @@ class Trainer:
         )
         for level, thawed in ({} if run.joint is None else run.joint.fields).items():
             self.archive.replace_field(level, thawed)
-        heir_wants_it = self.settings.inherit == "full" and run.stage.level > 0
-        self.archive.finish_level(record, field, run.model.optimizer_moments() if heir_wants_it else None)
+        moments = run.model.optimizer_moments() if self._heir_wants_moments(run.stage) else None
+        self.archive.finish_level(record, field, moments)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property

@@ -160,10 +160,12 @@ def draw(
         as_trained = PictureSettings(level=settings.level)
         right, _ = _shown(other, camera, as_trained, other.level_for(settings, window, distance))
         image = side_by_side(image, right.to(image), settings.divider)
-    # A composition is rendered from the finest level on. Fields do not tell: one may come to a GPU as another object.
-    bands = range(level, run.renderer.levels) if settings.band is None else [settings.band]
-    rendered = [each for each in bands if settings.gains.get(each, 1.0) != 0.0]
-    return Picture(image, level, dict(zip(rendered, stopwatch.laps, strict=True)))
+    # Rendered from the finest level on. Fields do not tell: one may come to a GPU as another object.
+    if settings.band is None:
+        rendered = run.renderer.fields_for(level, settings.gains)
+    else:
+        rendered = run.renderer.fields_for_band(level, settings.gains.get(level, 1.0))
+    return Picture(image, level, dict(zip(reversed(rendered), stopwatch.laps, strict=True)))
 
 
 def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:
@@ -190,10 +192,10 @@ def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int)
     top = level if settings.level is None else 0
     full = camera.resized(camera.width << top, camera.height << top)
     if settings.band is None:
-        image = renderer.render(full, level, settings.gains).composed[level]
+        image = renderer.images([full], level, settings.gains)[0]
     else:
-        image, _ = renderer.render_level(full, level, None, settings.gains.get(level, 1.0))
-        if renderer.fields[level].signed:
+        image = renderer.band(full, level, settings.gains.get(level, 1.0))
+        if level < renderer.levels - 1:
             image = around_grey(image)
     for finer in range(level - 1, top - 1, -1):
         at_finer = level_camera(full, finer)

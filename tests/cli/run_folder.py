@@ -49,16 +49,23 @@ def write_scene(folder: Path, view_names: list[str] | None = None, size: tuple[i
 
 
 def write_run(
-    folder: Path, scene: Path, *, levels: int = 2, finished: int | None = None, hold_out: bool = True, seed: int = 0
+    folder: Path,
+    scene: Path,
+    *,
+    levels: int = 2,
+    finished: int | None = None,
+    hold_out: bool = True,
+    seed: int = 0,
+    nested: bool = False,
 ) -> Path:
     """A run folder of `levels` levels (at most 2), of which the first `finished` are there."""
-    settings = TrainSettings(iterations=300, levels=levels)
+    settings = TrainSettings(iterations=300, levels=levels, hierarchy="nested" if nested else "laplacian")
     reference = SceneReference(str(scene), "full", hold_out, BACKGROUND, "transforms")
     manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
     with RunArchive.create(folder, manifest) as archive:
         elapsed = 0.0
         for level in list(range(levels - 1, -1, -1))[:finished]:
-            signed = level < levels - 1
+            signed = not nested and level < levels - 1
             field = blob_field(count=200 + 50 * level, seed=seed + level)
             sh = 0.3 * field.sh if signed else field.sh
             record = LevelRecord(

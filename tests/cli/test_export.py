@@ -50,6 +50,15 @@ def test_ply_of_every_level_for_other_viewers(run: Path) -> None:
     assert PlyData.read(str(run / "export" / "level_1_base.ply")).comments == ["base of run, a hierarchy of 2 levels"]
 
 
+def test_nested_levels_are_ordinary_fields(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), nested=True)
+    output = lapgs_export(run)
+    assert "residual" not in output
+    data = PlyData.read(run / "export" / "level_0_field.ply")
+    assert any("field of level 0" in comment and "nested levels" in comment for comment in data.comments)
+    assert not any("signed" in comment for comment in data.comments)
+
+
 def test_spz_of_one_level(run: Path, tmp_path: Path) -> None:
     lapgs_export(run, "--format", "spz", "--level", 0, "--out", tmp_path / "out")
     assert files_in(tmp_path / "out") == {"level_0_residual.spz"}

@@ -15,6 +15,7 @@ from lapgs_plugin.errors import TrainingDivergedError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.plan import Stage
+from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.scenes.scene import Scene
@@ -152,6 +153,70 @@ def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_
             Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(0, 10)).run()
         archive.path("checkpoint.pt").unlink()
         Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
+        assert plys(archive) == plys(whole)
+
+
+def nested(settings: TrainSettings = SETTINGS) -> TrainSettings:
+    return replace(settings, hierarchy="nested", joint=0.0)
+
+
+class FirstImage(StageHook):
+    """Keeps what each stage rendered first, and what it was to be added to."""
+
+    def __init__(self) -> None:
+        self.images: dict[int, tuple[str, torch.Tensor, torch.Tensor | None]] = {}
+
+    def compose(self, context: StageContext, image: torch.Tensor) -> torch.Tensor:
+        self.images.setdefault(context.stage.level, (context.view, image.detach(), context.accumulated))
+        return image
+
+
+def test_a_nested_level_goes_on_with_the_coarser_field(scene: Scene, tmp_path: Path) -> None:
+    """Its first image is the archived field's, at the finer size; what was measured at the end is the last field's."""
+    first = FirstImage()
+    archive = train(tmp_path / "run", scene, nested(), user_hooks=[first])
+    assert [(record.level, record.signed) for record in archive.manifest.records] == [(1, False), (0, False)]
+    view, image, accumulated = first.images[0]
+    camera = next(each.camera for each in scene.train if each.name == view)
+    with torch.no_grad():
+        expected = CpuRasterizer()(archive.field(1), camera, background=torch.tensor(scene.background)).image
+        held_out = [
+            psnr(CpuRasterizer()(archive.field(0), each.camera, background=torch.zeros(3)).image, each.image)
+            for each in scene.test
+        ]
+    assert accumulated is None
+    torch.testing.assert_close(image, expected, rtol=0, atol=0)
+    assert archive.history()[-1]["psnr"] == pytest.approx(math.fsum(held_out) / len(held_out), abs=1e-9)
+    assert not archive.path("cache").exists()
+
+
+def test_nested_levels_learn(scene: Scene, tmp_path: Path) -> None:
+    calm = Densification(start=20, until=150, every=20, reset_every=10_000)
+    archive = train(tmp_path / "run", scene, nested(replace(SETTINGS, iterations=300, densification=calm)))
+    renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
+    fits = {
+        level: math.fsum(
+            psnr(to_full_size(renderer.images([view.camera], level)[0], view.camera, level, Pyramid()), view.image)
+            for view in scene.train
+        )
+        / len(scene.train)
+        for level in (1, 0)
+    }
+    assert fits[0] > fits[1] + 1.0  # the gain was 2.8 dB
+
+
+def test_adam_goes_on_where_the_coarser_level_left_it(scene: Scene, tmp_path: Path) -> None:
+    """With its moments and its count of steps; and a run that lost its checkpoint does the same."""
+    whole = train(tmp_path / "whole", scene, nested())
+    with make_archive(tmp_path / "parts", nested()) as archive:
+        with pytest.raises(TrainingStoppedError):
+            Trainer(scene, nested(), archive, CpuRasterizer(), monitor=StopAt(0, 10)).run()
+        before, after = archive.optimizer_state(1), archive.load_checkpoint()["model"]["moments"]
+        assert before.keys() == after.keys() == {"means", "quats", "scales", "opacities", "sh"}
+        for name in before:
+            assert int(after[name]["step"]) == int(before[name]["step"]) + 10
+        archive.path("checkpoint.pt").unlink()
+        Trainer(scene, nested(), archive, CpuRasterizer()).run(resume=True)
         assert plys(archive) == plys(whole)
 
 

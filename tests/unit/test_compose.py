@@ -135,8 +135,9 @@ def test_an_unfinished_hierarchy_renders_what_it_has() -> None:
         ({}, r"fields of levels \[\]"),
         ({1: blobs(0, False)}, r"expected 2, \.\.\., 0"),
         ({2: blobs(0, False), 0: blobs(1, True)}, "without gaps"),
-        ({2: blobs(0, True)}, "level 2 is signed"),
-        ({2: blobs(0, False), 1: blobs(1, False)}, "level 1 is unsigned"),
+        ({2: blobs(0, True)}, "levels 2 signed; expected the coarsest, 2, unsigned"),
+        ({2: blobs(0, True), 1: blobs(1, False)}, "levels 2 signed, 1 unsigned; expected"),
+        ({2: blobs(0, False), 1: blobs(1, False), 0: blobs(2, True)}, "levels 2 unsigned, 1 unsigned, 0 signed"),
     ],
 )
 def test_fields_that_make_no_hierarchy_are_refused(fields: dict[int, GaussianField], message: str) -> None:
@@ -176,7 +177,65 @@ def test_a_gain_out_of_range_is_refused(gain: float) -> None:
     with pytest.raises(UserInputError, match=message):
         renderer.render(CAMERA, gains={0: gain})
     with pytest.raises(UserInputError, match=message):
-        renderer.render_level(CAMERA, 0, None, gain)
+        renderer.band(CAMERA, 0, gain)
+
+
+def test_a_band_is_what_its_field_renders() -> None:
+    fields = {2: blobs(2, False), 1: blobs(1, True), 0: blobs(0, True)}
+    renderer = HierarchyRenderer(fields, 3, Pyramid("camera"), OracleRasterizer(), BACKGROUND)
+    composition = renderer.render(CAMERA)
+    for level, expected in {2: composition.base, **composition.residuals}.items():
+        assert renderer.fields_for_band(level) == [level]
+        torch.testing.assert_close(renderer.band(CAMERA, level, 1.5), 1.5 * expected, rtol=0, atol=0)
+    assert renderer.fields_for_band(1, 0.0) == []
+    assert not renderer.band(CAMERA, 1, 0.0).any()
+
+
+NESTED = {2: blobs(2, False), 1: blobs(1, False), 0: blobs(0, False)}
+
+
+def test_nested_levels_by_the_formula() -> None:
+    oracle, pyramid = OracleRasterizer(), Pyramid("camera")
+    renderer = HierarchyRenderer(NESTED, 3, pyramid, oracle, BACKGROUND)
+    composition = renderer.render(CAMERA)
+    own = {
+        level: oracle(NESTED[level], CAMERA.resized(*size), background=torch.tensor(BACKGROUND)).image
+        for level, size in {2: (12, 8), 1: (23, 15), 0: (45, 30)}.items()
+    }
+    residuals = {1: own[1] - pyramid.up(own[2], (15, 23)), 0: own[0] - pyramid.up(own[1], (30, 45))}
+    torch.testing.assert_close(composition.base, own[2], rtol=0, atol=0)
+    torch.testing.assert_close(composition.composed, own, rtol=0, atol=0)
+    torch.testing.assert_close(composition.residuals, residuals, rtol=0, atol=0)
+    for level, image in own.items():
+        torch.testing.assert_close(renderer.images([CAMERA], level)[0], image, rtol=0, atol=0)
+    for level in (1, 0):
+        assert renderer.fields_for_band(level) == [level + 1, level]
+        torch.testing.assert_close(renderer.band(CAMERA, level, 2.0), 2.0 * residuals[level], rtol=0, atol=0)
+
+
+def test_gains_of_nested_levels_weigh_what_each_adds() -> None:
+    renderer = HierarchyRenderer(NESTED, 3, Pyramid("camera"), OracleRasterizer(), BACKGROUND)
+    plain = renderer.render(CAMERA)
+    gains = {2: 0.5, 1: 0.0, 0: 1.7}
+    middle = renderer.pyramid.up(0.5 * plain.base, (15, 23))
+    finest = renderer.pyramid.up(middle, (30, 45)) + 1.7 * plain.residuals[0]
+    # The kernel of Up and the sum adds in another order; worst seen 1.2e-7.
+    torch.testing.assert_close(renderer.render(CAMERA, gains=gains).composed[0], finest, rtol=0, atol=1e-6)
+    torch.testing.assert_close(renderer.images([CAMERA], 0, gains)[0], finest, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("level", "gains", "rendered"), [(0, {}, [0]), (1, {2: 1.0}, [1]), (2, {}, [2]), (0, {0: 0.0}, [2, 1, 0])]
+)
+def test_an_image_of_nested_levels_takes_one_field(level: int, gains: dict[int, float], rendered: list[int]) -> None:
+    rasterizer = Constant()
+    fields = {level: constant_field(0.1 * level, False) for level in range(3)}
+    renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
+    assert renderer.fields_for(level, gains) == rendered
+    renderer.images([CAMERA], level, gains)
+    sizes = {2: (12, 8), 1: (23, 15), 0: (45, 30)}
+    assert [size for _, size, _ in rasterizer.calls] == [sizes[each] for each in reversed(rendered)]
+    assert all(background == pytest.approx(list(BACKGROUND)) for *_, background in rasterizer.calls)
 
 
 def test_a_batch_is_its_views_one_by_one() -> None:

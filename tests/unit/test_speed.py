@@ -47,6 +47,17 @@ def test_every_kind_is_measured_by_itself() -> None:
     assert [each.what for each in measure_speed(renderer, [ring_camera(0.0)], 1, rounds=1)] == ["base"]
 
 
+def test_of_nested_levels_each_is_a_field() -> None:
+    renderer = HierarchyRenderer({1: blob_field(30), 0: blob_field(50)}, 2, Pyramid(), CpuRasterizer())
+    found = measure_speed(renderer, [ring_camera(0.0), ring_camera(1.0)], 0, rounds=1)
+    assert [(each.what, each.size, each.gaussians) for each in found] == [
+        ("level 0", (56, 40), 50),
+        ("base", (28, 20), 30),
+        ("base as large as level 0", (56, 40), 30),
+    ]
+    assert speed.composed_speed(renderer, [ring_camera(0.0)], 1).gaussians == 50
+
+
 def test_one_level_is_a_field() -> None:
     renderer = HierarchyRenderer({0: blob_field(30)}, 1, Pyramid(), CpuRasterizer())
     (only,) = measure_speed(renderer, [ring_camera(0.0)], 0, rounds=1)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import StagePlan, parse_split
+from lapgs_plugin.plan import Hierarchy, StagePlan, parse_split
 from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
 from lapgs_plugin.training.views import view_index
 
@@ -89,3 +89,34 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
 def test_bad_settings_say_what_is_expected(values: dict[str, float], message: str) -> None:
     with pytest.raises(UserInputError, match=message):
         TrainSettings(**values)
+
+
+def test_a_nested_field_keeps_its_sh_degree() -> None:
+    stage = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)[0]
+    schedule = StageSchedule.create(TrainSettings(hierarchy="nested"), stage, before=1500)
+    assert [schedule.active_sh_degree(i) for i in (1, 499, 500, 1499, 1500)] == [1, 1, 2, 2, 3]
+
+
+@pytest.mark.parametrize(("given", "resets"), [(None, []), (4000, [4000, 8000, 12_000])])
+def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | None, resets: list[int]) -> None:
+    settings = TrainSettings(hierarchy="nested", densification=Densification(reset_every=given))
+    base, finer = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)
+    schedule = StageSchedule.create(settings, finer, before=base.iterations)
+    assert [i for i in range(1, finer.iterations + 1) if i % schedule.reset_every == 0] == resets
+    assert StageSchedule.create(settings, base).reset_every == (given or 3000)
+
+
+@pytest.mark.parametrize(
+    ("hierarchy", "given", "factors"),
+    [
+        ("laplacian", None, [1, 1, 1]),
+        ("nested", None, [4, 2, 1]),
+        ("nested", 1.0, [1, 1, 1]),
+        ("laplacian", 3.0, [9, 3, 1]),
+    ],
+)
+def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
+    settings = TrainSettings(levels=3, hierarchy=hierarchy, densification=Densification(coarse_threshold=given))
+    plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
+    found = [settings.densification_of(stage).grow_grad2d for stage in plan]
+    assert found == pytest.approx([2e-4 * factor for factor in factors])

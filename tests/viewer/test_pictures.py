@@ -93,6 +93,26 @@ def test_one_band_alone_lies_around_grey(run: ShownRun) -> None:
     torch.testing.assert_close(base, picture(run, PictureSettings({0: 0.0})).image)
 
 
+def test_nested_levels_show_one_field_and_bands_that_are_differences() -> None:
+    background = torch.tensor([0.1, 0.2, 0.3])
+    fields = {1: blob_field(seed=0), 0: blob_field(seed=1)}
+    renderer = HierarchyRenderer(fields, 2, Pyramid("camera"), CpuRasterizer(), (0.1, 0.2, 0.3))
+    run = ShownRun("run", renderer, pixels_per_angle=CAMERA.fy, distance=4.0)
+    base, whole = field_image(run, 1, (32, 24), background), field_image(run, 0, (64, 48), background)
+    up = Pyramid("camera").up(base, (48, 64))
+    plain = picture(run, PictureSettings())
+    torch.testing.assert_close(plain.image, whole.clamp(0, 1))
+    assert plain.milliseconds.keys() == {0}
+    sharper = picture(run, PictureSettings({0: 2.0}))
+    torch.testing.assert_close(sharper.image, (up + 2.0 * (whole - up)).clamp(0, 1))
+    assert sharper.milliseconds.keys() == {1, 0}
+    blurred = picture(run, PictureSettings({0: 0.0}))
+    torch.testing.assert_close(blurred.image, up.clamp(0, 1))
+    band = picture(run, PictureSettings({0: 3.0}, band=0))
+    torch.testing.assert_close(band.image, (0.5 + 3.0 * (whole - up) / 2).clamp(0, 1))
+    assert band.milliseconds.keys() == {1, 0}
+
+
 @pytest.mark.parametrize(
     ("size", "distance", "level"),
     [
