@@ -38,12 +38,6 @@ FastGS on bonsai: 31.06 dB without, 31.48 with it, 31.55 bare. The built-in trai
 RESIDUAL_COLOR_RATE = 4.0
 """Factor of `lapgs run` on the SH learning rates of residual stages."""
 
-NESTED_COARSE_THRESHOLD = 2.0
-"""Factor on the thresholds of densification for each time that a nested level's images are halved.
-
-What a coarse level grows is optimized at every finer one as well, and there it can still grow.
-"""
-
 
 class Hierarchy(str, Enum):
     """What the field of a level is for, if not of the coarsest."""

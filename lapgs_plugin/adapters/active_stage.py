@@ -108,6 +108,11 @@ class ActiveStage:
         """What the stages after this one have to know of it, once its field is in the archive."""
         return FinishedStage(self.stage, self._call)
 
+    @property
+    def resets_opacities(self) -> bool:
+        """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
+        return self._before is None or not self._options.nested
+
     # What the replaced symbols ask for.
 
     def scene_for(self, gaussians: Any) -> Any:
@@ -373,15 +378,16 @@ class ActiveStage:
             return
         options = self._options
         generator = torch.Generator().manual_seed(options.seed)
-        field, self._kept = inherit(self._before.field, options.inherit, options.inherit_ratio, generator)
+        mode = options.inheritance
+        field, self._kept = inherit(self._before.field, mode, options.inherit_ratio, generator)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
         gaussians.create_from_pcd(
             type(points)(points=positions, colors=grey, normals=np.zeros_like(positions)), *others
         )
-        if options.inherit != "xyz":
+        if mode != "xyz":
             names = ["_rotation", "_scaling", "_opacity"]
-            if options.inherit == "full":
+            if mode == "full":
                 names += ["_features_dc", "_features_rest"]
             self._adapter.import_field(gaussians, field.to(self._device), names)
         for name, value in self._before.carried.items():
@@ -401,7 +407,7 @@ class ActiveStage:
 
     def _moments(self, gaussians: Any) -> dict[str, dict[str, Tensor]]:
         """Optimizer state by parameter group on the CPU, if the next stage inherits it."""
-        if self._options.inherit != "full" or self.stage.level == 0:
+        if self._options.inheritance != "full" or self.stage.level == 0:
             return {}
         state = {}
         for optimizer in self._adapter.optimizers(gaussians):

@@ -45,6 +45,9 @@ from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
 
+OPACITY_RESET = "reset_opacity"
+"""That method of the family's GaussianModel which is density control and can be left out by itself."""
+
 
 class HierarchyDriver:
     """Runs a script's main block with its `training` replaced by the stages of a hierarchy.
@@ -148,7 +151,13 @@ class HierarchyDriver:
             ),
             Replacement(train.Scene, "save", self._make_save, ("self", "iteration"), "training() at --save_iterations"),
             *(
-                Replacement(train.GaussianModel, name, self._make_density_control, ("self",), "training()")
+                Replacement(
+                    train.GaussianModel,
+                    name,
+                    self._make_opacity_reset if name == OPACITY_RESET else self._make_density_control,
+                    ("self",),
+                    "training()",
+                )
                 for name in self._adapter.info.density_control
             ),
         ]
@@ -204,6 +213,16 @@ class HierarchyDriver:
             return result
 
         return control
+
+    def _make_opacity_reset(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        control = self._make_density_control(original)
+
+        def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            if self._active is None or self._active.resets_opacities:
+                return control(gaussians, *args, **kwargs)
+            return None
+
+        return reset_opacity
 
     # The run.
 

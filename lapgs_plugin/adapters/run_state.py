@@ -36,22 +36,13 @@ from lapgs_plugin.watching import Watcher
 PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
 """10k and 20k of 30k iterations for two levels, as in the paper's main tables; more levels take `StagePlan`'s."""
 
-OF_NESTED: dict[str, Any] = {
-    "supervision": "reconstructed",
-    "inherit": "full",
-    "inherit_ratio": 1.0,
-    "joint": 0.0,
-    "residual_color_rate": RESIDUAL_COLOR_RATE,
-}
-"""The only values of those options that are about residuals, where levels are nested."""
-
 
 @dataclass(frozen=True)
 class HierarchyOptions:
     """What a user can choose about the hierarchy; everything else is the backbone's.
 
     Attributes:
-        hierarchy: "laplacian", or "nested", which leaves a choice in none of `OF_NESTED`.
+        hierarchy: "laplacian", or "nested", where nothing is to be chosen about residuals.
         levels: number of levels; 1 is the plain backbone, archived as a run.
         split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
         grid: of the pyramid.
@@ -100,24 +91,32 @@ class HierarchyOptions:
                 f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
             )
         if self.nested:
-            self._check_residuals()
+            self._require_no_residuals()
 
-    def _check_residuals(self) -> None:
+    def _require_no_residuals(self) -> None:
         """Refuse what is about residuals, of which nested levels have none."""
-        for name, only in OF_NESTED.items():
-            if (value := getattr(self, name)) != only:
-                option = name.replace("_", "-")
-                if name.startswith("inherit"):
-                    option, value = "inherit", f"{self.inherit}:{self.inherit_ratio:g}"
+        asked = {
+            "--supervision": (self.supervision, "reconstructed"),
+            "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
+            "--joint": (self.joint, 0.0),
+            "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
+        }
+        for option, (value, default) in asked.items():
+            if value != default:
                 raise UserInputError(
-                    f"--{option} {value}: is for residuals, and nested levels have none; leave it out, or train with "
-                    f"--hierarchy {Hierarchy.LAPLACIAN.value}"
+                    f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
+                    "train a laplacian hierarchy"
                 )
 
     @property
     def nested(self) -> bool:
         """Whether each level trains the field of the coarser one on."""
         return parse_hierarchy(self.hierarchy) is Hierarchy.NESTED
+
+    @property
+    def inheritance(self) -> str:
+        """What a level starts from, a mode of `inheritance.inherit`."""
+        return "full" if self.nested else self.inherit
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""

@@ -84,14 +84,13 @@ def run(
         ),
     ] = "reconstructed",
     inherit: Annotated[
-        str | None,
+        str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="What a residual starts from: geometry (all but colour; the default), xyz (positions, as in the "
-            "paper) or full (all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after "
-            "it: xyz:0.5. Nested levels inherit in full.",
+            help="What a residual starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
+            "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
         ),
-    ] = None,
+    ] = "geometry",
     joint: Annotated[
         float | None,
         typer.Option(
@@ -190,7 +189,7 @@ def run(
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
     nested = parse_hierarchy(hierarchy) is Hierarchy.NESTED
-    mode, ratio = parse_inheritance(inherit or ("full" if nested else "geometry"))
+    mode, ratio = parse_inheritance(inherit)
     if joint is None:
         joint = 0.0 if nested else JOINT_SHARE
     if coarse_threshold is None:

@@ -365,11 +365,14 @@ def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_
     [
         (["--hierarchy", "flat"], "--hierarchy flat: expected laplacian or nested"),
         *(
-            (["--hierarchy", "nested", *option.split()], f"{option}: is for residuals, and nested levels have none")
+            (
+                ["--hierarchy", "nested", *option.split()],
+                f"{option}: is about residual fields, and --hierarchy nested trains none",
+            )
             for option in (
                 "--supervision online_residual",
+                "--inherit full:1",
                 "--inherit geometry:0.5",
-                "--inherit full:0.5",
                 "--joint 0.25",
                 "--residual-color-rate 2.0",
             )
@@ -388,12 +391,10 @@ def test_what_nested_levels_cannot_honour_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("words", "inherit", "joint", "coarse_threshold"),
-    [((), "geometry", 0.25, 1.0), (("--hierarchy", "nested"), "full", 0.0, 2.0)],
+    ("words", "joint", "coarse_threshold"), [((), 0.25, 1.0), (("--hierarchy", "nested"), 0.0, 2.0)]
 )
 def test_defaults_go_with_the_hierarchy(
     words: tuple[str, ...],
-    inherit: str,
     joint: float,
     coarse_threshold: float,
     lapgs_run: Any,
@@ -404,9 +405,8 @@ def test_defaults_go_with_the_hierarchy(
     of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
     code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert code == 0
-    manifest = RunArchive.open(tmp_path / "run").manifest
-    found = manifest.inherit, manifest.settings["joint"], manifest.settings["coarse_threshold"]
-    assert found == (inherit, joint, coarse_threshold)
+    settings = RunArchive.open(tmp_path / "run").manifest.settings
+    assert (settings["joint"], settings["coarse_threshold"]) == (joint, coarse_threshold)
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
