@@ -348,7 +348,7 @@ class ActiveStage:
         )
         when = {} if elapsed is None else {"elapsed": elapsed}
         self._archive.append_history({"level": self.stage.level, "iteration": iteration, **when, **means})
-        logger.info("held-out PSNR of the composed hierarchy: %.2f dB over %d views", means["psnr"], len(cameras))
+        logger.info("held-out PSNR: %.2f dB over %d views", means["psnr"], len(cameras))
 
     def _whole(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) a view at full resolution, as if every finer residual were zero."""
