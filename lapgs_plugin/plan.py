@@ -39,6 +39,9 @@ FastGS on bonsai: 31.06 dB without, 31.48 with it, 31.55 bare. The built-in trai
 0.18 dB on the sample scene and took 0.17 on fox (docs/training.md).
 """
 
+RESIDUAL_COLOR_RATE = 4.0
+"""Factor of `lapgs run` on the SH learning rates of residual stages."""
+
 
 class Hierarchy(str, Enum):
     """What the field of a level is for, if not of the coarsest."""

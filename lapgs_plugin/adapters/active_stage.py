@@ -108,6 +108,11 @@ class ActiveStage:
         """What the stages after this one have to know of it, once its field is in the archive."""
         return FinishedStage(self.stage, self._call)
 
+    @property
+    def resets_opacities(self) -> bool:
+        """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
+        return self._before is None or not self._options.nested
+
     # What the replaced symbols ask for.
 
     def scene_for(self, gaussians: Any) -> Any:
@@ -225,7 +230,7 @@ class ActiveStage:
         self._hooks.stage_ends(stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
-        finished = self._finish(gaussians, field, self._adapter.carried_over(gaussians), self._moments(gaussians))
+        finished = self._finish(gaussians, field, self._carried(gaussians), self._moments(gaussians))
         if self._joint is not None:
             self._joint.archive_fields()  # before their residual: that one builds on what they are now
         self._archive_level(finished, seconds, memory)
@@ -239,7 +244,10 @@ class ActiveStage:
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.field_path(self.stage.level).with_name(OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
-        carried = {name: torch.nn.Parameter(value.detach().to(self._device)) for name, value in left["carried"].items()}
+        carried = {
+            name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
+            for name, value in left["carried"].items()
+        }
         return self._finish(gaussians, field, carried, left["moments"])
 
     def close(self) -> None:
@@ -315,7 +323,7 @@ class ActiveStage:
         if self._images.test and (self.stage.level == 0 or self._context.test_every is not None):
             with self.overhead.timed("evaluation"):
                 self._report_held_out(gaussians, self.stage.iterations)
-        if self.stage.level > 0:
+        if self.stage.level > 0 and not self._options.nested:
             with self.overhead.timed("cache"):
                 predictions = self._predict(gaussians)
         return Finished(field, predictions, carried, moments)
@@ -340,7 +348,7 @@ class ActiveStage:
         )
         when = {} if elapsed is None else {"elapsed": elapsed}
         self._archive.append_history({"level": self.stage.level, "iteration": iteration, **when, **means})
-        logger.info("held-out PSNR of the composed hierarchy: %.2f dB over %d views", means["psnr"], len(cameras))
+        logger.info("held-out PSNR: %.2f dB over %d views", means["psnr"], len(cameras))
 
     def _whole(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) a view at full resolution, as if every finer residual were zero."""
@@ -363,22 +371,23 @@ class ActiveStage:
             rendering.composed, rendering.capture, rendering.captured = composed, False, None
 
     def _initialise(self, gaussians: Any) -> None:
-        """Points for the base; for a residual the field of the level before."""
+        """Points for the base; for a finer level what is inherited of the field before."""
         points, others = self._loaded.points, self._loaded.others
         if self._before is None:
             gaussians.create_from_pcd(points, *others)
             return
         options = self._options
         generator = torch.Generator().manual_seed(options.seed)
-        field, self._kept = inherit(self._before.field, options.inherit, options.inherit_ratio, generator)
+        mode = options.inheritance
+        field, self._kept = inherit(self._before.field, mode, options.inherit_ratio, generator)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
         gaussians.create_from_pcd(
             type(points)(points=positions, colors=grey, normals=np.zeros_like(positions)), *others
         )
-        if options.inherit != "xyz":
+        if mode != "xyz":
             names = ["_rotation", "_scaling", "_opacity"]
-            if options.inherit == "full":
+            if mode == "full":
                 names += ["_features_dc", "_features_rest"]
             self._adapter.import_field(gaussians, field.to(self._device), names)
         for name, value in self._before.carried.items():
@@ -391,9 +400,14 @@ class ActiveStage:
                     name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
                 }
 
+    def _carried(self, gaussians: Any) -> dict[str, Any]:
+        """Attributes for the next model besides its Gaussians. A residual's SH start again at degree 0."""
+        degree = {"active_sh_degree": gaussians.active_sh_degree} if self._options.nested else {}
+        return {**self._adapter.carried_over(gaussians), **degree}
+
     def _moments(self, gaussians: Any) -> dict[str, dict[str, Tensor]]:
         """Optimizer state by parameter group on the CPU, if the next stage inherits it."""
-        if self._options.inherit != "full" or self.stage.level == 0:
+        if self._options.inheritance != "full" or self.stage.level == 0:
             return {}
         state = {}
         for optimizer in self._adapter.optimizers(gaussians):

@@ -25,7 +25,7 @@ from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.plan import Hierarchy, Stage
 
 logger = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ class BackboneAdapter(ABC):
     def passes_dc_apart(self, call: TrainingCall) -> bool:
         """Whether the checkout's render gives its rasterizer the first SH coefficient by itself."""
 
-    def refuse(self, call: TrainingCall, levels: int) -> None:
+    def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         """Check that a hierarchy can honour the options of this call.
 
         Raises:
@@ -202,10 +202,11 @@ class BackboneAdapter(ABC):
                 f"--start_checkpoint {call.values['checkpoint']}: a checkpoint holds one field, not a hierarchy; "
                 "continue a run of ours with `lapgs run --resume`, or train with `lapgs run --off`"
             )
-        if levels > 1 and getattr(call.opt, "random_background", False):
+        adds = levels > 1 and hierarchy is Hierarchy.LAPLACIAN
+        if adds and getattr(call.opt, "random_background", False):
             raise UserInputError(
                 "--random_background: residual stages build on images rendered over one background; "
-                "leave it out, or train with --levels 1"
+                "leave it out, or train with --levels 1 or --hierarchy nested"
             )
         model = sys.modules[self.train.GaussianModel.__module__]
         if getattr(call.opt, "optimizer_type", "default") == "sparse_adam" and not hasattr(model, SPARSE_ADAM):

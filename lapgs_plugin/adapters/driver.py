@@ -38,12 +38,15 @@ from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.archive import CACHE, Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.plan import StagePlan
+from lapgs_plugin.plan import Hierarchy, StagePlan, parse_hierarchy
 from lapgs_plugin.rendering.rasterizers import RASTER_SETTINGS
 from lapgs_plugin.signed_color import ColorPath, SignedColorRasterizer
 from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
+
+OPACITY_RESET = "reset_opacity"
+"""That method of the family's GaussianModel which is density control and can be left out by itself."""
 
 
 class HierarchyDriver:
@@ -148,7 +151,13 @@ class HierarchyDriver:
             ),
             Replacement(train.Scene, "save", self._make_save, ("self", "iteration"), "training() at --save_iterations"),
             *(
-                Replacement(train.GaussianModel, name, self._make_density_control, ("self",), "training()")
+                Replacement(
+                    train.GaussianModel,
+                    name,
+                    self._make_opacity_reset if name == OPACITY_RESET else self._make_density_control,
+                    ("self",),
+                    "training()",
+                )
                 for name in self._adapter.info.density_control
             ),
         ]
@@ -205,10 +214,21 @@ class HierarchyDriver:
 
         return control
 
+    def _make_opacity_reset(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        control = self._make_density_control(original)
+
+        def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            if self._active is None or self._active.resets_opacities:
+                return control(gaussians, *args, **kwargs)
+            return None
+
+        return reset_opacity
+
     # The run.
 
     def _train(self, call: TrainingCall) -> None:
-        self._adapter.refuse(call, self._options.levels)
+        hierarchy = parse_hierarchy(self._options.hierarchy)
+        self._adapter.refuse(call, self._options.levels, hierarchy)
         folder = Path(call.dataset.model_path or _folder_as_the_checkouts_name_it()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite)
@@ -216,7 +236,11 @@ class HierarchyDriver:
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = self._load_scene(call, Path(scratch))
             plan = StagePlan.create(
-                self._album.smallest_size(), call.opt.iterations, self._options.levels, self._options.shares()
+                self._album.smallest_size(),
+                call.opt.iterations,
+                self._options.levels,
+                self._options.shares(),
+                hierarchy,
             )
             with self._open_archive(folder, self._manifest(call, plan)) as archive:
                 self._context.watcher.run_started(archive)
@@ -264,8 +288,8 @@ class HierarchyDriver:
     def _color_path(self) -> ColorPath:
         """How signed colour is evaluated by the installed rasterizer, found by trying it."""
         extension = CudaExtension(self._adapter.info.rasterizer, self._context.device)
-        if self._options.levels == 1:
-            return ColorPath.NATIVE  # never asked for: the base is not signed
+        if self._options.levels == 1 or self._options.nested:
+            return ColorPath.NATIVE  # never asked for: no field is signed
         return SignedColorRasterizer(extension, checkout=self._adapter.script.checkout).path
 
     def _load_scene(self, call: TrainingCall, scratch: Path) -> LoadedScene:
@@ -363,4 +387,5 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     settings.pop("images_on", None)
-    return {**values, **settings, **backbone}
+    # Runs of the first weeks do not say what all of them were.
+    return {"hierarchy": Hierarchy.LAPLACIAN.value, **values, **settings, **backbone}

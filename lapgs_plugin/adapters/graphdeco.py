@@ -19,7 +19,7 @@ class GraphdecoAdapter(BackboneAdapter):
     """Drives a checkout of the graphdeco repository.
 
     Its render applies the exposure of a view and clamps to [0, 1] after the rasterizer, so both act on the composed
-    image. Depth supervises the base alone: a residual's opacity says where detail is missing, not where surfaces are.
+    image. Depth supervises no residual: a residual's opacity says where detail is missing, not where surfaces are.
     """
 
     info = BackboneInfo(

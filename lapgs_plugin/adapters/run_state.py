@@ -19,7 +19,15 @@ from lapgs_plugin.adapters.shim import RasterizerShim
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS
-from lapgs_plugin.plan import JOINT_SHARE, Stage, check_joint_share, parse_split
+from lapgs_plugin.plan import (
+    JOINT_SHARE,
+    RESIDUAL_COLOR_RATE,
+    Hierarchy,
+    Stage,
+    check_joint_share,
+    parse_hierarchy,
+    parse_split,
+)
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import joint_from, parse_supervision
@@ -34,6 +42,7 @@ class HierarchyOptions:
     """What a user can choose about the hierarchy; everything else is the backbone's.
 
     Attributes:
+        hierarchy: "laplacian", or "nested", where nothing is to be chosen about residuals.
         levels: number of levels; 1 is the plain backbone, archived as a run.
         split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
         grid: of the pyramid.
@@ -51,6 +60,7 @@ class HierarchyOptions:
         UserInputError: one of them is none of what it can be.
     """
 
+    hierarchy: str = Hierarchy.LAPLACIAN.value
     levels: int = 2
     split: str | None = None
     grid: str = "camera"
@@ -58,7 +68,7 @@ class HierarchyOptions:
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
     joint: float = JOINT_SHARE
-    residual_color_rate: float = 4.0
+    residual_color_rate: float = RESIDUAL_COLOR_RATE
     coarse_threshold: float = 1.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
@@ -66,6 +76,7 @@ class HierarchyOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        parse_hierarchy(self.hierarchy)
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         self.shares()
@@ -79,6 +90,33 @@ class HierarchyOptions:
             raise UserInputError(
                 f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
             )
+        if self.nested:
+            self._require_no_residuals()
+
+    def _require_no_residuals(self) -> None:
+        """Refuse what is about residuals, of which nested levels have none."""
+        asked = {
+            "--supervision": (self.supervision, "reconstructed"),
+            "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
+            "--joint": (self.joint, 0.0),
+            "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
+        }
+        for option, (value, default) in asked.items():
+            if value != default:
+                raise UserInputError(
+                    f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
+                    "train a laplacian hierarchy"
+                )
+
+    @property
+    def nested(self) -> bool:
+        """Whether each level trains the field of the coarser one on."""
+        return parse_hierarchy(self.hierarchy) is Hierarchy.NESTED
+
+    @property
+    def inheritance(self) -> str:
+        """What a level starts from, a mode of `inheritance.inherit`."""
+        return "full" if self.nested else self.inherit
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""
@@ -141,7 +179,7 @@ class Finished:
 
     Attributes:
         field: its Gaussians, on the CPU.
-        predictions: Up(I_hat^l) of every view by key; None after the finest level.
+        predictions: Up(I_hat^l) of every view by key; None after the finest level, and where levels are nested.
         carried: attributes for the next model.
         moments: optimizer state by parameter group, for full inheritance.
     """

@@ -13,11 +13,12 @@ from torch import Tensor
 from lapgs_plugin.adapters.attachment import Replacement
 from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import Hierarchy
 
 logger = logging.getLogger(__name__)
 
 BASE_SHARE, FINEST_SHARE = 0.5, 1.0
-"""Share of the budget that the base and the finest residual end with; stages between lie between.
+"""Share of the budget that the coarsest and the finest level end with; stages between lie between.
 
 The base, at a fraction of the pixels, ends with half of it, so that the total work falls. With shares of 0.4 and 0.6
 and opacities frozen half way through each stage, bonsai lost 1.4 dB.
@@ -73,8 +74,8 @@ class TamingAdapter(BackboneAdapter):
     def passes_dc_apart(self, call: TrainingCall) -> bool:
         return bool(call.pipe.separate_sh)
 
-    def refuse(self, call: TrainingCall, levels: int) -> None:
-        super().refuse(call, levels)
+    def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
+        super().refuse(call, levels, hierarchy)
         self._try_lpips(call)
         if levels > 1 and call.values["args"].benchmark_dir:
             raise UserInputError(

@@ -10,7 +10,13 @@ import typer
 
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import JOINT_SHARE
+from lapgs_plugin.plan import (
+    JOINT_SHARE,
+    NESTED_COARSE_THRESHOLD,
+    RESIDUAL_COLOR_RATE,
+    Hierarchy,
+    parse_hierarchy,
+)
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
@@ -49,6 +55,14 @@ def run(
         bool, typer.Option("--resume", help="Continue the run in -m after its last finished level.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -m.")] = False,
+    hierarchy: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="What finer levels are. laplacian: residuals, added to what the coarser levels make, as in the paper. "
+            "nested: the coarser level's field, trained on at the finer size, which makes the whole image alone.",
+        ),
+    ] = Hierarchy.LAPLACIAN.value,
     levels: Annotated[
         int,
         typer.Option(
@@ -73,18 +87,18 @@ def run(
         str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="What the next level starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
+            help="What a residual starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
             "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
         ),
     ] = "geometry",
     joint: Annotated[
-        float,
+        float | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
             help="Share of each residual stage, its last, in which the finished fields are trained along; 0 leaves "
-            "them as they are, as in the paper.",
+            f"them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
         ),
-    ] = JOINT_SHARE,
+    ] = None,
     grid: Annotated[
         str,
         typer.Option(
@@ -94,15 +108,16 @@ def run(
     ] = "camera",
     residual_color_rate: Annotated[
         float, typer.Option(rich_help_panel=HIERARCHY, help="Factor on the SH learning rates of residual stages.")
-    ] = 4.0,
+    ] = RESIDUAL_COLOR_RATE,
     coarse_threshold: Annotated[
-        float,
+        float | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
             help="Factor on the backbone's gradient thresholds for densification, for each time that a level's images "
-            "are halved: above 1 gives coarse levels fewer Gaussians.",
+            "are halved: above 1 gives coarse levels fewer Gaussians. "
+            f"Default: 1, and {NESTED_COARSE_THRESHOLD:g} where levels are nested.",
         ),
-    ] = 1.0,
+    ] = None,
     seed: Annotated[
         int,
         typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),
@@ -173,8 +188,14 @@ def run(
     logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
+    nested = parse_hierarchy(hierarchy) is Hierarchy.NESTED
     mode, ratio = parse_inheritance(inherit)
+    if joint is None:
+        joint = 0.0 if nested else JOINT_SHARE
+    if coarse_threshold is None:
+        coarse_threshold = NESTED_COARSE_THRESHOLD if nested else 1.0
     options = HierarchyOptions(
+        hierarchy=hierarchy,
         levels=levels,
         split=split,
         grid=grid,

@@ -33,6 +33,13 @@ ITERATIONS = 90
 SCHEDULE = ("--eval", "--iterations", ITERATIONS, "--densify_from_iter", 5, "--densification_interval", 5)
 SCHEDULE += ("--densify_until_iter", 60, "--percent_dense", 0.05)
 
+WHITE = ("--white_background", "--densify_from_iter", 0)
+"""Over white, the checkouts reset opacities at the first iteration that densifies; never, if that is 0. In as few
+iterations as here they do not recover before FastGS prunes what is faint."""
+
+NESTED: dict[str, Any] = {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}
+"""Options that `--hierarchy nested` alone stands for."""
+
 
 @dataclass(frozen=True)
 class Stub:

@@ -22,6 +22,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
+    NESTED,
     STUBS,
     Result,
     StopAt,
@@ -178,6 +179,11 @@ def test_any_number_of_levels(name: str, levels: int, scene: Path, big: Path, tm
     archive, _ = run_hierarchy(STUBS[name], big if levels == 3 else scene, folder, *short, levels=levels)
     assert archive.manifest.complete
     assert archive.available_levels == tuple(reversed(range(levels)))
+
+
+def test_three_nested_levels(big: Path, tmp_path: Path) -> None:
+    archive, _ = run_hierarchy(STUBS["fastgs"], big, tmp_path / "run", "--iterations", 60, levels=3, **NESTED)
+    assert [(r.level, r.signed) for r in archive.manifest.records] == [(2, False), (1, False), (0, False)]
 
 
 @pytest.mark.parametrize("supervision", ["online_residual", "gt_laplacian"])

@@ -360,6 +360,55 @@ def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_
     assert not any("Traceback" in line for line in lines)
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--hierarchy", "flat"], "--hierarchy flat: expected laplacian or nested"),
+        *(
+            (
+                ["--hierarchy", "nested", *option.split()],
+                f"{option}: is about residual fields, and --hierarchy nested trains none",
+            )
+            for option in (
+                "--supervision online_residual",
+                "--inherit full:1",
+                "--inherit geometry:0.5",
+                "--joint 0.25",
+                "--residual-color-rate 2.0",
+            )
+        ),
+    ],
+)
+def test_what_nested_levels_cannot_honour_is_refused(
+    words: list[str], message: str, lapgs_run: Any, scene: Path, tmp_path: Path
+) -> None:
+    of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run")
+    code, lines = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
+    assert code == 2
+    (line,) = lines
+    assert line.startswith(f"lapgs: {message}")
+    assert nothing_written(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("words", "joint", "coarse_threshold"), [((), 0.25, 1.0), (("--hierarchy", "nested"), 0.0, 2.0)]
+)
+def test_defaults_go_with_the_hierarchy(
+    words: tuple[str, ...],
+    joint: float,
+    coarse_threshold: float,
+    lapgs_run: Any,
+    scene: Path,
+    tmp_path: Path,
+) -> None:
+    """As the manifest has them."""
+    of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
+    code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
+    assert code == 0
+    settings = RunArchive.open(tmp_path / "run").manifest.settings
+    assert (settings["joint"], settings["coarse_threshold"]) == (joint, coarse_threshold)
+
+
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
     code, lines = lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option", "-m", tmp_path / "run")
     assert code == 2

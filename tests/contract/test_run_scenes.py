@@ -23,7 +23,9 @@ from lapgs_plugin.signed_color import signed_degree
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
+    NESTED,
     STUBS,
+    WHITE,
     StopAt,
     Stub,
     captured,
@@ -34,9 +36,6 @@ from tests.contract.stub_runs import (
 )
 
 SHORT = ("--iterations", 30)
-WHITE = ("--white_background", "--densify_from_iter", 0)
-"""Over white, the checkouts reset opacities at the first iteration that densifies; never, if that is 0. In as few
-iterations as here they do not recover before FastGS prunes what is faint."""
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +146,12 @@ def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
     assert used[0]
     assert not used[-1]
     assert used == sorted(used, reverse=True), "first the base with depths, then the residual without"
+
+
+def test_depths_supervise_every_nested_level(deep: Path, tmp_path: Path) -> None:
+    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths", **NESTED)
+    shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
+    assert min(shown) > 0
 
 
 def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.plan import Stage
-from tests.contract.stub_runs import NAMES, STUBS, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import NAMES, NESTED, STUBS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
@@ -184,6 +184,32 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
     assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
     assert found["step"] == [(n, i) for n in (200, 400) for i in range(1, n)]
     assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
+
+
+@pytest.mark.parametrize("options", [{}, NESTED], ids=["laplacian", "nested"])
+@pytest.mark.parametrize("name", NAMES)
+def test_nested_levels_after_the_first_reset_no_opacities(
+    name: str, options: dict[str, Any], scene: Path, tmp_path: Path
+) -> None:
+    """Neither at the interval nor, over white, where densification may begin."""
+    more = ("--opacity_reset_interval", 8, "--white_background")
+    asked: dict[int, int] = {}
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *more) as adapter:
+        model = adapter.train.GaussianModel
+        setup = model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            self.stage_iterations = training_args.iterations
+            asked[training_args.iterations] = 0
+            setup(self, training_args)
+
+        def reset_opacity(self: Any) -> None:
+            asked[self.stage_iterations] += 1
+
+        model.training_setup, model.reset_opacity = training_setup, reset_opacity
+        drive(adapter, **options)
+    assert asked[30] > 1
+    assert (asked[60] == 0) == bool(options)
 
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:

@@ -1,0 +1,223 @@
+"""Nested levels in a driven run of each stub: what a level starts from, what it renders, what is archived."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters import driver
+from lapgs_plugin.adapters.base import PARAMETERS
+from lapgs_plugin.archive import OPTIMIZER, RunArchive
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.field import GaussianField
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.rendering.rasterizers import rasterizer_for
+from lapgs_plugin.rendering.run import run_scene
+from lapgs_plugin.scenes import load_scene
+from tests.contract.stub_runs import NAMES, NESTED, STUBS, WHITE, StopAt, captured, drive, loaded, run_hierarchy
+
+DEGREE = 2
+"""Of the base's SH when it ends: the checkouts raise it every 1,000 iterations, which no stage here has."""
+
+
+@dataclass
+class State:
+    """Of a checkout's model when an iteration begins."""
+
+    parameters: dict[str, Tensor]
+    moments: dict[tuple[str, str], Tensor]
+    degree: int
+
+    @classmethod
+    def of(cls, model: Any) -> State:
+        optimizers = [model.optimizer, *([model.shoptimizer] if getattr(model, "shoptimizer", None) else [])]
+        moments = {
+            (group["name"], name): value.clone()
+            for optimizer in optimizers
+            for group in optimizer.param_groups
+            for name, value in optimizer.state.get(group["params"][0], {}).items()
+        }
+        parameters = {name: getattr(model, name).detach().clone() for name in PARAMETERS}
+        return cls(parameters, moments, model.active_sh_degree)
+
+
+@dataclass
+class Seen(StageHook):
+    """What a run went through.
+
+    Attributes:
+        starts: at the first iteration of each stage.
+        last: at the last iteration of the base, which neither steps nor densifies.
+        contexts: what hooks were told of the second stage's images.
+        rendered: width, sum of the background and SH degree of all that was rasterized.
+    """
+
+    starts: list[State] = field(default_factory=list)
+    last: State | None = None
+    contexts: list[StageContext] = field(default_factory=list)
+    rendered: set[tuple[int, float, int]] = field(default_factory=set)
+
+    def loss(self, context: StageContext, image: Tensor) -> None:
+        if context.stage.level == 0:
+            self.contexts.append(context)
+
+
+def watch(adapter: Any, seen: Seen) -> None:
+    model = adapter.train.GaussianModel
+    renderer: Any = sys.modules["gaussian_renderer"]
+    update, rasterizer = model.update_learning_rate, renderer.GaussianRasterizer
+
+    def update_learning_rate(self: Any, iteration: int) -> Any:
+        if iteration == 1:
+            seen.starts.append(State.of(self))
+        if len(seen.starts) == 1:
+            self.active_sh_degree = DEGREE
+            if iteration == 30:
+                seen.last = State.of(self)
+        return update(self, iteration)
+
+    def make_rasterizer(raster_settings: Any) -> Any:
+        background = float(raster_settings.bg.sum())
+        seen.rendered.add((raster_settings.image_width, background, raster_settings.sh_degree))
+        return rasterizer(raster_settings=raster_settings)
+
+    model.update_learning_rate = update_learning_rate
+    renderer.GaussianRasterizer = make_rasterizer
+
+
+def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = False, resume: bool = False) -> Seen:
+    seen = Seen()
+    with captured(folder, []), loaded(STUBS[name], scene, folder, *more) as adapter:
+        watch(adapter, seen)
+        drive(adapter, hooks=(seen, *([StopAt(0)] if stop else [])), resume=resume, **NESTED)
+    return seen
+
+
+@pytest.fixture(scope="module")
+def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[RunArchive, Seen]]:
+    """The nested run of a stub over white, made once, on a rasterizer that must not be asked for signed colour."""
+    made: dict[str, tuple[RunArchive, Seen]] = {}
+
+    def unasked(*_: Any, **__: Any) -> None:
+        raise AssertionError("nothing is signed")
+
+    def run(name: str) -> tuple[RunArchive, Seen]:
+        if name not in made:
+            folder = tmp_path_factory.mktemp(name) / "run"
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(driver, "SignedColorRasterizer", unasked)
+                seen = run_watched(name, scene, folder, *WHITE)
+            made[name] = RunArchive.open(folder), seen
+        return made[name]
+
+    return run
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_level_is_a_residual(name: str, run_of: Callable[[str], tuple[RunArchive, Seen]]) -> None:
+    archive, seen = run_of(name)
+    coarse, fine = archive.manifest.records
+    assert (coarse.level, coarse.signed, coarse.image_size) == (1, False, (32, 24))
+    assert (fine.level, fine.signed, fine.image_size) == (0, False, (64, 48))
+    assert not any(archive.field(level).signed for level in (1, 0))
+    assert "cache" not in {*coarse.overhead_seconds, *fine.overhead_seconds}, "nothing predicts"
+    assert archive.manifest.settings["hierarchy"] == "nested"
+    assert seen.rendered == {(32, 3.0, DEGREE), (64, 3.0, DEGREE)}, "over white, and in clamped colours"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_level_goes_on_where_the_coarser_one_ended(
+    name: str, run_of: Callable[[str], tuple[RunArchive, Seen]]
+) -> None:
+    archive, seen = run_of(name)
+    _, start = seen.starts
+    coarse = archive.field(1)
+    for part, of in PARAMETERS.items():
+        assert torch.equal(start.parameters[part], of(coarse)), part
+    assert seen.last is not None
+    assert start.moments.keys() == seen.last.moments.keys()
+    assert {group for group, _ in start.moments} >= {"xyz", "f_dc", "opacity", "scaling", "rotation"}
+    for key, moment in seen.last.moments.items():
+        assert torch.equal(start.moments[key], moment), key
+    assert start.degree == DEGREE
+    assert not archive.path("level_1", OPTIMIZER).exists(), "of no use once the finest level is there"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_images_are_compared_whole(name: str, run_of: Callable[[str], tuple[RunArchive, Seen]], scene: Path) -> None:
+    """The second stage's targets are the photos, and nothing lies below what is rendered."""
+    photos = {Path(view.name).stem: view.image for view in load_scene(scene, progress=False).train}
+    told = run_of(name)[1].contexts
+    assert len(told) == 60
+    for context in told:
+        assert context.accumulated is None
+        assert (context.target - photos[Path(context.view).stem]).abs().max() < 1e-6  # 6e-8 seen
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_finest_field_alone_makes_the_held_out_views(
+    name: str, run_of: Callable[[str], tuple[RunArchive, Seen]]
+) -> None:
+    """Its PLY, rendered by code that knows no checkout, is as good as the history says."""
+    archive, _ = run_of(name)
+    (noted,) = [entry for entry in archive.history() if "psnr" in entry]
+    alone = GaussianField.load_ply(archive.field_path(0))
+    rasterizer = rasterizer_for(archive.manifest, "cpu", archive.manifest.rasterizer).rasterizer
+    white = torch.ones(3)
+    with torch.no_grad():
+        values = [
+            psnr(rasterizer(alone, view.camera, background=white).image, view.image) for view in run_scene(archive).test
+        ]
+    assert sum(values) / len(values) == pytest.approx(noted["psnr"], abs=1e-6)  # 4e-9 seen
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stopped_run_starts_its_finest_level_the_same(
+    name: str, run_of: Callable[[str], tuple[RunArchive, Seen]], scene: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_watched(name, scene, tmp_path / "run", *WHITE, stop=True)
+    (again,) = run_watched(name, scene, tmp_path / "run", *WHITE, resume=True).starts
+    _, start = run_of(name)[1].starts
+    for part, value in start.parameters.items():
+        assert torch.equal(again.parameters[part], value), part
+    assert again.moments.keys() == start.moments.keys()
+    for key, moment in start.moments.items():
+        assert torch.equal(again.moments[key], moment), key
+    assert again.degree == start.degree
+
+
+def test_tamings_budget_is_shared_by_levels_that_go_on(run_of: Callable[[str], tuple[RunArchive, Seen]]) -> None:
+    """300 points times 4: half for the base; the finest level grows from that to the whole. Seen: 580 and 1189."""
+    coarse, fine = (record.num_gaussians for record in run_of("taming")[0].manifest.records)
+    assert 300 < coarse <= 600 < fine <= 1200
+
+
+def test_backgrounds_may_be_random(scene: Path, tmp_path: Path) -> None:
+    """Nothing is composed that was rendered over another one."""
+    more = ("--random_background", "--iterations", 30)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, **NESTED)
+    assert archive.manifest.complete
+
+
+def test_runs_that_do_not_say_their_hierarchy_go_on_as_laplacian(scene: Path, tmp_path: Path) -> None:
+    folder, short = tmp_path / "run", ("--iterations", 30)
+    with pytest.raises(KeyboardInterrupt):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, hooks=(StopAt(0),))
+    manifest = json.loads((folder / MANIFEST).read_text())
+    assert manifest["settings"].pop("hierarchy") == "laplacian"
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(RunFolderError, match=r"started with another hierarchy \('laplacian', now 'nested'\)"):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **NESTED)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True)
+    assert [record.signed for record in archive.manifest.records] == [False, True]
