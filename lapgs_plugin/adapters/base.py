@@ -25,7 +25,7 @@ from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Hierarchy, Stage
+from lapgs_plugin.plan import NESTED_DENSIFY_SHARE, Hierarchy, Stage
 
 logger = logging.getLogger(__name__)
 
@@ -138,6 +138,11 @@ class StageWindow:
     residual_color_rate: float
     coarse_threshold: float
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether the field of the level before is trained on."""
+        return not self.stage.signed and self.stage.level < self.levels - 1
+
     def scaled(self, iterations: int) -> int:
         """A constant of the whole run's schedule, as the same share of this stage."""
         return round(iterations * self.stage.iterations / self.total)
@@ -225,7 +230,8 @@ class BackboneAdapter(ABC):
         dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
-        opt.densify_until_iter = window.scaled(opt.densify_until_iter)
+        share = NESTED_DENSIFY_SHARE if window.goes_on else 1.0
+        opt.densify_until_iter = window.scaled(round(share * opt.densify_until_iter))
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
         for name in self.info.densify_thresholds:
             setattr(opt, name, getattr(opt, name) * window.coarse_threshold**window.stage.level)

@@ -44,7 +44,8 @@ class HierarchyOptions:
     Attributes:
         hierarchy: "laplacian", or "nested", where nothing is to be chosen about residuals.
         levels: number of levels; 1 is the plain backbone, archived as a run.
-        split: share of the iterations of each stage, coarsest first, as text; None takes the paper's.
+        split: share of the iterations of each stage, coarsest first, as text; None takes the paper's, and of nested
+            levels `StagePlan`'s.
         grid: of the pyramid.
         supervision, inherit, inherit_ratio: see their modules.
         joint: share of each residual stage, its last, in which the finished fields are trained along, 0 to 1. Ablations
@@ -126,7 +127,7 @@ class HierarchyOptions:
         """Of the iterations for each stage, coarsest first; None leaves them to `StagePlan`."""
         if self.split is not None:
             return parse_split(self.split)
-        return PAPER_SPLIT if self.levels == len(PAPER_SPLIT) else None
+        return PAPER_SPLIT if self.levels == len(PAPER_SPLIT) and not self.nested else None
 
 
 @dataclass(frozen=True)

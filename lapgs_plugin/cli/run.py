@@ -73,7 +73,7 @@ def run(
         str | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of the iterations of each stage, coarsest first. Two levels: 1/3,2/3.",
+            help="Share of the iterations of each stage, coarsest first. Two levels: 1/3,2/3, nested 1/2,1/2.",
         ),
     ] = None,
     supervision: Annotated[

@@ -39,6 +39,8 @@ iterations as here they do not recover before FastGS prunes what is faint."""
 
 NESTED: dict[str, Any] = {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}
 """Options that `--hierarchy nested` alone stands for."""
+NESTED_LIKE_OTHERS: dict[str, Any] = {**NESTED, "split": "1/3,2/3"}
+"""The same in stages of 30 and 60 iterations."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,17 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.rasterizers import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.scenes import load_scene
-from tests.contract.stub_runs import NAMES, NESTED, STUBS, WHITE, StopAt, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import (
+    NAMES,
+    NESTED_LIKE_OTHERS,
+    STUBS,
+    WHITE,
+    StopAt,
+    captured,
+    drive,
+    loaded,
+    run_hierarchy,
+)
 
 DEGREE = 2
 """Of the base's SH when it ends: the checkouts raise it every 1,000 iterations, which no stage here has."""
@@ -99,7 +109,7 @@ def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = F
     seen = Seen()
     with captured(folder, []), loaded(STUBS[name], scene, folder, *more) as adapter:
         watch(adapter, seen)
-        drive(adapter, hooks=(seen, *([StopAt(0)] if stop else [])), resume=resume, **NESTED)
+        drive(adapter, hooks=(seen, *([StopAt(0)] if stop else [])), resume=resume, **NESTED_LIKE_OTHERS)
     return seen
 
 
@@ -206,7 +216,7 @@ def test_tamings_budget_is_shared_by_levels_that_go_on(run_of: Callable[[str], t
 def test_backgrounds_may_be_random(scene: Path, tmp_path: Path) -> None:
     """Nothing is composed that was rendered over another one."""
     more = ("--random_background", "--iterations", 30)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, **NESTED)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, **NESTED_LIKE_OTHERS)
     assert archive.manifest.complete
 
 
@@ -218,6 +228,6 @@ def test_runs_that_do_not_say_their_hierarchy_go_on_as_laplacian(scene: Path, tm
     assert manifest["settings"].pop("hierarchy") == "laplacian"
     (folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(RunFolderError, match=r"started with another hierarchy \('laplacian', now 'nested'\)"):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **NESTED)
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **NESTED_LIKE_OTHERS)
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True)
     assert [record.signed for record in archive.manifest.records] == [False, True]

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import Stage
-from tests.contract.stub_runs import NAMES, NESTED, STUBS, captured, drive, loaded, run_hierarchy
+from lapgs_plugin.plan import Hierarchy, Stage, StagePlan
+from tests.contract.stub_runs import NAMES, NESTED, NESTED_LIKE_OTHERS, STUBS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
@@ -186,7 +187,21 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
     assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
 
 
-@pytest.mark.parametrize("options", [{}, NESTED], ids=["laplacian", "nested"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Path, tmp_path: Path) -> None:
+    base, finest = StagePlan.create(
+        (800, 533), TOTAL, split=HierarchyOptions(**NESTED).shares(), hierarchy=Hierarchy.NESTED
+    )
+    with loaded(STUBS[name], scene, tmp_path) as adapter:
+        adapter.first_points(1_000)
+        call = published_call(name, adapter)
+        windows = (StageWindow(base, 0, TOTAL, 2, 4.0, 2.0), StageWindow(finest, base.iterations, TOTAL, 2, 4.0, 2.0))
+        stages = [adapter.stage_call(call, window, "run").opt for window in windows]
+    assert [opt.iterations for opt in stages] == [15_000, 15_000]
+    assert [opt.densify_until_iter for opt in stages] == [7_500, 5_000]
+
+
+@pytest.mark.parametrize("options", [{}, NESTED_LIKE_OTHERS], ids=["laplacian", "nested"])
 @pytest.mark.parametrize("name", NAMES)
 def test_nested_levels_after_the_first_reset_no_opacities(
     name: str, options: dict[str, Any], scene: Path, tmp_path: Path
