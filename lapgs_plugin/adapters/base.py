@@ -25,7 +25,7 @@ from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import NESTED_DENSIFY_SHARE, Hierarchy, Stage
+from lapgs_plugin.plan import Hierarchy, Stage, nested_densify_until
 
 logger = logging.getLogger(__name__)
 
@@ -230,8 +230,8 @@ class BackboneAdapter(ABC):
         dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
-        share = NESTED_DENSIFY_SHARE if window.goes_on else 1.0
-        opt.densify_until_iter = window.scaled(round(share * opt.densify_until_iter))
+        until = window.scaled(opt.densify_until_iter)
+        opt.densify_until_iter = nested_densify_until(until) if window.goes_on else until
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
         for name in self.info.densify_thresholds:
             setattr(opt, name, getattr(opt, name) * window.coarse_threshold**window.stage.level)

@@ -26,6 +26,7 @@ from lapgs_plugin.evaluation.comparison import Metrics, comparison_rows, unlike
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 from lapgs_plugin.evaluation.pictures import Strip, make_strip
 from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.plan import Hierarchy
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import HierarchyRenderer
@@ -349,6 +350,7 @@ def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
 def _settings(run: MeasuredRun) -> dict[str, str]:
     """What decides a run's result, by name, flat; and the versions it was measured with."""
     manifest = run.archive.manifest
+    nested = manifest.settings.get("hierarchy") == Hierarchy.NESTED.value
     values: dict[str, Any] = {
         "scene": manifest.scene.path,
         "resolution": manifest.scene.resolution,
@@ -357,7 +359,7 @@ def _settings(run: MeasuredRun) -> dict[str, str]:
         "levels": manifest.levels,
         "grid": manifest.grid,
         "supervision": manifest.supervision,
-        "inherit": manifest.inherit,
+        "inherit": "everything" if nested else manifest.inherit,
         "SH degree": manifest.sh_degree,
         "seed": manifest.seed,
         "rasterizer": manifest.rasterizer,

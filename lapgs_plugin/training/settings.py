@@ -10,10 +10,10 @@ from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.plan import (
     NESTED_COARSE_THRESHOLD,
-    NESTED_DENSIFY_SHARE,
     Hierarchy,
     Stage,
     check_joint_share,
+    nested_densify_until,
     parse_hierarchy,
 )
 from lapgs_plugin.pyramid import Pyramid
@@ -182,8 +182,8 @@ class StageSchedule:
     From `gather_from` on the gradients of `gather` views make one step.
 
     A field that was trained before, in `before` iterations of coarser nested levels, keeps its SH degree and stops
-    densifying at `NESTED_DENSIFY_SHARE` of that. Its opacities are not reset unless the user says when: what resets are
-    for, floaters near the cameras, was done at the coarser size, and recovering takes iterations.
+    densifying earlier (`plan.nested_densify_until`). Its opacities are not reset unless the user says when: what
+    resets are for, floaters near the cameras, was done at the coarser size, and recovering takes iterations.
     """
 
     iterations: int
@@ -208,13 +208,13 @@ class StageSchedule:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
         late = round(stage.iterations * LATE_SHARE)
-        share = NESTED_DENSIFY_SHARE if before else 1.0
         resets = constant(given.reset_every, 3000, 300)
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
+        of_stage = round(until * stage.iterations / settings.iterations)
         return cls(
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),
-            densify_until=round(until * share * stage.iterations / settings.iterations),
+            densify_until=nested_densify_until(of_stage) if before else of_stage,
             densify_every=given.every,
             reset_every=stage.iterations + 1 if before and given.reset_every is None else resets,
             sh_every=constant(settings.sh_every, 1000, 1),

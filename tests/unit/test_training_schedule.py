@@ -106,11 +106,12 @@ def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | N
     assert StageSchedule.create(settings, base).reset_every == (given or 3000)
 
 
-def test_a_nested_field_densifies_for_a_third_of_its_stage() -> None:
-    base, finer = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)
-    settings = TrainSettings(hierarchy="nested")
-    assert StageSchedule.create(settings, base).densify_until == 7500
-    assert StageSchedule.create(settings, finer, before=base.iterations).densify_until == 5000
+@pytest.mark.parametrize(("iterations", "until"), [(30_000, 5000), (20_000, 4000), (7000, 1750)])
+def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, until: int) -> None:
+    base, finer = StagePlan.create((1600, 1066), iterations, hierarchy=Hierarchy.NESTED)
+    settings = TrainSettings(iterations=iterations, hierarchy="nested")
+    assert StageSchedule.create(settings, base).densify_until == iterations // 4
+    assert StageSchedule.create(settings, finer, before=base.iterations).densify_until == until
 
 
 @pytest.mark.parametrize(
