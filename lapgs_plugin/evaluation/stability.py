@@ -137,9 +137,11 @@ def path_frames(
 ) -> Iterable[Frame]:
     """The frames of a hierarchy along a path: its composition, each of its bands, and a single field beside it.
 
-    All are at full size. The depth is that of the single field where there is one, and of the base otherwise.
+    All are at full size. The depth is that of the single field where there is one, otherwise of the finest field that is
+    no residual.
     """
     surface = renderer if single is None else single
+    solid = min(level for level, field in surface.fields.items() if not field.signed)
     for camera in cameras:
         composition = renderer.render(camera)
         coarsest = renderer.levels - 1
@@ -153,7 +155,7 @@ def path_frames(
         images[COMPOSITION] = images[COMPOSITION].clamp(0.0, 1.0)
         if single is not None:
             images[SINGLE] = single.render(camera).composed[0].to(images[COMPOSITION]).clamp(0.0, 1.0)
-        depth = render_depth(surface.rasterizer, surface.field(surface.levels - 1), camera)
+        depth = render_depth(surface.rasterizer, surface.field(solid), camera)
         yield Frame(camera, depth, images)
 
 

@@ -315,7 +315,7 @@ class HierarchyRenderer:
         if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
             found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
             raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
-        nested = self.nested
+        nested, as_trained = self.nested, all(gains.get(each, 1.0) == 1.0 for each in levels)
         weights = {} if nested else gains  # a nested field's image has the coarser bands in it
         renders = self._at_once if self._goes_at_once(cameras, levels, weights) else self._field_by_field
         residuals: dict[int, Tensor] = {}
@@ -332,7 +332,6 @@ class HierarchyRenderer:
                 assert coarser is not None, "the first level was another one"
                 adds = images - self.pyramid.up(coarser, (images.shape[-2], images.shape[-1]))
                 residuals[each] = _times(gains.get(each, 1.0), adds)
-                as_trained = all(gain == 1.0 for gain in gains.values())
                 composed[each] = images if as_trained else add_raised(self.pyramid, composed[each + 1], residuals[each])
             coarser = images
         return Composition(composed[levels[0]], residuals, composed)
