@@ -137,8 +137,8 @@ def path_frames(
 ) -> Iterable[Frame]:
     """The frames of a hierarchy along a path: its composition, each of its bands, and a single field beside it.
 
-    All are at full size. The depth is that of the single field where there is one, otherwise of the finest field that is
-    no residual.
+    All are at full size. The depth is that of the single field where there is one, otherwise of the finest field that
+    is no residual.
     """
     surface = renderer if single is None else single
     solid = min(level for level, field in surface.fields.items() if not field.signed)
