@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
@@ -205,6 +205,23 @@ def parse_split(text: str) -> tuple[Fraction, ...]:
         return tuple(Fraction(part.strip()) for part in text.split(","))
     except (ValueError, ZeroDivisionError) as error:
         raise UserInputError(f"--split {text!r}: expected fractions separated by commas, such as 1/3,2/3") from error
+
+
+def require_no_residuals(given: Mapping[str, tuple[object, object]]) -> None:
+    """Refuse options about residuals, of which nested levels have none.
+
+    Args:
+        given: by option, its value and its default.
+
+    Raises:
+        UserInputError: a value is not the default.
+    """
+    for option, (value, default) in given.items():
+        if value != default:
+            raise UserInputError(
+                f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
+                "train a laplacian hierarchy"
+            )
 
 
 def nested_densify_until(until: int) -> int:

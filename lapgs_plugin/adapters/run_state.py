@@ -27,6 +27,7 @@ from lapgs_plugin.plan import (
     check_joint_share,
     parse_hierarchy,
     parse_split,
+    require_no_residuals,
 )
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
@@ -92,22 +93,14 @@ class HierarchyOptions:
                 f"--prediction-precision {self.prediction_precision}: expected {', '.join(PRECISIONS)}"
             )
         if self.nested:
-            self._require_no_residuals()
-
-    def _require_no_residuals(self) -> None:
-        """Refuse what is about residuals, of which nested levels have none."""
-        asked = {
-            "--supervision": (self.supervision, "reconstructed"),
-            "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
-            "--joint": (self.joint, 0.0),
-            "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
-        }
-        for option, (value, default) in asked.items():
-            if value != default:
-                raise UserInputError(
-                    f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
-                    "train a laplacian hierarchy"
-                )
+            require_no_residuals(
+                {
+                    "--supervision": (self.supervision, "reconstructed"),
+                    "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
+                    "--joint": (self.joint, 0.0),
+                    "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
+                }
+            )
 
     @property
     def nested(self) -> bool:

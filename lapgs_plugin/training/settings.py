@@ -15,6 +15,7 @@ from lapgs_plugin.plan import (
     check_joint_share,
     nested_densify_until,
     parse_hierarchy,
+    require_no_residuals,
 )
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import joint_from, parse_supervision
@@ -112,7 +113,13 @@ class TrainSettings:
             )
         check_joint_share(self.joint)
         if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED:
-            self._require_no_residuals()
+            require_no_residuals(
+                {
+                    "--supervision": (self.supervision, "reconstructed"),
+                    "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
+                    "--joint": (self.joint, 0.0),
+                }
+            )
         factor = self.densification.coarse_threshold
         if factor is not None and not (factor > 0.0 and math.isfinite(factor)):
             raise UserInputError(f"--coarse-threshold {factor}: expected a positive factor")
@@ -120,21 +127,6 @@ class TrainSettings:
             raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
-
-    def _require_no_residuals(self) -> None:
-        """Refuse what is about residuals, of which nested levels have none."""
-        asked = {
-            "--supervision": (self.supervision, "reconstructed"),
-            "--inherit": (self.inherit, "geometry"),
-            "--inherit ratio": (self.inherit_ratio, 1.0),
-            "--joint": (self.joint, 0.0),
-        }
-        for option, (value, default) in asked.items():
-            if value != default:
-                raise UserInputError(
-                    f"{option} {value}: is about residual fields, and --hierarchy nested trains none; leave it out, or "
-                    "train a laplacian hierarchy"
-                )
 
     def densification_of(self, stage: Stage) -> Densification:
         """Density control of a stage: as set, with a threshold for its size."""

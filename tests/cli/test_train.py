@@ -52,7 +52,7 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--grid", "odd"), "expected camera or even"),
         (("--hierarchy", "gaussian"), "--hierarchy gaussian: expected laplacian or nested"),
         (("--hierarchy", "nested", "--joint", "0.5"), "--joint 0.5: is about residual fields"),
-        (("--hierarchy", "nested", "--inherit", "xyz"), "--inherit xyz: is about residual fields"),
+        (("--hierarchy", "nested", "--inherit", "xyz"), "--inherit xyz:1: is about residual fields"),
         (("--hierarchy", "nested", "--supervision", "gt_laplacian"), "--supervision gt_laplacian: is about"),
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
