@@ -191,9 +191,11 @@ class Following:
 
     def keep_preview(self) -> None:
         """Keep what the next viewer of the run begins with, where it is not there and nothing of the run is amiss."""
-        run = self._runs[0]
-        if run.shown is not None and run.problem is None and read_preview(run.archive.path()) is None:
-            keep_preview(run.archive, run.shown, self._start(run.shown))
+        archive, shown = self._runs[0].archive, self._runs[0].shown  # `watch` may replace them meanwhile
+        if shown is None or len(shown.counts) < len(archive.manifest.records):
+            return
+        if read_preview(archive.path()) is None:
+            keep_preview(archive, shown, self._start(shown))
 
     def watch(self, stop: threading.Event) -> None:
         """Show what is new whenever there is something, until `stop` is set."""
