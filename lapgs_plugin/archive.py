@@ -5,6 +5,7 @@
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
+    RUN/preview.jpg                what the viewer shows until it can render
     RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   what is made of it later
 
 Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
@@ -29,6 +30,7 @@ from lapgs_plugin.field import GaussianField, count_gaussians
 from lapgs_plugin.files import (
     LOCK,
     MANIFEST,
+    PREVIEW,
     TEMPORARY_PATTERN,
     FolderLock,
     atomic_write,
@@ -599,7 +601,7 @@ def _is_run(folder: Path) -> bool:
 def _remove_results(folder: Path) -> None:
     """Remove what a former run left, and nothing that a run does not write."""
     _remove_scratch(folder)
-    for name in (HISTORY, METRICS, STABILITY, REPORT):
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW):
         (folder / name).unlink(missing_ok=True)
     for name in (RENDERS, EXPORT):
         if (folder / name).is_dir():

@@ -19,6 +19,9 @@ MANIFEST = "manifest.json"
 BARE_RECORD = "lapgs_record.json"
 """Name of the file in which `lapgs run --off --record` notes what a script's own run took."""
 
+PREVIEW = "preview.jpg"
+"""Name of the picture of a run that the viewer begins with; here because it is read before torch is imported."""
+
 LOCK = ".lock"
 """Name of the file that `FolderLock` locks."""
 

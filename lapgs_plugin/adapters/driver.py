@@ -61,6 +61,9 @@ class HierarchyDriver:
         breakdown: measure the parts of iterations.
         watcher: may look at the fields between iterations; None for nobody.
         test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
+
+    Attributes:
+        folder: of the run, once it is complete.
     """
 
     def __init__(
@@ -93,6 +96,7 @@ class HierarchyDriver:
             test_every=test_every,
         )
         self._active: ActiveStage | None = None
+        self.folder: Path | None = None
 
     def run(self) -> None:
         """Run the main block.
@@ -249,6 +253,7 @@ class HierarchyDriver:
                 finally:
                     # A run that stops in between makes its images again when it goes on.
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
+        self.folder = folder
         logger.info("run folder: %s", folder)
 
     def _run_stages(

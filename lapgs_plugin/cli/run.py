@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
+from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.plan import (
     JOINT_SHARE,
@@ -243,6 +243,8 @@ def run(
                 test_every=test_every,
             )
             driver.run()
+        if driver.folder is not None:
+            keep_preview(driver.folder, chosen)
     except ImportError as error:
         line = None if off else explained(error, str(script))
         if line is None:

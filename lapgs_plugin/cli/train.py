@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, watching
+from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -272,6 +272,7 @@ def train(
             resume=resume,
             watcher=watcher,
         )
+    keep_preview(out.absolute())
     console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
 
 

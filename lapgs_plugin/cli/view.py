@@ -49,8 +49,10 @@ def view(
     require_viser("lapgs view")
     for folder in filter(None, (run, baseline)):
         require_manifest(folder.absolute())
+    from lapgs_plugin.viewer.preview import read_preview
+
     # A browser loads the page while this process imports what draws.
-    with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer") as page:
+    with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run.absolute())) as page:
         from lapgs_plugin.reference_raster.threads import one_pool
 
         show_log()
@@ -75,7 +77,7 @@ def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, dev
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)
     watching.start()
     try:
-        viewer.serve()
+        viewer.serve(at_rest=following.keep_preview)
     finally:
         stop.set()
         watching.join()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,6 +14,8 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.watching import Watcher
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
+
     from lapgs_plugin.viewer.page import Page
 
 HOST, PORT = "127.0.0.1", 8080
@@ -39,15 +42,16 @@ def require_viser(what: str) -> None:
         )
 
 
-def open_page(host: str, port: int, label: str, until: str) -> Page:
+def open_page(host: str, port: int, label: str, until: str, preview: Image | None = None) -> Page:
     """Serve the page, and say where.
 
     Args:
         until: what ends it.
+        preview: what it shows before anything can be rendered.
     """
     from lapgs_plugin.viewer.page import Page
 
-    page = Page(host, port, label)
+    page = Page(host, port, label, preview)
     print(f"open {page.address} in a browser; {until}", flush=True)
     return page
 
@@ -75,3 +79,17 @@ def watching(view: bool, port: int | None, label: str, device: str = "auto") -> 
         from lapgs_plugin.viewer.live import LiveView
 
         yield LiveView(page, device)
+
+
+def keep_preview(run: Path, device: str = "auto") -> None:
+    """Let the viewer begin with a picture of a run that has just been trained. Whatever fails is a line of the log.
+
+    Args:
+        run: its folder.
+        device: where to render.
+    """
+    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.viewer.preview import keep_preview_of
+
+    with one_pool():
+        keep_preview_of(run, device)

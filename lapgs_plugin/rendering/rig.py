@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lapgs_plugin.camera import Camera
@@ -61,6 +62,21 @@ def camera_positions(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 def forward(camera: Camera) -> Vector:
     """Unit vector along the optical axis in world coordinates, (3,)."""
     return np.asarray(_rotation(camera)[2])
+
+
+def looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
+    """A lens that stands at `place` and looks at `at`, with `up` upwards in its image; all (3,) in world units."""
+    ahead = (at - place) / np.linalg.norm(at - place)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    return posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
+
+
+def posed(lens: Camera, rotation: NDArray[np.float64], place: Vector) -> Camera:
+    """A lens with a pose: rotation camera to world, (3, 3), and centre, (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ place
+    return replace(lens, world_to_camera=torch.from_numpy(pose).float())
 
 
 def _rotation(camera: Camera) -> NDArray[np.float64]:

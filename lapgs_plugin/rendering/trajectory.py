@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.rendering.rig import Rig, Vector, camera_positions
+from lapgs_plugin.rendering.rig import Rig, Vector, camera_positions, looking, posed
 
 MAX_KEYS = 24
 """Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
@@ -58,7 +58,7 @@ def orbit(rig: Rig, frames: int) -> list[Camera]:
     lens = _median_lens(rig.cameras)
     angles = 2.0 * math.pi * np.arange(frames) / frames
     places = [centre + radius * (math.cos(angle) * first + math.sin(angle) * second) for angle in angles]
-    return [_looking(lens, place, rig.focus, rig.up) for place in places]
+    return [looking(lens, place, rig.focus, rig.up) for place in places]
 
 
 def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -79,11 +79,11 @@ def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     kept = np.concatenate([[True], np.diff(times) > 0])  # two photos from one tripod
     times, positions, rotations = times[kept], positions[kept], rotations[kept]
     if len(times) == 1:
-        return [_posed(lens, rotations[0], positions[0])] * frames
+        return [posed(lens, rotations[0], positions[0])] * frames
     when = np.linspace(0.0, times[-1], frames)
     places = CubicSpline(times, positions)(when)
     turned = RotationSpline(times, Rotation.from_matrix(rotations))(when).as_matrix()
-    return [_posed(lens, rotation, place) for rotation, place in zip(turned, places, strict=True)]
+    return [posed(lens, rotation, place) for rotation, place in zip(turned, places, strict=True)]
 
 
 def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
@@ -223,19 +223,6 @@ def _times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> ND
 def _median_lens(cameras: Sequence[Camera]) -> Camera:
     """The camera in the middle by field of view; its pose means nothing."""
     return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2]
-
-
-def _looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
-    ahead = _unit(at - place)
-    right = _unit(np.cross(ahead, up))
-    return _posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
-
-
-def _posed(lens: Camera, rotation: NDArray[np.float64], place: Vector) -> Camera:
-    """A lens with a pose: rotation camera to world, (3, 3), and centre, (3,)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ place
-    return replace(lens, world_to_camera=torch.from_numpy(pose).float())
 
 
 def _unit(vector: Vector) -> Vector:

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from lapgs_plugin.archive import RunArchive
@@ -21,11 +20,12 @@ from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
-from lapgs_plugin.viewer.navigation import Pose, Start, start_at, start_outside
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import PictureSettings, ShownRun, draw
+from lapgs_plugin.viewer.preview import keep_preview, read_preview
 from lapgs_plugin.viewer.server import Viewer
 from lapgs_plugin.viewer.session import Exhibit
+from lapgs_plugin.viewer.start import Start, start_at, start_outside
 
 LOOK_SECONDS = 1.0
 """Time between two looks at whether a run has changed."""
@@ -187,9 +187,15 @@ class Following:
         shown = self._runs[0].shown
         if shown is None or self._viewer.watched:
             return
-        start = self._start(shown)
-        pose = Pose(np.array([1.0, 0.0, 0.0, 0.0]), start.position, start.fov)
-        draw(shown, None, pose.camera(32, 32), PictureSettings(), distance=1.0, zoom=1.0)
+        draw(shown, None, self._start(shown).camera(32, 32), PictureSettings(), distance=1.0, zoom=1.0)
+
+    def keep_preview(self) -> None:
+        """Keep what the next viewer of the run begins with, where it is not there and nothing of the run is amiss."""
+        archive, shown = self._runs[0].archive, self._runs[0].shown  # `watch` may replace them meanwhile
+        if shown is None or len(shown.counts) < len(archive.manifest.records):
+            return
+        if read_preview(archive.path()) is None:
+            keep_preview(archive, shown, self._start(shown))
 
     def watch(self, stop: threading.Event) -> None:
         """Show what is new whenever there is something, until `stop` is set."""

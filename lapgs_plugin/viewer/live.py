@@ -21,11 +21,11 @@ from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
-from lapgs_plugin.viewer.navigation import start_at, start_outside
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import ShownRun
 from lapgs_plugin.viewer.server import Viewer
 from lapgs_plugin.viewer.session import Exhibit, Pace
+from lapgs_plugin.viewer.start import start_at, start_outside
 from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)

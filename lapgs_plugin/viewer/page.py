@@ -9,14 +9,19 @@ import contextlib
 import errno
 import io
 import socket
+import threading
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import viser
+from PIL import Image
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.viewer.preview import fitted
 
 PORTS_TRIED = 100
+PREVIEW_QUALITY = 85
 
 
 def free_port(host: str, port: int) -> int:
@@ -51,12 +56,13 @@ class Page:
         host: address to listen on.
         port: where to listen; the next free one where it is taken.
         label: title of the panel.
+        preview: what every client sees until `end_preview`; None leaves the page empty.
 
     Raises:
         UserInputError: as `free_port`.
     """
 
-    def __init__(self, host: str, port: int, label: str) -> None:
+    def __init__(self, host: str, port: int, label: str, preview: Image.Image | None = None) -> None:
         found = free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its addresses; we say one line
             self.server = viser.ViserServer(host=host, port=found, label=label, verbose=False)
@@ -64,7 +70,11 @@ class Page:
         self._host = "localhost" if host in ("0.0.0.0", "127.0.0.1") else host
         # The button would offer the run to the internet by way of somebody else's server.
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
-        self._status: Any = self.server.gui.add_markdown("Starting.")
+        self._status: Any = self.server.gui.add_markdown(
+            "Starting." if preview is None else "As it was when it was trained; loading."
+        )
+        self._preview, self._preview_lock = preview, threading.Lock()
+        self.server.on_client_connect(self._send_preview)
         if self.port != port:
             print(f"port {port} is taken, using {self.port}")
 
@@ -81,6 +91,20 @@ class Page:
     def status(self, text: str) -> None:
         if text != self._status.content:
             self._status.content = text
+
+    def end_preview(self) -> None:
+        """Rendered pictures come from now on: the preview is sent to nobody any more, nor after one of them."""
+        with self._preview_lock:
+            self._preview = None
+
+    def _send_preview(self, client: viser.ClientHandle) -> None:
+        with self._preview_lock:
+            if self._preview is None:
+                return
+            # The browser stretches it to its window. As the client's own picture it is replaced by the next one.
+            image = fitted(self._preview, client.camera.image_width / max(client.camera.image_height, 1))
+            client.scene.set_background_image(np.asarray(image), format="jpeg", jpeg_quality=PREVIEW_QUALITY)
+            client.flush()
 
     def close(self) -> None:
         """Disconnect everybody and free the port."""

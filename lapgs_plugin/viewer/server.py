@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import viser
 
 from lapgs_plugin.rendering.rig import Vector
-from lapgs_plugin.viewer.navigation import Start
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.session import Exhibit, Pace, Session
+from lapgs_plugin.viewer.start import Start
 
 logger = logging.getLogger(__name__)
 
@@ -63,10 +64,19 @@ class Viewer:
             for session in self._sessions.values():
                 session.forget()
 
-    def serve(self, stop: threading.Event | None = None) -> None:
-        """Draw for whoever is connected, until `stop` is set or the process is interrupted."""
+    def serve(self, stop: threading.Event | None = None, at_rest: Callable[[], None] | None = None) -> None:
+        """Draw for whoever is connected, until `stop` is set or the process is interrupted.
+
+        Args:
+            at_rest: called once, when somebody has been drawn for and nobody waits for more.
+        """
+        drawn = False
         while stop is None or not stop.is_set():
-            self.draw_next(patience=0.25)
+            if self.draw_next(patience=0.25):
+                drawn = True
+            elif drawn and at_rest is not None:
+                at_rest()
+                at_rest = None
 
     def draw_next(self, patience: float) -> bool:
         """Draw for who has waited longest; False when nobody wanted a picture for `patience` seconds."""
@@ -82,6 +92,7 @@ class Viewer:
 
     def _draw(self, session: Session) -> None:
         """One client's picture; what goes wrong with it, such as too little memory, ends that client alone."""
+        self._page.end_preview()
         try:
             session.draw()
         except Exception:

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import torch
 import viser
 from numpy.typing import NDArray
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.viewer.controls import Controls
-from lapgs_plugin.viewer.navigation import Pose, Start, turning_distance
+from lapgs_plugin.viewer.navigation import Pose
 from lapgs_plugin.viewer.pacing import TARGET_SECONDS, Pacing
-from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw
+from lapgs_plugin.viewer.start import Start, turning_distance
 
 MAX_SIDE = 2048
 """Longest side of a picture in pixels; the browser stretches it to larger windows."""
@@ -282,10 +282,3 @@ class Session:
             frustum.on_click(partial(self._clicked, index))
             frustums.append(frustum)
         return frustums
-
-
-def as_bytes(image: torch.Tensor) -> NDArray[np.uint8]:
-    """An image of (3, h, w) in [0, 1] as (h, w, 3) pixels of 8 bits."""
-    planes = image.mul(255.0).add_(0.5).to(torch.uint8)
-    # Stacked planes take half the time of a permuted image, whose copy goes from plane to plane for each byte.
-    return np.asarray(torch.stack(planes.unbind(0), dim=-1).cpu().numpy())

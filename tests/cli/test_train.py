@@ -12,6 +12,7 @@ import pytest
 
 from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.viewer.preview import read_preview
 
 SHORT = ("--iterations", "40", "--sh-degree", "1")
 
@@ -33,6 +34,7 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     archive = RunArchive.open(tmp_path / "run")
     assert archive.manifest.complete
+    assert read_preview(tmp_path / "run") is not None
     before = archive.field_path(0).read_bytes()
     again = lapgs("train", scene, "-o", tmp_path / "run", *SHORT)
     assert again.returncode == 2

@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -33,7 +32,7 @@ lapgs_view = succeeding(app, columns=200)
 def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C as soon as the viewer serves."""
 
-    def interrupt(self: Viewer, stop: threading.Event | None = None) -> None:
+    def interrupt(self: Viewer, **_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Viewer, "serve", interrupt)

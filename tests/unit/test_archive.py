@@ -149,7 +149,8 @@ def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> 
         archive.append_history({"level": 0, "iteration": 1})
         archive.save_checkpoint({"x": 1})
         archive.write_metrics({"psnr": 1.0})
-    for name in ("renders/test/a.png", "report.html", "cache/train/000000.bin", "level_1/.point_cloud.ply.9.tmp"):
+    written = ("renders/test/a.png", "report.html", "preview.jpg", "cache/train/000000.bin")
+    for name in (*written, "level_1/.point_cloud.ply.9.tmp"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"ours")
     mine = {"notes.txt": b"mine", "level_1/edited.ply": b"mine", "paper/figure.png": b"mine"}

@@ -1,0 +1,192 @@
+"""The picture that stands on the page before anything can be rendered: whose it is, who gets it, and until when."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.files import PREVIEW
+from lapgs_plugin.rendering.run import run_cameras, run_renderer
+from lapgs_plugin.viewer.preview import SIZE, fitted, keep_preview_of, read_preview
+from tests.cli.run_folder import write_run, write_scene
+
+pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from lapgs_plugin.viewer.following import FollowedRun, Following
+from lapgs_plugin.viewer.page import Page
+from lapgs_plugin.viewer.server import Viewer
+from tests.viewer.wire import WireClient, wire_client
+
+PATIENCE = 20.0
+WINDOW = (320, 240)
+
+# Torch cannot be imported before a file is there.
+COMMAND = """
+import builtins, sys, time
+from pathlib import Path
+gate, plain = Path(sys.argv.pop()), builtins.__import__
+def gated(name, *rest):
+    while name.split(".")[0] == "torch" and not gate.exists():
+        time.sleep(0.01)
+    return plain(name, *rest)
+builtins.__import__ = gated
+from lapgs_plugin.cli import main
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def run(scene: Path, tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run", scene)
+
+
+def decoded(jpeg: bytes) -> NDArray[np.float64]:
+    return np.asarray(Image.open(io.BytesIO(jpeg)), np.float64)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def test_it_is_what_the_first_camera_of_the_scene_sees(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, hold_out=False)  # all around, so that up is up in every image
+    keep_preview_of(run, "cpu")
+    archive = RunArchive.open(run)
+    preview = read_preview(run)
+    assert preview is not None
+    camera = run_cameras(archive)[0]["photos/00.png"]
+    width, height = round(SIZE[1] * camera.width / camera.height), SIZE[1]
+    seen = run_renderer(archive, "cpu").images([camera.resized(width, height)])[0].clamp(0, 1)
+    shown = np.asarray(fitted(preview, width / height), np.float64)
+    # Mean over the picture, 8 bits, for a JPEG; worst seen 0.74.
+    assert np.abs(255 * seen.permute(1, 2, 0).numpy() - shown).mean() < 1.5
+
+
+def test_windows_get_its_middle_at_full_height() -> None:
+    columns = np.tile(np.arange(200, dtype=np.uint8)[None, :, None], (100, 1, 3))
+    image = Image.fromarray(columns)
+    np.testing.assert_array_equal(np.asarray(fitted(image, 1.5)), columns[:, 25:175])
+    wider = np.asarray(fitted(image, 3.0))
+    np.testing.assert_array_equal(wider[:, 50:250], columns)
+    assert wider.shape == (100, 300, 3)
+    assert not wider[:, :50].any()
+
+
+def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -> None:
+    keep_preview_of(run, "cpu")
+    kept, manifest = (run / PREVIEW).read_bytes(), json.loads((run / "manifest.json").read_text())
+    assert read_preview(run) is not None
+    (run / "manifest.json").write_text(json.dumps({**manifest, "created": "2001-01-01T00:00:00+00:00"}))
+    assert read_preview(run) is None
+    (run / "manifest.json").write_text(json.dumps({**manifest, "records": manifest["records"][:1]}))
+    assert read_preview(run) is None
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    for damaged in (kept[: len(kept) // 2], b"", b"\x89PNG", kept[:300]):
+        (run / PREVIEW).write_bytes(damaged)
+        assert read_preview(run) is None
+    (run / "manifest.json").write_text("{")
+    (run / PREVIEW).write_bytes(kept)
+    assert read_preview(run) is None
+    assert read_preview(tmp_path / "nowhere") is None
+
+
+def test_what_cannot_be_kept_is_a_line_of_the_log(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (run / PREVIEW).mkdir()
+    keep_preview_of(run, "cpu")
+    assert [record.levelname for record in caplog.records if "no picture of" in record.message] == ["WARNING"]
+    assert not list(run.glob("*.tmp")) + list(run.glob(".*.tmp"))
+    (run / "level_0" / "point_cloud.ply").unlink()
+    keep_preview_of(run, "cpu")
+    assert "level 0 of" in caplog.messages[-1]
+
+
+def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
+    stop = threading.Event()
+    with Page("127.0.0.1", 8960, "run") as page:
+        viewer = Viewer(page)
+        following = Following(viewer, page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following.begin()
+        serving = threading.Thread(target=viewer.serve, args=(stop, following.keep_preview))
+        serving.start()
+        try:
+            time.sleep(0.6)  # twice the patience of the thread that draws
+            assert read_preview(run) is None
+            with wire_client(page.address, WINDOW) as client:
+                assert client.listen(PATIENCE, pictures=1) == 1
+                wait_for(lambda: read_preview(run) is not None)
+        finally:
+            stop.set()
+            serving.join()
+    kept = (run / PREVIEW).read_bytes()
+    keep_preview_of(run, "cpu")
+    assert (run / PREVIEW).read_bytes() == kept
+
+
+def test_a_damaged_run_leaves_none(run: Path) -> None:
+    ply = run / "level_0" / "point_cloud.ply"
+    ply.write_bytes(ply.read_bytes()[:-1000])
+    with Page("127.0.0.1", 8965, "run") as page:
+        following = Following(Viewer(page), page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following.begin()
+        following.keep_preview()
+    assert not (run / PREVIEW).exists()
+
+
+@pytest.fixture
+def gated(run: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """The address of `lapgs view` in a process that cannot import torch yet, and the file that lets it."""
+    gate = tmp_path / "gate"
+    command = [sys.executable, "-c", COMMAND, "view", str(run), "--device", "cpu", "--port", "8970", str(gate)]
+    keep_preview_of(run, "cpu")
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline().split()[1], gate
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_it_comes_before_torch_and_goes_with_the_first_picture(run: Path, gated: tuple[str, Path]) -> None:
+    address, gate = gated
+    with Image.open(run / PREVIEW) as stored:
+        middle = np.asarray(stored, np.float64)[:, 200:1000]  # 4:3 of 1200x600
+
+    def gets_it(client: WireClient) -> None:
+        assert client.listen(PATIENCE, pictures=1) == 1
+        # Mean over the picture, 8 bits, for a JPEG of a JPEG; worst seen 0.51.
+        assert np.abs(decoded(client.pictures[0][1]) - middle).mean() < 1.0
+        assert "As it was when it was trained; loading." in client.words
+
+    with wire_client(address, WINDOW) as first, wire_client(address, WINDOW) as second:
+        gets_it(first)
+        gets_it(second)
+        gate.touch()
+        for client in (first, second):
+            wait_for(lambda client=client: client.listen(0.5) == 0 and len(client.pictures) > 1)  # type: ignore[misc]
+            sizes = [decoded(jpeg).shape[:2] for _, jpeg in client.pictures]
+            assert sizes.count(middle.shape[:2]) == 1
+            assert sizes[-1] == WINDOW[::-1]
+    with wire_client(address, WINDOW) as later:
+        assert later.listen(PATIENCE, pictures=1) == 1
+        assert decoded(later.pictures[0][1]).shape[0] <= WINDOW[1]
