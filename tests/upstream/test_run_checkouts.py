@@ -47,7 +47,7 @@ def bare(variable: str, scene: Path, folder: Path) -> Done:
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_two_levels(variable: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    done = run(variable, scene, tmp_path / "run", "--hierarchy", hierarchy)
+    done = run(variable, scene, tmp_path / "run", "--hierarchy", hierarchy, "--split", "1/3,2/3")
     archive = RunArchive.open(done.folder)
     assert [record.image_size for record in archive.manifest.records] == [(60, 40), (120, 80)]
     assert [record.signed for record in archive.manifest.records] == [False, hierarchy == "laplacian"]
