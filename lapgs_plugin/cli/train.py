@@ -56,9 +56,9 @@ def train(
         str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="laplacian (a base and residuals that are added up, as in the paper) or nested (each level trains the "
-            "coarser one's field on at its own size; the last one renders alone: as fast as a single field, nearly its "
-            "quality, less of the time saved).",
+            help="laplacian (a base and residuals that are added up, as in the paper) or nested (each level trains "
+            "the coarser one's field on at its own size, and the last one renders alone: as fast as a single field "
+            "and about as good; residuals save more time where images are large).",
         ),
     ] = "laplacian",
     supervision: Annotated[
@@ -317,9 +317,8 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         **{
             name: getattr(settings, name)
             for name in (
-                *("iterations", "levels", "hierarchy", "split", "supervision", "grid", "joint", "gather", "sh_degree"),
-                "seed",
-                *("packed", "sparse_adam"),
+                *("iterations", "levels", "hierarchy", "split", "supervision", "grid", "joint", "gather"),
+                *("sh_degree", "seed", "packed", "sparse_adam"),
             )
         },
     }
