@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from lapgs_plugin.experiments import store as store_module
 from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MOST_CLAIMS, PENDING, RUNNING, ResultStore
 from lapgs_plugin.experiments.worker import work
 from tests.experiments.examples import COPY, START, copying_jobs
+from tests.waiting import wait_for
 
 WORKER = "import sys; from pathlib import Path; from lapgs_plugin.experiments.worker import work; "
 WORKER += "print(work(Path(sys.argv[1]), sys.argv[2:]))"
@@ -26,13 +26,6 @@ WORKER += "print(work(Path(sys.argv[1]), sys.argv[2:]))"
 
 def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", WORKER, str(store), *run_ids], stdout=subprocess.DEVNULL)
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 30.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.05)
 
 
 def starts(folder: Path) -> Counter[str]:
@@ -75,11 +68,11 @@ def test_a_killed_worker_costs_one_run_its_first_attempt(tmp_path: Path) -> None
     store = ResultStore.create(path)
     store.plan(jobs)
     doomed = start_worker(path, run_ids)
-    wait_until(lambda: (tmp_path / "started-pid").exists() and (tmp_path / "started-pid").read_text() != "")
+    wait_for(lambda: (tmp_path / "started-pid").exists() and (tmp_path / "started-pid").read_text() != "")
     child = int((tmp_path / "started-pid").read_text())
     doomed.send_signal(signal.SIGKILL)
     doomed.wait()
-    wait_until(lambda: not Path(f"/proc/{child}").exists() if sys.platform == "linux" else True)
+    wait_for(lambda: not Path(f"/proc/{child}").exists() if sys.platform == "linux" else True)
     assert work(path, run_ids) == len(run_ids), "what the dead worker held is taken over"
     assert [outcome.state for outcome in store.outcomes(run_ids)] == [DONE] * len(run_ids)
     first, *others = run_ids
@@ -189,7 +182,7 @@ def test_stopping_kills_the_run_and_gives_it_back(tmp_path: Path) -> None:
     stop = threading.Event()
     thread = threading.Thread(target=work, args=(path, run_ids, None, stop))
     thread.start()
-    wait_until(lambda: bool(starts(tmp_path)))
+    wait_for(lambda: bool(starts(tmp_path)))
     stop.set()
     thread.join(timeout=10)
     assert not thread.is_alive()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
 from lapgs_plugin.viewer import following
 from lapgs_plugin.viewer.following import FollowedRun, Following
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -164,13 +164,6 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
     assert len(viewer.shown[0].cameras) == 10
     assert viewer.starts == 1
     assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in 30 s"
-        time.sleep(0.01)
 
 
 def test_without_a_level_to_show_damage_is_an_error(scene: Path, tmp_path: Path) -> None:

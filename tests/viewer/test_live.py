@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import threading
-import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,8 +26,10 @@ from lapgs_plugin.viewer.live import LiveView
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.server import Viewer
 from tests.viewer.wire import WireClient, wire_client
+from tests.waiting import wait_for as wait_so_long
 
 PATIENCE = 60.0
+wait_for = partial(wait_so_long, seconds=PATIENCE)
 
 
 @pytest.fixture
@@ -82,13 +84,6 @@ def watched_run(
         thread.join(PATIENCE)
     assert len(result) == 1, "training did not come to its end"
     return result[0]
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.01)
 
 
 def same_bits(one: RunArchive, other: RunArchive) -> bool:

@@ -8,7 +8,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,10 @@ from lapgs_plugin.viewer.following import FollowedRun, Following
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.server import Viewer
 from tests.viewer.wire import WireClient, wire_client
+from tests.waiting import wait_for as wait_so_long
 
 PATIENCE = 20.0
+wait_for = partial(wait_so_long, seconds=PATIENCE)
 WINDOW = (320, 240)
 
 # Torch cannot be imported before a file is there.
@@ -59,13 +62,6 @@ def run(scene: Path, tmp_path: Path) -> Path:
 
 def decoded(jpeg: bytes) -> NDArray[np.float64]:
     return np.asarray(Image.open(io.BytesIO(jpeg)), np.float64)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
 
 
 def test_it_is_what_the_first_camera_of_the_scene_sees(scene: Path, tmp_path: Path) -> None:
