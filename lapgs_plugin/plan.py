@@ -224,6 +224,18 @@ def require_no_residuals(given: Mapping[str, tuple[object, object]]) -> None:
             )
 
 
+def goes_on(stage: Stage, levels: int) -> bool:
+    """Whether a stage of so many levels trains the field of the stage before on."""
+    return not stage.signed and stage.level < levels - 1
+
+
+def coarse_factor(given: float | None, hierarchy: Hierarchy) -> float:
+    """What thresholds for densification are multiplied by for each halving: as given, or by the hierarchy if None."""
+    if given is not None:
+        return given
+    return NESTED_COARSE_THRESHOLD if hierarchy is Hierarchy.NESTED else 1.0
+
+
 def nested_densify_until(until: int) -> int:
     """The last iteration in which a field that goes on densifies, where its stage otherwise would until `until`.
 

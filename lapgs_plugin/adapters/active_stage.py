@@ -111,7 +111,7 @@ class ActiveStage:
     @property
     def resets_opacities(self) -> bool:
         """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
-        return self._before is None or not self._options.nested
+        return not self.window.goes_on
 
     # What the replaced symbols ask for.
 

@@ -25,7 +25,7 @@ from lapgs_plugin.adapters.level_views import make_level_view
 from lapgs_plugin.adapters.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Hierarchy, Stage, nested_densify_until
+from lapgs_plugin.plan import Hierarchy, Stage, goes_on, nested_densify_until
 
 logger = logging.getLogger(__name__)
 
@@ -141,7 +141,7 @@ class StageWindow:
     @property
     def goes_on(self) -> bool:
         """Whether the field of the level before is trained on."""
-        return not self.stage.signed and self.stage.level < self.levels - 1
+        return goes_on(self.stage, self.levels)
 
     def scaled(self, iterations: int) -> int:
         """A constant of the whole run's schedule, as the same share of this stage."""

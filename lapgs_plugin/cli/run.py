@@ -15,6 +15,7 @@ from lapgs_plugin.plan import (
     NESTED_COARSE_THRESHOLD,
     RESIDUAL_COLOR_RATE,
     Hierarchy,
+    coarse_factor,
     parse_hierarchy,
 )
 
@@ -188,12 +189,10 @@ def run(
     logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
-    nested = parse_hierarchy(hierarchy) is Hierarchy.NESTED
+    kind_of_levels = parse_hierarchy(hierarchy)
     mode, ratio = parse_inheritance(inherit)
     if joint is None:
-        joint = 0.0 if nested else JOINT_SHARE
-    if coarse_threshold is None:
-        coarse_threshold = NESTED_COARSE_THRESHOLD if nested else 1.0
+        joint = 0.0 if kind_of_levels is Hierarchy.NESTED else JOINT_SHARE
     options = HierarchyOptions(
         hierarchy=hierarchy,
         levels=levels,
@@ -204,7 +203,7 @@ def run(
         inherit_ratio=ratio,
         joint=joint,
         residual_color_rate=residual_color_rate,
-        coarse_threshold=coarse_threshold,
+        coarse_threshold=coarse_factor(coarse_threshold, kind_of_levels),
         images_on=images_on,
         prediction_precision=prediction_precision,
         fused_adam=fused_adam,

@@ -9,10 +9,10 @@ from typing import Any
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.plan import (
-    NESTED_COARSE_THRESHOLD,
     Hierarchy,
     Stage,
     check_joint_share,
+    coarse_factor,
     nested_densify_until,
     parse_hierarchy,
     require_no_residuals,
@@ -130,9 +130,7 @@ class TrainSettings:
 
     def densification_of(self, stage: Stage) -> Densification:
         """Density control of a stage: as set, with a threshold for its size."""
-        factor = self.densification.coarse_threshold
-        if factor is None:
-            factor = NESTED_COARSE_THRESHOLD if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED else 1.0
+        factor = coarse_factor(self.densification.coarse_threshold, parse_hierarchy(self.hierarchy))
         return replace(self.densification, grow_grad2d=self.densification.grow_grad2d * factor**stage.level)
 
     def joint_from(self, stage: Stage) -> int | None:

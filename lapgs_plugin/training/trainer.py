@@ -22,7 +22,7 @@ from lapgs_plugin.imagestore import ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.peak_memory import PeakMemory
-from lapgs_plugin.plan import Hierarchy, Stage, StagePlan, parse_hierarchy, parse_split
+from lapgs_plugin.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.raster import Rasterizer, render_image
 from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
@@ -201,7 +201,7 @@ class Trainer:
         if checkpoint is not None:
             return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
         with self._overhead.timed("inheritance"):
-            if self._goes_on(stage):
+            if goes_on(stage, self.plan.levels):
                 field = self.archive.field(stage.level + 1)
                 model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
@@ -220,17 +220,13 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
-    def _goes_on(self, stage: Stage) -> bool:
-        """Whether a stage trains the field of the one before on."""
-        return self.plan.hierarchy is Hierarchy.NESTED and stage.level < self.plan.levels - 1
-
     def _heir_wants_moments(self, stage: Stage) -> bool:
         """Whether the stage after this one goes on with Adam's state."""
         return stage.level > 0 and (self.plan.hierarchy is Hierarchy.NESTED or self.settings.inherit == "full")
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
-        schedule = StageSchedule.create(self.settings, stage, coarser if self._goes_on(stage) else 0)
+        schedule = StageSchedule.create(self.settings, stage, coarser if goes_on(stage, self.plan.levels) else 0)
         if self._images is not None:
             self._images.close()
         with self._overhead.timed("pyramid"):
