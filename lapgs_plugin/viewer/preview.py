@@ -77,13 +77,14 @@ def keep_preview_of(run: Path, device: str = "auto") -> None:
         run: its folder.
         device: where to render, as `rasterizer_for` takes it.
     """
-    from lapgs_plugin.archive import RunArchive
-    from lapgs_plugin.rendering.rig import Rig
-    from lapgs_plugin.rendering.run import run_cameras, run_renderer
-    from lapgs_plugin.viewer.pictures import ShownRun
-    from lapgs_plugin.viewer.start import start_at
-
     try:
+        # In here: a backbone's environment may lack OpenImageIO, say, and has trained all the same.
+        from lapgs_plugin.archive import RunArchive
+        from lapgs_plugin.rendering.rig import Rig
+        from lapgs_plugin.rendering.run import run_cameras, run_renderer
+        from lapgs_plugin.viewer.pictures import ShownRun
+        from lapgs_plugin.viewer.start import start_at
+
         archive = RunArchive.open(run)
         train, test = run_cameras(archive)
         rig = Rig.of(list(train.values()))

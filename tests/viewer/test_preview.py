@@ -106,7 +106,9 @@ def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -
     assert read_preview(tmp_path / "nowhere") is None
 
 
-def test_what_cannot_be_kept_is_a_line_of_the_log(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_cannot_be_kept_is_a_line_of_the_log(
+    run: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (run / PREVIEW).mkdir()
     keep_preview_of(run, "cpu")
     assert [record.levelname for record in caplog.records if "no picture of" in record.message] == ["WARNING"]
@@ -114,6 +116,9 @@ def test_what_cannot_be_kept_is_a_line_of_the_log(run: Path, caplog: pytest.LogC
     (run / "level_0" / "point_cloud.ply").unlink()
     keep_preview_of(run, "cpu")
     assert "level 0 of" in caplog.messages[-1]
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.run", None)  # importing it fails
+    keep_preview_of(run, "cpu")
+    assert "rendering.run" in caplog.messages[-1]
 
 
 def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
