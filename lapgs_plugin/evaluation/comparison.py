@@ -67,7 +67,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
-        ("num_gaussians", "Gaussians, all levels", "{:,.0f}", _ratio),
+        ("num_gaussians", "Gaussians to render", "{:,.0f}", _ratio),
         ("weighted_gaussians", "Gaussians, mean of levels by iterations", "{:,.0f}", _ratio),
         ("mean_gaussians", "Gaussians at once, mean of iterations", "{:,.0f}", _ratio),
         ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),

@@ -18,8 +18,9 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     Keys:
         train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
         breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
-        num_gaussians: by level; peak_gaussians: the most that were optimized at once.
-        weighted_gaussians: num_gaussians weighted by the levels' iterations, as the paper's plot of time against count.
+        num_gaussians: by level, of the fields that the finest picture is rendered from: of nested levels the last.
+        peak_gaussians: the most that were optimized at once.
+        weighted_gaussians: those of every level weighted by its iterations, as the paper's plot of time against count.
         mean_gaussians: those being optimized, mean over all iterations; None when not recorded.
         peak_memory_bytes, peak_memory_without_images_bytes: of the GPU in training, the highest stage; None on a CPU.
     """
@@ -31,13 +32,18 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
         "train_seconds": math.fsum(record.train_seconds for record in records),
         "overhead_seconds": _sums(record.overhead_seconds for record in records),
         "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
-        "num_gaussians": {str(record.level): record.num_gaussians for record in records},
+        "num_gaussians": {str(record.level): record.num_gaussians for record in _rendered(records)},
         "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
         "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
         "peak_gaussians": max(record.peak_gaussians for record in records),
         "peak_memory_bytes": max((each["peak"] for each in memory), default=None),
         "peak_memory_without_images_bytes": max((each["peak"] - each["images"] for each in memory), default=None),
     }
+
+
+def _rendered(records: Sequence[LevelRecord]) -> Sequence[LevelRecord]:
+    """The last field that makes an image by itself, and the residuals that are added to it."""
+    return records[max((index for index, record in enumerate(records) if not record.signed), default=0) :]
 
 
 def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:

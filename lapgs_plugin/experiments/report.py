@@ -40,7 +40,7 @@ COLORS = 8
 COUNTS = {
     "weighted_gaussians": "Gaussians, mean of levels by iterations",
     "mean_gaussians": "Gaussians at once, mean of iterations",
-    "gaussians": "Gaussians, all levels",
+    "gaussians": "Gaussians to render",
 }
 """Columns that say how many Gaussians there were: the first that all rows have is charted."""
 

@@ -5,8 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from lapgs_plugin.archive import Manifest, SceneReference
+import pytest
+
+from lapgs_plugin.archive import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.evaluation.comparison import Cell, comparison_rows, unlike
+from lapgs_plugin.evaluation.training_figures import training_figures
+from lapgs_plugin.plan import Hierarchy, StagePlan
+from tests.training_scene import blob_field
 
 
 def metrics(**changes: Any) -> dict[str, Any]:
@@ -39,6 +44,16 @@ BASELINE = metrics(
     peak_gaussians=3_000_000,
     fps=120.0,
 )
+
+
+@pytest.mark.parametrize(
+    ("hierarchy", "rendered"),
+    [(Hierarchy.LAPLACIAN, {"2": 12, "1": 11, "0": 10}), (Hierarchy.NESTED, {"0": 10})],
+)
+def test_gaussians_are_those_that_an_image_takes(hierarchy: Hierarchy, rendered: dict[str, int]) -> None:
+    plan = StagePlan.create((320, 240), 60, 3, hierarchy=hierarchy)
+    records = [LevelRecord.of(stage, blob_field(10 + stage.level)) for stage in plan]
+    assert training_figures(records)["num_gaussians"] == rendered
 
 
 def test_rows_of_a_run_and_its_baseline() -> None:
