@@ -28,6 +28,7 @@ from lapgs_plugin.field import GaussianField
 from lapgs_plugin.inheritance import inherit
 from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.peak_memory import PeakMemory
+from lapgs_plugin.pruning import blended_pixels, least_blended
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.signed_color import ColorPath
@@ -152,6 +153,8 @@ class ActiveStage:
             elapsed = self._elapsed()
             with self.outside("evaluation"):
                 self._report_held_out(gaussians, iteration - 1, elapsed)
+        if self._options.prune and iteration == self._densified_before:
+            self._prune(gaussians)
         if iteration == self._joint_from:
             self._train_jointly(gaussians)
         self._iteration = iteration
@@ -164,6 +167,42 @@ class ActiveStage:
             self._archive.append_history(
                 {"level": self.stage.level, "iteration": iteration, "elapsed": self._elapsed(), "num_gaussians": count}
             )
+
+    @property
+    def _densified_before(self) -> int | None:
+        """The first iteration without densification after those with; None where it is not in this stage."""
+        opt = self._call.opt
+        return opt.densify_until_iter if opt.densify_from_iter < opt.densify_until_iter < opt.iterations else None
+
+    def _prune(self, gaussians: Any) -> None:
+        """Remove what training views hardly see, as the checkout removes Gaussians."""
+        self._context.parts.breakdown.mark("densification")
+        pixels = self._blended_pixels(gaussians)
+        gaussians.tmp_radii = gaussians.max_radii2D  # some prune it as well, though it matters while they densify alone
+        with torch.no_grad():
+            gaussians.prune_points(least_blended(pixels, self._options.prune))
+        gaussians.tmp_radii = None
+        self.densified(gaussians)
+        self._context.parts.breakdown.mark("other")
+
+    def _blended_pixels(self, gaussians: Any) -> Tensor:
+        """(n,) `pruning.blended_pixels` of the field under training."""
+        alone = StageRendering(signed=False, path=self._path, views={}, capture=True)
+        background = torch.zeros(3, device=self._device)
+        colors, degree = gaussians._features_dc, gaussians.active_sh_degree
+        grey = torch.nn.Parameter(torch.zeros_like(colors))
+
+        def image(camera: Any) -> Tensor:
+            self._adapter.render(self._call, self._view(camera), gaussians, background)
+            assert alone.captured is not None
+            return alone.captured
+
+        try:
+            self._context.shim.stage, gaussians._features_dc, gaussians.active_sh_degree = alone, grey, 0
+            return blended_pixels((image(camera) for camera in self._images.train), grey)
+        finally:
+            self._context.shim.stage = self._rendering
+            gaussians._features_dc, gaussians.active_sh_degree = colors, degree
 
     def _train_jointly(self, gaussians: Any) -> None:
         """From now on the finished fields learn as well, and what they predict is rendered."""

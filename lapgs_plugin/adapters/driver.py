@@ -393,4 +393,4 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     settings.pop("images_on", None)
     # Runs of the first weeks do not say what all of them were.
-    return {"hierarchy": Hierarchy.LAPLACIAN.value, **values, **settings, **backbone}
+    return {"hierarchy": Hierarchy.LAPLACIAN.value, "prune": 0.0, **values, **settings, **backbone}

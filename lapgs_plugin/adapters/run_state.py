@@ -29,6 +29,7 @@ from lapgs_plugin.plan import (
     parse_split,
     require_no_residuals,
 )
+from lapgs_plugin.pruning import check_prune_share
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import joint_from, parse_supervision
@@ -53,6 +54,8 @@ class HierarchyOptions:
             that supervise residuals alone have no use for it: nothing is composed there.
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
         coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
+        prune: share of all blending that the Gaussians make up together which are removed when a stage's densification
+            ends; 0 for none.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
         prediction_precision: what cached predictions are stored as before Up, a key of `imagestore.PRECISIONS`.
         fused_adam: let PyTorch's Adam step each tensor in one kernel.
@@ -72,6 +75,7 @@ class HierarchyOptions:
     joint: float = JOINT_SHARE
     residual_color_rate: float = RESIDUAL_COLOR_RATE
     coarse_threshold: float = 1.0
+    prune: float = 0.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
     fused_adam: bool = True
@@ -83,6 +87,7 @@ class HierarchyOptions:
         Pyramid(self.grid)
         self.shares()
         check_joint_share(self.joint)
+        check_prune_share(self.prune)
         for name in ("residual_color_rate", "coarse_threshold"):
             if (factor := getattr(self, name)) <= 0 or not math.isfinite(factor):
                 raise UserInputError(f"--{name.replace('_', '-')} {factor}: expected a positive factor")

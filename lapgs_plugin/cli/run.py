@@ -119,6 +119,14 @@ def run(
             f"Default: 1, and {NESTED_COARSE_THRESHOLD:g} where levels are nested.",
         ),
     ] = None,
+    prune: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help="When a stage's densification ends, remove the Gaussians least seen, as many as make up this share of "
+            "all blending together: 0.005 takes about a fifth of them.",
+        ),
+    ] = 0.0,
     seed: Annotated[
         int,
         typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),
@@ -204,6 +212,7 @@ def run(
         joint=joint,
         residual_color_rate=residual_color_rate,
         coarse_threshold=coarse_factor(coarse_threshold, kind_of_levels),
+        prune=prune,
         images_on=images_on,
         prediction_precision=prediction_precision,
         fused_adam=fused_adam,

@@ -119,6 +119,14 @@ def train(
         ),
     ] = None,
     densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
+    prune: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="When densification ends, remove the Gaussians least seen, as many as make up this share of all "
+            "blending together: 0.005 takes about a fifth of them.",
+        ),
+    ] = 0.0,
     opacity_reset_every: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
     ] = None,
@@ -245,6 +253,7 @@ def train(
             absgrad=absgrad,
             cap_max=cap_max,
             coarse_threshold=coarse_threshold,
+            prune=prune,
             **({"grow_grad2d": ABSGRAD_THRESHOLD} if absgrad else {}),
         ),
         packed=packed,
@@ -309,6 +318,7 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         "densify_until": densification.until,
         "densify_every": densification.every,
         "coarse_threshold": densification.coarse_threshold,
+        "prune": densification.prune,
         "opacity_reset_every": densification.reset_every,
         "strategy": densification.strategy,
         "cap_max": densification.cap_max,

@@ -17,6 +17,7 @@ from lapgs_plugin.plan import (
     parse_hierarchy,
     require_no_residuals,
 )
+from lapgs_plugin.pruning import check_prune_share
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import joint_from, parse_supervision
 
@@ -72,6 +73,7 @@ class Densification:
     strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
     absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
     cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
+    prune: float = 0.0  # share of all blending that those make up together which are removed when densification ends
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,9 @@ class TrainSettings:
         factor = self.densification.coarse_threshold
         if factor is not None and not (factor > 0.0 and math.isfinite(factor)):
             raise UserInputError(f"--coarse-threshold {factor}: expected a positive factor")
+        check_prune_share(self.densification.prune)
+        if self.densification.prune and self.densification.strategy == "mcmc":
+            raise UserInputError("--prune with --strategy mcmc: it moves Gaussians that are not seen; leave one out")
         if self.gather < 1:
             raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
@@ -158,7 +163,7 @@ class TrainSettings:
                 f"match); continue it with {manifest.created_by}"
             )
         values["learning_rates"] = LearningRates(**values["learning_rates"])
-        values["densification"] = Densification(**{"coarse_threshold": None, **values["densification"]})
+        values["densification"] = Densification(**{"coarse_threshold": None, "prune": 0.0, **values["densification"]})
         values["split"] = None if values["split"] is None else tuple(values["split"])
         return cls(**values)
 
@@ -220,6 +225,12 @@ class StageSchedule:
         """Whether the optimizers step after this iteration."""
         late = iteration - self.gather_from + 1
         return late < 1 or late % self.gather == 0 or iteration == self.iterations
+
+    @property
+    def prunes_after(self) -> int | None:
+        """The first iteration with a step since densification has ended; None without one, or with none after it."""
+        ends = range(self.densify_until, self.iterations if self.densify_until > self.densify_start else 0)
+        return next((iteration for iteration in ends if self.steps(iteration)), None)
 
     def means_learning_rate(self, iteration: int) -> float:
         """Log-linear decay from the first iteration to the last, in units of the scene's extent."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from lapgs_plugin.breakdown import Breakdown, breakdown_on
@@ -16,6 +17,7 @@ from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.plan import Stage
+from lapgs_plugin.pruning import blended_pixels, least_blended
 from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.training.densification import DensityControl
@@ -213,9 +215,22 @@ class StageRun:
             self.accumulated.announce(name)
 
     def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
-        if self.densifier.after_step(self.model, context.iteration, result, view.camera):
+        changed = self.densifier.after_step(self.model, context.iteration, result, view.camera)
+        if (share := self.settings.densification.prune) and context.iteration == self.schedule.prunes_after:
+            self._prune(share)
+            changed = True
+        if changed:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
+
+    def _prune(self, share: float) -> None:
+        """Remove what training views hardly see."""
+        seen = self.model.field.detach()
+        grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
+        plain = replace(seen, sh=grey, signed=True)
+        images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
+        pixels = blended_pixels(images, grey)
+        remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))
 
     def _keep_loss(self, loss: Tensor, iteration: int) -> None:
         """On a CPU read it at once, before a loss that is not finite does harm."""

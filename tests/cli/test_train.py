@@ -57,6 +57,7 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--hierarchy", "nested", "--inherit", "xyz"), "--inherit xyz:1: is about residual fields"),
         (("--hierarchy", "nested", "--supervision", "gt_laplacian"), "--supervision gt_laplacian: is about"),
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
+        (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
         (("--strategy", "luck"), "expected default or mcmc"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),

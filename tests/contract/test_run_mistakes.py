@@ -223,6 +223,7 @@ def test_options_of_the_hierarchy_are_checked_before_anything_is_read() -> None:
         ({"prediction_precision": "int4"}, "--prediction-precision int4: expected float32, float16, uint8"),
         ({"images_on": "tape"}, "--images-on tape: expected auto, gpu, memory, disk"),
         ({"residual_color_rate": 0.0}, "--residual-color-rate 0.0: expected a positive factor"),
+        ({"prune": 1.0}, "--prune 1.0: expected a share from 0"),
         ({"split": "half"}, "--split 'half'"),
     ):
         with pytest.raises(UserInputError, match=message) as caught:

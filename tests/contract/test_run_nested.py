@@ -220,12 +220,13 @@ def test_backgrounds_may_be_random(scene: Path, tmp_path: Path) -> None:
     assert archive.manifest.complete
 
 
-def test_runs_that_do_not_say_their_hierarchy_go_on_as_laplacian(scene: Path, tmp_path: Path) -> None:
+def test_runs_from_before_nesting_and_pruning_go_on_without(scene: Path, tmp_path: Path) -> None:
     folder, short = tmp_path / "run", ("--iterations", 30)
     with pytest.raises(KeyboardInterrupt):
         run_hierarchy(STUBS["graphdeco"], scene, folder, *short, hooks=(StopAt(0),))
     manifest = json.loads((folder / MANIFEST).read_text())
     assert manifest["settings"].pop("hierarchy") == "laplacian"
+    assert manifest["settings"].pop("prune") == 0.0
     (folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(RunFolderError, match=r"started with another hierarchy \('laplacian', now 'nested'\)"):
         run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **NESTED_LIKE_OTHERS)

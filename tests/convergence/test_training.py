@@ -29,7 +29,7 @@ SETTINGS = TrainSettings(
     iterations=60,
     sh_degree=1,
     sh_every=10,
-    densification=Densification(start=3, until=45, every=5, reset_every=12),
+    densification=Densification(start=3, until=45, every=5, reset_every=12, prune=0.02),
     joint=0.25,
 )
 
@@ -287,6 +287,18 @@ def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, ob
     assert archive.manifest.complete
     assert not archive.path("cache").exists()
     assert TrainSettings.from_manifest(archive.manifest) == settings
+
+
+def test_what_is_least_seen_goes_when_densification_ends(scene: Scene, tmp_path: Path) -> None:
+    counts = {}
+    for share in (0.0, 0.05):
+        settings = replace(SETTINGS, levels=1, densification=replace(SETTINGS.densification, prune=share))
+        archive = train(tmp_path / str(share), scene, settings, test_every=1)
+        counts[share] = {entry["iteration"]: entry["num_gaussians"] for entry in archive.history()}
+    assert counts[0.05][44] == counts[0.0][44] == counts[0.0][60]
+    # The 45th iteration is the first after densification; seen: 0.19 of them.
+    assert 0.05 < 1 - counts[0.05][45] / counts[0.0][45] < 0.4
+    assert counts[0.05][60] == counts[0.05][45]
 
 
 def test_an_inherited_share_starts_smaller(scene: Scene, tmp_path: Path) -> None:

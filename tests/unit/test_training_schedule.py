@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -63,6 +64,19 @@ def test_late_in_a_stage_eight_views_make_a_step() -> None:
     assert all(schedule.gather == 1 for schedule in schedules(TrainSettings(gather=1)))
 
 
+def test_pruning_waits_for_the_end_of_densification_and_for_a_step() -> None:
+    def prunes(levels: int = 1, **densification: Any) -> list[int | None]:
+        settings = TrainSettings(levels=levels, densification=Densification(**densification))
+        return [schedule.prunes_after for schedule in schedules(settings)]
+
+    assert prunes() == [15_000]
+    assert prunes(levels=2) == [7500, 7500]
+    # Steps of eight views from 22,501 on: the first one at or after 25,001 is the 314th of them.
+    assert prunes(until=25_001) == [22_500 + 8 * 313]
+    assert prunes(until=30_000) == [None]
+    assert prunes(until=500) == prunes(until=0) == [None]
+
+
 @given(st.integers(1, 400), st.integers(0, 10), st.integers(0, 3), st.integers(0, 5))
 def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epoch: int) -> None:
     seen = Counter(view_index(epoch * count + i + 1, count, seed, level) for i in range(count))
@@ -84,9 +98,12 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"inherit_ratio": 0.0}, "above 0 and at most 1"),
         ({"inherit_ratio": 1.5}, "above 0 and at most 1"),
         ({"inherit_ratio": math.nan}, "above 0 and at most 1"),
+        ({"densification": Densification(prune=1.0)}, "--prune 1.0: expected a share from 0"),
+        ({"densification": Densification(prune=math.nan)}, "--prune nan"),
+        ({"densification": Densification(prune=0.01, strategy="mcmc")}, "--prune with --strategy mcmc"),
     ],
 )
-def test_bad_settings_say_what_is_expected(values: dict[str, float], message: str) -> None:
+def test_bad_settings_say_what_is_expected(values: dict[str, Any], message: str) -> None:
     with pytest.raises(UserInputError, match=message):
         TrainSettings(**values)
 
