@@ -6,7 +6,6 @@ missing. All of them are projected, sorted and stepped in every iteration that i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import torch
@@ -22,7 +21,7 @@ def check_prune_share(share: float) -> None:
     Raises:
         UserInputError: it is not from 0 to below 1.
     """
-    if not 0.0 <= share < 1.0 or math.isnan(share):
+    if not 0.0 <= share < 1.0:
         raise UserInputError(f"--prune {share}: expected a share from 0, where nothing is pruned, to below 1, as 0.005")
 
 

@@ -296,7 +296,7 @@ def test_what_is_least_seen_goes_when_densification_ends(scene: Scene, tmp_path:
         archive = train(tmp_path / str(share), scene, settings, test_every=1)
         counts[share] = {entry["iteration"]: entry["num_gaussians"] for entry in archive.history()}
     assert counts[0.05][44] == counts[0.0][44] == counts[0.0][60]
-    # The 45th iteration is the first after densification; seen: 0.19 of them.
+    # The 45th iteration is the first after densification; seen: 0.24 of them.
     assert 0.05 < 1 - counts[0.05][45] / counts[0.0][45] < 0.4
     assert counts[0.05][60] == counts[0.05][45]
 
