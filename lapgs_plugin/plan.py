@@ -253,3 +253,13 @@ def check_joint_share(share: float) -> None:
     """
     if not 0.0 <= share <= 1.0:
         raise UserInputError(f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25")
+
+
+def check_prune_share(share: float) -> None:
+    """Refuse a share of all blending that cannot be pruned.
+
+    Raises:
+        UserInputError: it is not from 0 to below 1.
+    """
+    if not 0.0 <= share < 1.0:
+        raise UserInputError(f"--prune {share}: expected a share from 0, where nothing is pruned, to below 1, as 0.005")

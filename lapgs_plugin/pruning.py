@@ -11,18 +11,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.inheritance import SH_C0
-
-
-def check_prune_share(share: float) -> None:
-    """Refuse a share of all blending that cannot be pruned.
-
-    Raises:
-        UserInputError: it is not from 0 to below 1.
-    """
-    if not 0.0 <= share < 1.0:
-        raise UserInputError(f"--prune {share}: expected a share from 0, where nothing is pruned, to below 1, as 0.005")
 
 
 def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:

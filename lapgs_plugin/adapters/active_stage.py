@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -191,17 +192,14 @@ class ActiveStage:
         background = torch.zeros(3, device=self._device)
         colors, degree = gaussians._features_dc, gaussians.active_sh_degree
         grey = torch.nn.Parameter(torch.zeros_like(colors))
-
-        def image(camera: Any) -> Tensor:
-            self._adapter.render(self._call, self._view(camera), gaussians, background)
-            assert alone.captured is not None
-            return alone.captured
-
+        images = (
+            self._context.image(alone, self._call, self._view(camera), gaussians, background)
+            for camera in self._images.train
+        )
         try:
-            self._context.shim.stage, gaussians._features_dc, gaussians.active_sh_degree = alone, grey, 0
-            return blended_pixels((image(camera) for camera in self._images.train), grey)
+            gaussians._features_dc, gaussians.active_sh_degree = grey, 0
+            return blended_pixels(images, grey)
         finally:
-            self._context.shim.stage = self._rendering
             gaussians._features_dc, gaussians.active_sh_degree = colors, degree
 
     def _train_jointly(self, gaussians: Any) -> None:
@@ -399,15 +397,9 @@ class ActiveStage:
 
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """(3, h, w) I_hat^l of a view, before exposure and clamping."""
-        rendering, composed = self._rendering, self._rendering.composed
-        rendering.composed, rendering.capture = self._images.keys, True
+        rendering = replace(self._rendering, composed=self._images.keys, capture=True)
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
-        try:
-            self._adapter.render(self._call, self._view(camera), gaussians, background)
-            assert rendering.captured is not None
-            return rendering.captured
-        finally:  # training may go on, and supervise residuals alone
-            rendering.composed, rendering.capture, rendering.captured = composed, False, None
+        return self._context.image(rendering, self._call, self._view(camera), gaussians, background)
 
     def _initialise(self, gaussians: Any) -> None:
         """Points for the base; for a finer level what is inherited of the field before."""

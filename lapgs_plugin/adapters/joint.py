@@ -135,15 +135,7 @@ class JointLevels:
         """(3, h, w) of one field alone."""
         if key not in one.views:
             one.views[key] = self._context.adapter.view_at(self._cameras[key], size, one.of.stage.signed, _no_image)
-        shim = self._context.shim
-        outer, shim.stage = shim.stage, one.rendering
-        try:
-            self._context.adapter.render(one.of.call, one.views[key], one.gaussians, one.background)
-        finally:
-            shim.stage = outer
-        image, one.rendering.captured = one.rendering.captured, None
-        assert image is not None
-        return image
+        return self._context.image(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
 from lapgs_plugin.adapters.hooking import HookCaller
 from lapgs_plugin.adapters.iteration_parts import IterationParts
 from lapgs_plugin.adapters.level_views import PhotoAlbum
-from lapgs_plugin.adapters.shim import RasterizerShim
+from lapgs_plugin.adapters.shim import RasterizerShim, StageRendering
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS
@@ -25,11 +25,11 @@ from lapgs_plugin.plan import (
     Hierarchy,
     Stage,
     check_joint_share,
+    check_prune_share,
     parse_hierarchy,
     parse_split,
     require_no_residuals,
 )
-from lapgs_plugin.pruning import check_prune_share
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.raised_images import RaisedImages
 from lapgs_plugin.supervision import joint_from, parse_supervision
@@ -153,6 +153,27 @@ class RunContext:
     parts: IterationParts
     watcher: Watcher
     test_every: int | None
+
+    def image(
+        self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor
+    ) -> Tensor:
+        """(3, h, w) what the checkout's render makes of a view, before exposure or clamping.
+
+        Args:
+            rendering: takes the running stage's place meanwhile; it captures.
+            call: of the script's `training`, as the stage of these Gaussians made it.
+            view: the checkout's camera at that stage's level.
+            gaussians: the checkout's model.
+            background: (3,) behind them.
+        """
+        outer, self.shim.stage = self.shim.stage, rendering
+        try:
+            self.adapter.render(call, view, gaussians, background)
+        finally:
+            self.shim.stage = outer
+        image, rendering.captured = rendering.captured, None
+        assert image is not None, "a rendering that captures"
+        return image
 
 
 @dataclass(frozen=True)

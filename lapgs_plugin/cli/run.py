@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.options import HIERARCHY, PRUNE_HELP, GridOption, SupervisionOption
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.plan import (
@@ -22,7 +23,6 @@ from lapgs_plugin.plan import (
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
 
-HIERARCHY = "Hierarchy"
 MEMORY = "Memory and speed"
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -77,13 +77,7 @@ def run(
             help="Share of the iterations of each stage, coarsest first. Two levels: 1/3,2/3, nested 1/2,1/2.",
         ),
     ] = None,
-    supervision: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="reconstructed (composed image against the photo), online_residual or gt_laplacian.",
-        ),
-    ] = "reconstructed",
+    supervision: SupervisionOption = "reconstructed",
     inherit: Annotated[
         str,
         typer.Option(
@@ -100,13 +94,7 @@ def run(
             f"them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
         ),
     ] = None,
-    grid: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="Pixel grid of the pyramid: camera (where the cameras see) or even (every second pixel, as OpenCV).",
-        ),
-    ] = "camera",
+    grid: GridOption = "camera",
     residual_color_rate: Annotated[
         float, typer.Option(rich_help_panel=HIERARCHY, help="Factor on the SH learning rates of residual stages.")
     ] = RESIDUAL_COLOR_RATE,
@@ -119,14 +107,7 @@ def run(
             f"Default: 1, and {NESTED_COARSE_THRESHOLD:g} where levels are nested.",
         ),
     ] = None,
-    prune: Annotated[
-        float,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="When a stage's densification ends, remove the Gaussians least seen, as many as make up this share of "
-            "all blending together: 0.005 takes about a fifth of them.",
-        ),
-    ] = 0.0,
+    prune: Annotated[float, typer.Option(rich_help_panel=HIERARCHY, help=PRUNE_HELP)] = 0.0,
     seed: Annotated[
         int,
         typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lapgs_plugin.cli.options import HIERARCHY, PRUNE_HELP, GridOption, SupervisionOption
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from lapgs_plugin.training.settings import TrainSettings
     from lapgs_plugin.watching import Watcher
 
-HIERARCHY = "Hierarchy"
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
 RUN = "Run"
@@ -61,13 +61,7 @@ def train(
             "and about as good; residuals save more time where images are large).",
         ),
     ] = "laplacian",
-    supervision: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="reconstructed (composed image against the photo), online_residual or gt_laplacian.",
-        ),
-    ] = "reconstructed",
+    supervision: SupervisionOption = "reconstructed",
     inherit: Annotated[
         str,
         typer.Option(
@@ -84,13 +78,7 @@ def train(
             "0.25; 0 leaves them as they are, as in the paper.",
         ),
     ] = 0.0,
-    grid: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="Pixel grid of the pyramid: camera (where the cameras see) or even (every second pixel, as OpenCV).",
-        ),
-    ] = "camera",
+    grid: GridOption = "camera",
     sh_degree: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, help="Highest SH degree, 0 to 3.")] = 3,
     gather: Annotated[
         int,
@@ -119,14 +107,7 @@ def train(
         ),
     ] = None,
     densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
-    prune: Annotated[
-        float,
-        typer.Option(
-            rich_help_panel=SCHEDULE,
-            help="When densification ends, remove the Gaussians least seen, as many as make up this share of all "
-            "blending together: 0.005 takes about a fifth of them.",
-        ),
-    ] = 0.0,
+    prune: Annotated[float, typer.Option(rich_help_panel=SCHEDULE, help=PRUNE_HELP)] = 0.0,
     opacity_reset_every: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
     ] = None,

@@ -15,6 +15,8 @@ Vector = NDArray[np.float64]  # (3,)
 
 RIDGE = 1e-3
 """Weight of the guess that settles where nearly parallel optical axes meet, against 1 for each axis."""
+NO_LENGTH = 1e-9
+"""Directions of this length and less point nowhere."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ class Rig:
         assert cameras, "a rig has at least one camera"
         positions, forwards = camera_positions(cameras), np.stack([forward(camera) for camera in cameras])
         focus = _nearest_to_axes(positions, forwards)
-        up = _unit(np.mean([-_rotation(camera)[1] for camera in cameras], axis=0), fallback=-_rotation(cameras[0])[1])
+        mean_up = np.mean([-_rotation(camera)[1] for camera in cameras], axis=0)
+        up = unit(mean_up) if np.linalg.norm(mean_up) > NO_LENGTH else -_rotation(cameras[0])[1]
         distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
         return cls(tuple(cameras), focus, up, distance)
 
@@ -49,7 +52,7 @@ class Rig:
         outwards = camera_positions(self.cameras) - self.focus
         flat = outwards - np.outer(outwards @ self.up, self.up)
         lengths = np.linalg.norm(flat, axis=1)
-        directions = flat[lengths > 1e-9] / lengths[lengths > 1e-9, None]
+        directions = flat[lengths > NO_LENGTH] / lengths[lengths > NO_LENGTH, None]
         # Directions spread evenly over an angle of 180 degrees have a mean of length 2 / pi.
         return len(directions) > 2 and float(np.linalg.norm(directions.mean(axis=0))) < 2.0 / np.pi
 
@@ -64,11 +67,15 @@ def forward(camera: Camera) -> Vector:
     return np.asarray(_rotation(camera)[2])
 
 
+def unit(vector: Vector) -> Vector:
+    """The vector at length 1; it has one."""
+    return vector / np.linalg.norm(vector)
+
+
 def looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
     """A lens that stands at `place` and looks at `at`, with `up` upwards in its image; all (3,) in world units."""
-    ahead = (at - place) / np.linalg.norm(at - place)
-    right = np.cross(ahead, up)
-    right /= np.linalg.norm(right)
+    ahead = unit(at - place)
+    right = unit(np.cross(ahead, up))
     return posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
 
 
@@ -92,9 +99,3 @@ def _nearest_to_axes(positions: NDArray[np.float64], forwards: NDArray[np.float6
     left = across.sum(axis=0) + RIDGE * len(positions) * np.eye(3)
     right = np.einsum("nij,nj->i", across, positions) + RIDGE * len(positions) * guess
     return np.asarray(np.linalg.solve(left, right))
-
-
-def _unit(vector: Vector, fallback: Vector) -> Vector:
-    """The vector at length 1, or `fallback` where it has none."""
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-9 else fallback

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.rendering.rig import Rig, Vector, camera_positions, looking, posed
+from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
 
 MAX_KEYS = 24
 """Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
@@ -50,10 +50,10 @@ def orbit(rig: Rig, frames: int) -> list[Camera]:
         radius = float(np.median(np.linalg.norm(np.cross(positions - rig.focus, rig.up), axis=1)))
         start = positions[0] - centre
     else:
-        centre, axis = middle, _unit(rig.focus - middle)
+        centre, axis = middle, unit(rig.focus - middle)
         radius = FACING_SHARE * float(np.sqrt(np.mean(np.sum((positions - middle) ** 2, axis=1))))
         start = rig.up
-    first = _unit(start - (start @ axis) * axis)
+    first = unit(start - (start @ axis) * axis)
     second = np.cross(axis, first)
     lens = _median_lens(rig.cameras)
     angles = 2.0 * math.pi * np.arange(frames) / frames
@@ -223,7 +223,3 @@ def _times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> ND
 def _median_lens(cameras: Sequence[Camera]) -> Camera:
     """The camera in the middle by field of view; its pose means nothing."""
     return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2]
-
-
-def _unit(vector: Vector) -> Vector:
-    return vector / np.linalg.norm(vector)

@@ -12,12 +12,12 @@ from lapgs_plugin.plan import (
     Hierarchy,
     Stage,
     check_joint_share,
+    check_prune_share,
     coarse_factor,
     nested_densify_until,
     parse_hierarchy,
     require_no_residuals,
 )
-from lapgs_plugin.pruning import check_prune_share
 from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.supervision import joint_from, parse_supervision
 

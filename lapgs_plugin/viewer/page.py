@@ -18,10 +18,9 @@ import viser
 from PIL import Image
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.viewer.preview import fitted
+from lapgs_plugin.viewer.preview import QUALITY, fitted
 
 PORTS_TRIED = 100
-PREVIEW_QUALITY = 85
 
 
 def free_port(host: str, port: int) -> int:
@@ -103,7 +102,7 @@ class Page:
                 return
             # The browser stretches it to its window. As the client's own picture it is replaced by the next one.
             image = fitted(self._preview, client.camera.image_width / max(client.camera.image_height, 1))
-            client.scene.set_background_image(np.asarray(image), format="jpeg", jpeg_quality=PREVIEW_QUALITY)
+            client.scene.set_background_image(np.asarray(image), format="jpeg", jpeg_quality=QUALITY)
             client.flush()
 
     def close(self) -> None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import io
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,17 +59,15 @@ def keep_preview(archive: RunArchive, shown: ShownRun, start: Start) -> None:
         shown: all of its finished levels.
         start: where clients begin.
     """
-    from lapgs_plugin.viewer.pictures import PictureSettings, as_bytes, draw
+    with _logged(archive.path()):
+        from lapgs_plugin.viewer.pictures import PictureSettings, as_bytes, draw
 
-    try:
         picture = draw(shown, None, start.camera(*SIZE), PictureSettings(), distance=1.0, zoom=1.0)
         manifest = archive.manifest
         with atomic_write(archive.path(PREVIEW)) as stream:
             Image.fromarray(as_bytes(picture.image)).save(
                 stream, "JPEG", quality=QUALITY, comment=_state(manifest.created, len(manifest.records))
             )
-    except Exception as error:
-        logger.warning("no picture of %s is kept for the viewer to begin with: %s", archive.path(), error)
 
 
 def keep_preview_of(run: Path, device: str = "auto") -> None:
@@ -77,7 +77,7 @@ def keep_preview_of(run: Path, device: str = "auto") -> None:
         run: its folder.
         device: where to render, as `rasterizer_for` takes it.
     """
-    try:
+    with _logged(run):
         # In here: a backbone's environment may lack OpenImageIO, say, and has trained all the same.
         from lapgs_plugin.archive import RunArchive
         from lapgs_plugin.rendering.rig import Rig
@@ -89,10 +89,16 @@ def keep_preview_of(run: Path, device: str = "auto") -> None:
         train, test = run_cameras(archive)
         rig = Rig.of(list(train.values()))
         shown = ShownRun.of(run.name, run_renderer(archive, device), rig)
+        keep_preview(archive, shown, start_at(next(iter({**test, **train}.values())), rig))
+
+
+@contextmanager
+def _logged(run: Path) -> Iterator[None]:
+    """Whatever fails in here is a line of the log: a run is whole without a picture."""
+    try:
+        yield
     except Exception as error:
         logger.warning("no picture of %s is kept for the viewer to begin with: %s", run, error)
-    else:
-        keep_preview(archive, shown, start_at(next(iter({**test, **train}.values())), rig))
 
 
 def _state(created: str, finished: int) -> bytes:

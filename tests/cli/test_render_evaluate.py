@@ -31,16 +31,6 @@ app.command("eval")(evaluate)
 lapgs = succeeding(app, columns=100)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture
-def run(scene: Path, tmp_path: Path) -> Path:
-    return write_run(tmp_path / "run", scene)
-
-
 def test_render_writes_every_image_of_the_held_out_views(run: Path) -> None:
     output = lapgs("render", run)
     suffixes = ("base", "residual_0", "composed")

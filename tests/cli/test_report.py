@@ -68,14 +68,9 @@ class Page(HTMLParser):
 lapgs_report = succeeding(app, columns=120)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("striped"))
-
-
 @pytest.fixture
 def run(scene: Path, tmp_path: Path) -> Path:
-    return write_run(tmp_path / "hierarchy", scene)
+    return write_run(tmp_path / "hierarchy", scene)  # the name is on the page
 
 
 @pytest.fixture

@@ -14,16 +14,11 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.rendering.trajectory import trajectory_json
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import write_run, write_scene
+from tests.cli.run_folder import write_run
 
 app = typer.Typer()
 app.command("eval")(evaluate)
 lapgs_eval = succeeding(app, columns=120)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
 
 
 def test_a_camera_that_stands_still_sees_no_flicker(scene: Path, tmp_path: Path) -> None:

@@ -38,11 +38,6 @@ def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Viewer, "serve", interrupt)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
-
-
 def test_it_says_how_to_reach_it_and_takes_the_next_port(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
     with socket.create_server(("127.0.0.1", 0)) as taken:

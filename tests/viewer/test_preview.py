@@ -21,7 +21,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.files import PREVIEW
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.viewer.preview import SIZE, fitted, keep_preview_of, read_preview
-from tests.cli.run_folder import write_run, write_scene
+from tests.cli.run_folder import write_run
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
@@ -48,16 +48,6 @@ builtins.__import__ = gated
 from lapgs_plugin.cli import main
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture
-def run(scene: Path, tmp_path: Path) -> Path:
-    return write_run(tmp_path / "run", scene)
 
 
 def decoded(jpeg: bytes) -> NDArray[np.float64]:
