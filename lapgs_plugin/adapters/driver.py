@@ -271,7 +271,7 @@ class HierarchyDriver:
         for stage in plan:
             options = self._options
             window = StageWindow(
-                stage, start, plan.iterations, plan.levels, options.residual_color_rate, options.coarse_threshold
+                stage, start, plan.iterations, plan.levels, options.residual_color_rate, options.coarse_factor
             )
             active = ActiveStage(self._context, call, scene, archive, window, tuple(finished), before, path)
             self._active = active
@@ -352,11 +352,7 @@ class HierarchyDriver:
                 },
                 RASTER_SETTINGS: self._adapter.raster_settings(call),
                 "iterations": plan.iterations,
-                **{
-                    name: value
-                    for name, value in asdict(self._options).items()
-                    if name not in ("levels", "grid", "supervision", "inherit", "seed")
-                },
+                **self._options.for_manifest(),
             },
         )
 
@@ -378,9 +374,11 @@ def _require_same_run(found: Manifest, wanted: Manifest) -> None:
     before, now = _identity(found), _identity(wanted)
     for name in {**before, **now}:
         if before.get(name) != now.get(name):
+            # Who leaves the option out may have done so before, when it stood for residuals.
+            same = f"--hierarchy {before[name]}" if name == "hierarchy" else "the same options"
             raise RunFolderError(
                 f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
-                "resume with the same options, or start again with --overwrite"
+                f"resume with {same}, or start again with --overwrite"
             )
 
 

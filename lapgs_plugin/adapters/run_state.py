@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -20,12 +20,14 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS
 from lapgs_plugin.plan import (
-    JOINT_SHARE,
+    DEFAULT_HIERARCHY,
     RESIDUAL_COLOR_RATE,
     Hierarchy,
     Stage,
     check_joint_share,
     check_prune_share,
+    coarse_factor,
+    joint_share,
     parse_hierarchy,
     parse_split,
     require_no_residuals,
@@ -36,7 +38,10 @@ from lapgs_plugin.supervision import joint_from, parse_supervision
 from lapgs_plugin.watching import Watcher
 
 PAPER_SPLIT = (Fraction(1, 3), Fraction(2, 3))
-"""10k and 20k of 30k iterations for two levels, as in the paper's main tables; more levels take `StagePlan`'s."""
+"""10k and 20k of 30k iterations for a base and a residual, as in the paper's main tables; others take `StagePlan`'s."""
+
+IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed")
+"""Options that the manifest has fields of its own for."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +49,17 @@ class HierarchyOptions:
     """What a user can choose about the hierarchy; everything else is the backbone's.
 
     Attributes:
-        hierarchy: "laplacian", or "nested", where nothing is to be chosen about residuals.
+        hierarchy: "nested", where nothing is to be chosen about residuals, or "laplacian".
         levels: number of levels; 1 is the plain backbone, archived as a run.
-        split: share of the iterations of each stage, coarsest first, as text; None takes the paper's, and of nested
-            levels `StagePlan`'s.
+        split: share of the iterations of each stage, coarsest first, as text; None takes `StagePlan`'s, and of a base
+            with one residual the paper's.
         grid: of the pyramid.
         supervision, inherit, inherit_ratio: see their modules.
         joint: share of each residual stage, its last, in which the finished fields are trained along, 0 to 1. Ablations
-            that supervise residuals alone have no use for it: nothing is composed there.
+            that supervise residuals alone have no use for it: nothing is composed there. None: by the hierarchy.
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
         coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
+            None: by the hierarchy.
         prune: share of all blending that the Gaussians make up together which are removed when a stage's densification
             ends; 0 for none.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
@@ -65,16 +71,16 @@ class HierarchyOptions:
         UserInputError: one of them is none of what it can be.
     """
 
-    hierarchy: str = Hierarchy.LAPLACIAN.value
+    hierarchy: str = DEFAULT_HIERARCHY.value
     levels: int = 2
     split: str | None = None
     grid: str = "camera"
     supervision: str = "reconstructed"
     inherit: str = "geometry"
     inherit_ratio: float = 1.0
-    joint: float = JOINT_SHARE
+    joint: float | None = None
     residual_color_rate: float = RESIDUAL_COLOR_RATE
-    coarse_threshold: float = 1.0
+    coarse_threshold: float | None = None
     prune: float = 0.0
     images_on: str = "auto"
     prediction_precision: str = "float16"
@@ -86,11 +92,14 @@ class HierarchyOptions:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         self.shares()
-        check_joint_share(self.joint)
+        check_joint_share(self.joint_share)
         check_prune_share(self.prune)
-        for name in ("residual_color_rate", "coarse_threshold"):
-            if (factor := getattr(self, name)) <= 0 or not math.isfinite(factor):
-                raise UserInputError(f"--{name.replace('_', '-')} {factor}: expected a positive factor")
+        for option, factor in (
+            ("--residual-color-rate", self.residual_color_rate),
+            ("--coarse-threshold", self.coarse_factor),
+        ):
+            if factor <= 0 or not math.isfinite(factor):
+                raise UserInputError(f"{option} {factor}: expected a positive factor")
         if self.images_on not in ("auto", *PLACES):
             raise UserInputError(f"--images-on {self.images_on}: expected {', '.join(('auto', *PLACES))}")
         if self.prediction_precision not in PRECISIONS:
@@ -102,7 +111,7 @@ class HierarchyOptions:
                 {
                     "--supervision": (self.supervision, "reconstructed"),
                     "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
-                    "--joint": (self.joint, 0.0),
+                    "--joint": (self.joint_share, 0.0),
                     "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
                 }
             )
@@ -113,19 +122,34 @@ class HierarchyOptions:
         return parse_hierarchy(self.hierarchy) is Hierarchy.NESTED
 
     @property
+    def joint_share(self) -> float:
+        """Of each residual stage, 0 to 1."""
+        return joint_share(self.joint, parse_hierarchy(self.hierarchy))
+
+    @property
+    def coarse_factor(self) -> float:
+        """On densification thresholds, for each halving."""
+        return coarse_factor(self.coarse_threshold, parse_hierarchy(self.hierarchy))
+
+    @property
     def inheritance(self) -> str:
         """What a level starts from, a mode of `inheritance.inherit`."""
         return "full" if self.nested else self.inherit
 
     def joint_from(self, stage: Stage) -> int | None:
         """The iteration of a stage from which the finished fields are trained along; None when they never are."""
-        return joint_from(stage, self.joint, parse_supervision(self.supervision))
+        return joint_from(stage, self.joint_share, parse_supervision(self.supervision))
 
     def shares(self) -> tuple[Fraction, ...] | None:
         """Of the iterations for each stage, coarsest first; None leaves them to `StagePlan`."""
         if self.split is not None:
             return parse_split(self.split)
         return PAPER_SPLIT if self.levels == len(PAPER_SPLIT) and not self.nested else None
+
+    def for_manifest(self) -> dict[str, Any]:
+        """What the manifest has under "settings", with nothing left to the hierarchy."""
+        values = {**asdict(self), "joint": self.joint_share, "coarse_threshold": self.coarse_factor}
+        return {name: value for name, value in values.items() if name not in IN_MANIFEST}
 
 
 @dataclass(frozen=True)

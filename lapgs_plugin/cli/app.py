@@ -45,7 +45,7 @@ def options(
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Train 3D Gaussian Splatting as a Laplacian frequency hierarchy.
+    """Train 3D Gaussian Splatting from coarse to fine: nested levels, or the paper's Laplacian frequency hierarchy.
 
     A scene comes from `lapgs sample` or `lapgs prepare`, `lapgs train` makes a run folder of it, and `lapgs eval`,
     `lapgs render` and `lapgs report` look at that. `lapgs doctor` says what this machine can do.

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.options import HIERARCHY, PRUNE_HELP, GridOption, SupervisionOption
+from lapgs_plugin.cli.options import (
+    DEFAULT_INHERITANCE,
+    HIERARCHY,
+    PRUNE_HELP,
+    GridOption,
+    InheritOption,
+    SupervisionOption,
+    check_residual_options,
+)
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import (
-    JOINT_SHARE,
-    NESTED_COARSE_THRESHOLD,
-    RESIDUAL_COLOR_RATE,
-    Hierarchy,
-    coarse_factor,
-    parse_hierarchy,
-)
+from lapgs_plugin.plan import DEFAULT_HIERARCHY, JOINT_SHARE, NESTED_COARSE_THRESHOLD, RESIDUAL_COLOR_RATE
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
@@ -60,10 +61,11 @@ def run(
         str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="What finer levels are. laplacian: residuals, added to what the coarser levels make, as in the paper. "
-            "nested: the coarser level's field, trained on at the finer size, which makes the whole image alone.",
+            help="What finer levels are. nested: the coarser level's field, trained on at the finer size, which makes "
+            "the whole image alone. laplacian: the paper's residuals, added to what the coarser levels make; they save "
+            "more time where images are large and views are few.",
         ),
-    ] = Hierarchy.LAPLACIAN.value,
+    ] = DEFAULT_HIERARCHY.value,
     levels: Annotated[
         int,
         typer.Option(
@@ -74,37 +76,35 @@ def run(
         str | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of the iterations of each stage, coarsest first. Two levels: 1/3,2/3, nested 1/2,1/2.",
+            help="Share of the iterations of each stage, coarsest first. Two levels: 1/2,1/2; a base and a residual "
+            "1/3,2/3, as in the paper.",
         ),
     ] = None,
     supervision: SupervisionOption = "reconstructed",
-    inherit: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="What a residual starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
-            "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
-        ),
-    ] = "geometry",
+    inherit: InheritOption = None,
     joint: Annotated[
         float | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of each residual stage, its last, in which the finished fields are trained along; 0 leaves "
-            f"them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
+            help="Of residuals: share of each residual stage, its last, in which the finished fields are trained "
+            f"along; 0 leaves them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
         ),
     ] = None,
     grid: GridOption = "camera",
     residual_color_rate: Annotated[
-        float, typer.Option(rich_help_panel=HIERARCHY, help="Factor on the SH learning rates of residual stages.")
-    ] = RESIDUAL_COLOR_RATE,
+        float | None,
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            help=f"Factor on the SH learning rates of residual stages. Default: {RESIDUAL_COLOR_RATE:g}.",
+        ),
+    ] = None,
     coarse_threshold: Annotated[
         float | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
             help="Factor on the backbone's gradient thresholds for densification, for each time that a level's images "
             "are halved: above 1 gives coarse levels fewer Gaussians. "
-            f"Default: 1, and {NESTED_COARSE_THRESHOLD:g} where levels are nested.",
+            f"Default: {NESTED_COARSE_THRESHOLD:g}, and 1 for residuals.",
         ),
     ] = None,
     prune: Annotated[float, typer.Option(rich_help_panel=HIERARCHY, help=PRUNE_HELP)] = 0.0,
@@ -178,10 +178,8 @@ def run(
     logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
-    kind_of_levels = parse_hierarchy(hierarchy)
-    mode, ratio = parse_inheritance(inherit)
-    if joint is None:
-        joint = 0.0 if kind_of_levels is Hierarchy.NESTED else JOINT_SHARE
+    check_residual_options(hierarchy, {"--inherit": inherit, "--residual-color-rate": residual_color_rate})
+    mode, ratio = parse_inheritance(DEFAULT_INHERITANCE if inherit is None else inherit)
     options = HierarchyOptions(
         hierarchy=hierarchy,
         levels=levels,
@@ -191,8 +189,8 @@ def run(
         inherit=mode,
         inherit_ratio=ratio,
         joint=joint,
-        residual_color_rate=residual_color_rate,
-        coarse_threshold=coarse_factor(coarse_threshold, kind_of_levels),
+        residual_color_rate=RESIDUAL_COLOR_RATE if residual_color_rate is None else residual_color_rate,
+        coarse_threshold=coarse_threshold,
         prune=prune,
         images_on=images_on,
         prediction_precision=prediction_precision,

@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lapgs_plugin.cli.options import HIERARCHY, PRUNE_HELP, GridOption, SupervisionOption
+from lapgs_plugin.cli.options import (
+    DEFAULT_INHERITANCE,
+    HIERARCHY,
+    PRUNE_HELP,
+    GridOption,
+    InheritOption,
+    SupervisionOption,
+    check_residual_options,
+)
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.plan import DEFAULT_HIERARCHY, NESTED_COARSE_THRESHOLD
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -56,26 +65,19 @@ def train(
         str,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="laplacian (a base and residuals that are added up, as in the paper) or nested (each level trains "
-            "the coarser one's field on at its own size, and the last one renders alone: as fast as a single field "
-            "and about as good; residuals save more time where images are large).",
+            help="nested (each level trains the coarser one's field on at its own size; the last one makes the whole "
+            "image, as fast as a single field's and about as good) or laplacian (the paper's: a base and residuals "
+            "that are added up; saves more time where images are large and views are few).",
         ),
-    ] = "laplacian",
+    ] = DEFAULT_HIERARCHY.value,
     supervision: SupervisionOption = "reconstructed",
-    inherit: Annotated[
-        str,
-        typer.Option(
-            rich_help_panel=HIERARCHY,
-            help="What the next level starts from: geometry (all but colour), xyz (positions, as in the paper) or full "
-            "(all parameters and optimizer state); a ratio in (0, 1] of the Gaussians alone or after it: xyz:0.5.",
-        ),
-    ] = "geometry",
+    inherit: InheritOption = None,
     joint: Annotated[
         float,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Share of each residual stage, its last, in which the finished fields are trained along, such as "
-            "0.25; 0 leaves them as they are, as in the paper.",
+            help="Of residuals: share of each residual stage, its last, in which the finished fields are trained "
+            "along, such as 0.25; 0 leaves them as they are, as in the paper.",
         ),
     ] = 0.0,
     grid: GridOption = "camera",
@@ -103,7 +105,7 @@ def train(
         typer.Option(
             rich_help_panel=SCHEDULE,
             help="Factor on the gradient threshold of densification for each time that images are halved: above 1 "
-            "gives coarse levels fewer Gaussians. Default: 1, or 2 where levels are nested.",
+            f"gives coarse levels fewer Gaussians. Default: {NESTED_COARSE_THRESHOLD:g}, and 1 for residuals.",
         ),
     ] = None,
     densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
@@ -189,13 +191,15 @@ def train(
     view: ViewOption = False,
     view_port: ViewPortOption = None,
 ) -> None:
-    """Train SCENE as a Laplacian frequency hierarchy, one small field a stage, into the run folder --out.
+    """Train SCENE level by level, from small images to its own, into the run folder --out.
 
     Examples:
 
         lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
 
         lapgs train data/garden -o runs/plain --levels 1       (the baseline: one field)
+
+        lapgs train data/garden -o runs/bands --hierarchy laplacian       (the paper's method: a base and a residual)
 
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
     """
@@ -208,7 +212,8 @@ def train(
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
-    mode, ratio = parse_inheritance(inherit)
+    check_residual_options(hierarchy, {"--inherit": inherit})
+    mode, ratio = parse_inheritance(DEFAULT_INHERITANCE if inherit is None else inherit)
     watcher = context.with_resource(watching(view, view_port, out.absolute().name))
     settings = TrainSettings(
         iterations=iterations,

@@ -9,6 +9,7 @@ from typing import Any
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.plan import (
+    DEFAULT_HIERARCHY,
     Hierarchy,
     Stage,
     check_joint_share,
@@ -82,7 +83,7 @@ class TrainSettings:
 
     iterations: int = 30_000
     levels: int = 2
-    hierarchy: str = "laplacian"
+    hierarchy: str = DEFAULT_HIERARCHY.value
     split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
     grid: str = "camera"
     supervision: str = "reconstructed"

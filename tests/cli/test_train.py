@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -11,10 +12,13 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.viewer.preview import read_preview
+from tests.cli.run_folder import write_run, write_scene
 
 SHORT = ("--iterations", "40", "--sh-degree", "1")
+RESIDUALS = ("--hierarchy", "laplacian")
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +38,8 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     archive = RunArchive.open(tmp_path / "run")
     assert archive.manifest.complete
+    assert archive.manifest.settings["hierarchy"] == "nested", "unless told otherwise"
+    assert [record.signed for record in archive.manifest.records] == [False, False]
     assert read_preview(tmp_path / "run") is not None
     before = archive.field_path(0).read_bytes()
     again = lapgs("train", scene, "-o", tmp_path / "run", *SHORT)
@@ -48,14 +54,17 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--levels", "3"), "level 2 of 3 would be 16x12 pixels"),
         (("--split", "1/3,1/3"), "sum to 1"),
         (("--levels", "1", "--split", "1/3,2/3"), "--split has 2 shares, expected 1"),
-        (("--inherit", "1.5"), "above 0 and at most 1"),
-        (("--inherit", "colours"), "expected geometry, xyz, full"),
+        ((*RESIDUALS, "--inherit", "1.5"), "above 0 and at most 1"),
+        ((*RESIDUALS, "--inherit", "colours"), "expected geometry, xyz, full"),
         (("--supervision", "magic"), "expected reconstructed, online_residual, gt_laplacian"),
         (("--grid", "odd"), "expected camera or even"),
-        (("--hierarchy", "gaussian"), "--hierarchy gaussian: expected laplacian or nested"),
-        (("--hierarchy", "nested", "--joint", "0.5"), "--joint 0.5: is about residual fields"),
-        (("--hierarchy", "nested", "--inherit", "xyz"), "--inherit xyz:1: is about residual fields"),
-        (("--hierarchy", "nested", "--supervision", "gt_laplacian"), "--supervision gt_laplacian: is about"),
+        (("--hierarchy", "gaussian"), "--hierarchy gaussian: expected nested or laplacian"),
+        *(
+            ((*words, *option.split()), f"{option}: is about residuals, and nested levels have none; leave it out, or")
+            for words in ((), ("--hierarchy", "nested"))
+            for option in ("--joint 0.5", "--inherit xyz", "--inherit geometry", "--supervision gt_laplacian")
+        ),
+        (("--joint", "0.5"), "add --hierarchy laplacian to train residuals"),
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
@@ -78,6 +87,30 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert message in last
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "run" / "manifest.json").exists()
+
+
+def test_residuals_are_trained_where_they_are_asked_for(scene: Path, tmp_path: Path) -> None:
+    options = (*RESIDUALS, "--joint", "0.25", "--inherit", "xyz:0.5", "--supervision", "reconstructed")
+    done = lapgs("train", scene, "-o", tmp_path / "run", *options, *SHORT)
+    assert done.returncode == 0, done.stderr
+    manifest = RunArchive.open(tmp_path / "run").manifest
+    assert [record.signed for record in manifest.records] == [False, True]
+    assert (manifest.inherit, manifest.settings["inherit_ratio"], manifest.settings["joint"]) == ("xyz", 0.5, 0.25)
+
+
+def test_runs_from_before_nesting_go_on_with_residuals(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), finished=1)
+    manifest = json.loads((run / MANIFEST).read_text())
+    assert manifest["settings"].pop("hierarchy") == "laplacian"
+    manifest["sh_degree"] = 0  # that of the field that is there
+    (run / MANIFEST).write_text(json.dumps(manifest))
+    words = ("train", tmp_path / "scene", "-o", run, "--resume")
+    other = lapgs(*words, "--hierarchy", "nested")
+    assert other.returncode == 2
+    assert "--hierarchy asks for nested, but the run" in other.stderr.replace("\n", " ")
+    done = lapgs(*words)
+    assert done.returncode == 0, done.stderr
+    assert [record.signed for record in RunArchive.open(run).manifest.records] == [False, True]
 
 
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bits(scene: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,10 @@ WHITE = ("--white_background", "--densify_from_iter", 0)
 """Over white, the checkouts reset opacities at the first iteration that densifies; never, if that is 0. In as few
 iterations as here they do not recover before FastGS prunes what is faint."""
 
-NESTED: dict[str, Any] = {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}
-"""Options that `--hierarchy nested` alone stands for."""
-NESTED_LIKE_OTHERS: dict[str, Any] = {**NESTED, "split": "1/3,2/3"}
-"""The same in stages of 30 and 60 iterations."""
+THIRDS: dict[str, Any] = {"split": "1/3,2/3"}
+"""Stages of 30 and 60 iterations: residuals have them anyway, nested levels halves."""
+KINDS = ("nested", "laplacian")
+"""Of hierarchies."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,10 @@ def run_hierarchy(
             **options,
         )
     return RunArchive.open(folder), results[0]
+
+
+drive_residuals = partial(drive, hierarchy="laplacian")
+run_residuals = partial(run_hierarchy, hierarchy="laplacian")
 
 
 class StopAt(StageHook):

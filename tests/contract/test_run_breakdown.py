@@ -14,7 +14,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from lapgs_plugin.breakdown import PARTS
 from lapgs_plugin.hooks import StageContext, StageHook
-from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
+from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy, run_residuals
 
 TINY = ("--iterations", 18, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 18)
 LOSS, BACKWARD, DENSIFY, STEP = 0.05, 0.03, 0.06, 0.02
@@ -80,7 +80,7 @@ def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None
         )
     finally:
         handles[0].remove()
-    assert len(taken) >= 18
+    assert len(taken) >= 16, "with every iteration but the last one of a stage"
     optimizer = sum(record.breakdown_seconds["optimizer"] for record in archive.manifest.records)
     assert optimizer >= STEP * len(taken)
     whole = sum(record.train_seconds for record in archive.manifest.records)
@@ -88,10 +88,10 @@ def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None
 
 
 def test_fields_that_are_trained_along_count(scene: Path, tmp_path: Path) -> None:
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, joint=0.5)
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, joint=0.5)
     base, residual = archive.manifest.records
     assert residual.peak_gaussians >= base.num_gaussians + residual.num_gaussians
-    apart, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "apart", *TINY, joint=0.0)
+    apart, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "apart", *TINY, joint=0.0)
     assert apart.manifest.record(0).peak_gaussians < base.num_gaussians + residual.num_gaussians
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.field import GaussianField
-from tests.contract.stub_runs import NAMES, STUBS, loaded, run_hierarchy
+from tests.contract.stub_runs import NAMES, STUBS, drive_residuals, loaded, run_hierarchy
 
 PARTS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
@@ -94,8 +94,6 @@ def test_a_run_with_released_opacities_is_archived(scene: Path, tmp_path: Path) 
 def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp_path: Path) -> None:
     moments: list[dict[str, Tensor]] = []
     with loaded(STUBS[name], scene, tmp_path / "run", "--quiet") as adapter:
-        from tests.contract.stub_runs import drive
-
         model = adapter.train.GaussianModel
         # Every model begins an iteration here: the last state of the base, and the first one of the residual.
         update = model.update_learning_rate
@@ -107,7 +105,7 @@ def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp
             return update(self, iteration)
 
         model.update_learning_rate = spy
-        drive(adapter, inherit="full")
+        drive_residuals(adapter, inherit="full")
     none, base, residual, *_ = moments
     assert none == {}
     assert residual.keys() == base.keys() >= {"xyz", "f_dc", "opacity", "scaling", "rotation"}

@@ -1,4 +1,4 @@
-"""A driven run of each stub: its levels, what is compared with what, what is rendered, and going on after a stop."""
+"""Residuals in a driven run of each stub: what is compared with what, what is rendered, and going on after a stop."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
-    NESTED,
     STUBS,
     Result,
     StopAt,
     captured,
     composed_psnr,
-    drive,
+    drive_residuals,
     loaded,
-    run_hierarchy,
+    run_residuals,
 )
 
 Run = tuple[RunArchive, Result]
@@ -46,7 +45,7 @@ def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[s
         if name not in made:
             folder = tmp_path_factory.mktemp(name) / "run"
             more = ("--test_iterations", ITERATIONS, "--save_iterations", 30)
-            made[name] = run_hierarchy(STUBS[name], scene, folder, *more, joint=0.0)
+            made[name] = run_residuals(STUBS[name], scene, folder, *more, joint=0.0)
         return made[name]
 
     return run
@@ -112,7 +111,7 @@ def recorded(big: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunAr
     recorder = Recorder()
     folder = tmp_path_factory.mktemp("recorded") / "run"
     more = ("--densify_until_iter", 0, "--iterations", 12)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], big, folder, *more, levels=3, hooks=(recorder,), joint=0.0)
+    archive, _ = run_residuals(STUBS["graphdeco"], big, folder, *more, levels=3, hooks=(recorder,), joint=0.0)
     return archive, recorder
 
 
@@ -167,7 +166,7 @@ def test_score_functions_compare_composed_images(name: str, scene: Path, tmp_pat
             return original(image, photo, *others)
 
         setattr(utils, function, spy)
-        drive(adapter)
+        drive_residuals(adapter)
     assert seen.keys() == {(3, 24, 32), (3, 48, 64)}
     # A bare residual would be off by the photo itself: 1. Composed ones were off by 0.30 to 0.40.
     assert max(sum(values) / len(values) for values in seen.values()) < 0.6
@@ -176,14 +175,9 @@ def test_score_functions_compare_composed_images(name: str, scene: Path, tmp_pat
 @pytest.mark.parametrize(("name", "levels"), [("fastgs", 1), ("fastgs", 3), ("taming", 3), ("graphdeco", 3)])
 def test_any_number_of_levels(name: str, levels: int, scene: Path, big: Path, tmp_path: Path) -> None:
     folder, short = tmp_path / "run", ("--iterations", 60)
-    archive, _ = run_hierarchy(STUBS[name], big if levels == 3 else scene, folder, *short, levels=levels)
+    archive, _ = run_residuals(STUBS[name], big if levels == 3 else scene, folder, *short, levels=levels)
     assert archive.manifest.complete
     assert archive.available_levels == tuple(reversed(range(levels)))
-
-
-def test_three_nested_levels(big: Path, tmp_path: Path) -> None:
-    archive, _ = run_hierarchy(STUBS["fastgs"], big, tmp_path / "run", "--iterations", 60, levels=3, **NESTED)
-    assert [(r.level, r.signed) for r in archive.manifest.records] == [(2, False), (1, False), (0, False)]
 
 
 @pytest.mark.parametrize("supervision", ["online_residual", "gt_laplacian"])
@@ -200,7 +194,7 @@ def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene
             return original(image, target)
 
         adapter.train.l1_loss = spy
-        drive(adapter, hooks=(recorder,), supervision=supervision)
+        drive_residuals(adapter, hooks=(recorder,), supervision=supervision)
     image, target = next(pair for pair in compared if pair[0].shape == (3, 48, 64))
     assert not image.any(), "a residual without colour, not composed"
     context, told = recorder.contexts[0][0]
@@ -234,7 +228,7 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
             original(self, training_args)
 
         model.training_setup = spy
-        drive(adapter, inherit=inherit, joint=0.0)
+        drive_residuals(adapter, inherit=inherit, joint=0.0)
     archive = RunArchive.open(tmp_path / "run")
     field = archive.field(1)
     started = at_start[1]
@@ -255,11 +249,11 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
 def test_a_run_stopped_between_stages_goes_on(name: str, scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS[name], scene, folder, hooks=(StopAt(0),), joint=0.0)
+        run_residuals(STUBS[name], scene, folder, hooks=(StopAt(0),), joint=0.0)
     stopped = RunArchive.open(folder)
     assert stopped.available_levels == (1,)
     base = stopped.field_path(1).read_bytes()
-    archive, result = run_hierarchy(STUBS[name], scene, folder, resume=True, joint=0.0)
+    archive, result = run_residuals(STUBS[name], scene, folder, resume=True, joint=0.0)
     assert archive.available_levels == (1, 0)
     assert archive.field_path(1).read_bytes() == base
     assert result.output.count("Number of points at initialisation") == 1, "only the second stage was trained"

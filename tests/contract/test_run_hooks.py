@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.plan import Stage
-from tests.contract.stub_runs import NAMES, STUBS, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
 
 # Two stages of 3 and 6 iterations that densify at 2, and at 2 and 4.
 TINY = ("--iterations", 9, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 9)
@@ -53,7 +53,7 @@ def iteration(level: int, number: int, densifies: int = 0) -> list[str]:
 
 def test_the_order_of_calls(scene: Path, tmp_path: Path) -> None:
     hook = Recording()
-    run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, hooks=(hook,))
+    run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *TINY, hooks=(hook,), **THIRDS)
     assert hook.calls == [
         "start 1",
         *("render 1 1", "compose", "loss", "backward"),
@@ -75,7 +75,7 @@ def test_the_order_of_calls(scene: Path, tmp_path: Path) -> None:
 def test_renders_for_scores_are_no_iterations(name: str, scene: Path, tmp_path: Path) -> None:
     hook = Recording()
     more = ("--iterations", 18, *TINY[2:-1], 12)
-    run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, hooks=(hook,), split="1/2,1/2")
+    run_residuals(STUBS[name], scene, tmp_path / "run", *more, hooks=(hook,), split="1/2,1/2")
     calls = [call for call in hook.calls if not call.startswith("densify")]
     expected = []
     for level in (1, 0):

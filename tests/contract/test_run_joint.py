@@ -27,9 +27,9 @@ from tests.contract.stub_runs import (
     StopAt,
     captured,
     composed_psnr,
-    drive,
+    drive_residuals,
     loaded,
-    run_hierarchy,
+    run_residuals,
 )
 
 
@@ -55,7 +55,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
     more: tuple[Any, ...] = ("--test_iterations", ITERATIONS) if name != "fastgs" else ()
     if name == "taming":
         more += ("--ho_iteration", 40)  # before: its optimizer then holds opacities that its model has no longer
-    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.3)
+    archive, result = run_residuals(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.3)
     after = archive.field(1).parameters
     assert before.fields.keys() == {1}
     for part, value in before.fields[1].items():
@@ -70,7 +70,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 def test_without_a_share_they_stay_as_they_are(options: dict[str, Any], scene: Path, tmp_path: Path) -> None:
     """A share of less than an iteration is none; and what supervises residuals alone composes nothing."""
     before = FieldsAt(tmp_path / "run")
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before,), **options)
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before,), **options)
     for part, value in archive.field(1).parameters.items():
         assert torch.equal(before.fields[1][part], value)
 
@@ -118,7 +118,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
         return found
 
     inspected = Inspected(monkeypatch, differences)
-    run_hierarchy(STUBS["graphdeco"], odd, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
+    run_residuals(STUBS["graphdeco"], odd, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
     assert [len(found) for found in inspected.results] == [3, 3], "two residual stages"
     assert max(max(found) for found in inspected.results) < 5e-6  # 1.8e-7 seen
 
@@ -150,7 +150,7 @@ def test_gradients_reach_every_finished_field(
 
     inspected = Inspected(monkeypatch, relative_errors)
     options = ("--iterations", 60) if name == "taming" else ("--iterations", 12)
-    run_hierarchy(STUBS[name], odd, tmp_path / "run", *options, levels=3, joint=0.5)
+    run_residuals(STUBS[name], odd, tmp_path / "run", *options, levels=3, joint=0.5)
     assert [len(errors) for errors in inspected.results] == [1, 2]
     assert max(max(errors) for errors in inspected.results) < 2e-3  # 1.9e-4 seen: dark colours of the base are clamped
 
@@ -166,7 +166,7 @@ def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypat
         rates.append(dict(zip(names, (group["lr"] for group in self._following.param_groups), strict=True)))
 
     monkeypatch.setattr(joint._Follow, "__call__", follow)
-    run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", joint=0.25, residual_color_rate=4.0)
+    run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", joint=0.25, residual_color_rate=4.0)
     assert len(rates) == 14, "a quarter of the stage's 60 iterations; after its last the checkout does not step"
     for found in rates:
         assert found.pop("xyz") > 0
@@ -180,7 +180,7 @@ def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> No
     """Of the training views, by the archive: what joint training is for."""
     errors = {}
     for share in (0.0, 0.5):
-        archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / str(share), joint=share)
+        archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), joint=share)
         renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
         views = load_scene(scene, eval=True, progress=False).train
         squares = [(renderer.render(view.camera).composed[0] - view.image).square().mean() for view in views]
@@ -198,7 +198,7 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
 
     before = FieldsAt(tmp_path / "run")
     with captured(tmp_path, []), pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before, StopLate(-1)), joint=0.5)
+        run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before, StopLate(-1)), joint=0.5)
     stopped = RunArchive.open(tmp_path / "run")
     assert stopped.available_levels == (1,)
     for part, value in stopped.field(1).parameters.items():
@@ -208,5 +208,5 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
 @pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
 def test_a_share_is_one(share: float, scene: Path, tmp_path: Path) -> None:
     with loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter, pytest.raises(UserInputError) as error:
-        drive(adapter, joint=share)
+        drive_residuals(adapter, joint=share)
     assert str(error.value) == f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25"

@@ -37,6 +37,7 @@ from tests.contract.stub_runs import (
     loaded,
     run_bare,
     run_hierarchy,
+    run_residuals,
 )
 
 
@@ -212,7 +213,7 @@ def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_pat
                 self.prune_points(torch.ones(len(self.get_xyz), dtype=torch.bool))
 
         setattr(model, method, spy)
-        with pytest.raises(TrainingDivergedError, match=r"no Gaussian at level 0, iteration [0-9]+ of 60") as caught:
+        with pytest.raises(TrainingDivergedError, match=r"no Gaussian at level 0, iteration [0-9]+ of 45") as caught:
             drive(adapter)
     assert "finished levels (1) are kept" in one_line(caught.value)
     assert RunArchive.open(folder).available_levels == (1,)
@@ -244,7 +245,7 @@ def test_options_that_a_hierarchy_cannot_honour(
     name: str, options: tuple[Any, ...], message: str, scene: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(UserInputError) as caught:
-        run_hierarchy(STUBS[name], scene, tmp_path / "run", *options)
+        run_residuals(STUBS[name], scene, tmp_path / "run", *options)
     assert message in one_line(caught.value)
     assert str(options[0]) in str(caught.value)
     assert nothing_written(tmp_path / "run")
@@ -268,7 +269,7 @@ def test_a_hierarchy_that_does_not_fit_the_scene(
     options: dict[str, Any], message: str, scene: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(UserInputError) as caught:
-        run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", **options)
+        run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", **options)
     assert message in one_line(caught.value)
 
 
@@ -294,16 +295,16 @@ def test_a_folder_of_the_backbone_itself_is_not_written_over(scene: Path, tmp_pa
 def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, hooks=(StopAt(0),))
+        run_residuals(STUBS["graphdeco"], scene, folder, hooks=(StopAt(0),))
     for more, options in ((("--iterations", 120), {}), ((), {"inherit": "xyz"}), (("-r", 60), {})):
         with pytest.raises(RunFolderError, match=r"started with another (iterations|inherit|scene) ") as caught:
-            run_hierarchy(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
+            run_residuals(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
         one_line(caught.value)
 
 
 class FillsTheGpu(StageHook):
     def on_stage_start(self, stage: Stage) -> None:
-        if stage.signed:
+        if stage.level == 0:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nGPU 0 has ...")
 
 
@@ -364,18 +365,19 @@ def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--hierarchy", "flat"], "--hierarchy flat: expected laplacian or nested"),
+        (["--hierarchy", "flat"], "--hierarchy flat: expected nested or laplacian"),
         *(
             (
-                ["--hierarchy", "nested", *option.split()],
-                f"{option}: is about residual fields, and --hierarchy nested trains none",
+                [*words, *option.split()],
+                f"{option}: is about residuals, and nested levels have none; leave it out, or add --hierarchy lap",
             )
+            for words in ((), ("--hierarchy", "nested"))
             for option in (
                 "--supervision online_residual",
-                "--inherit full:1",
-                "--inherit geometry:0.5",
+                "--inherit full",
+                "--inherit geometry",
                 "--joint 0.25",
-                "--residual-color-rate 2.0",
+                "--residual-color-rate 4.0",
             )
         ),
     ],
@@ -392,22 +394,33 @@ def test_what_nested_levels_cannot_honour_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("words", "joint", "coarse_threshold"), [((), 0.25, 1.0), (("--hierarchy", "nested"), 0.0, 2.0)]
+    ("words", "settings", "iterations"),
+    [
+        ((), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [15, 15]),
+        (("--hierarchy", "laplacian"), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [10, 20]),
+        (
+            ("--hierarchy", "laplacian", "--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
+            {"joint": 0.0, "coarse_threshold": 2.0, "residual_color_rate": 1.0},
+            [10, 20],
+        ),
+    ],
 )
 def test_defaults_go_with_the_hierarchy(
     words: tuple[str, ...],
-    joint: float,
-    coarse_threshold: float,
+    settings: dict[str, Any],
+    iterations: list[int],
     lapgs_run: Any,
     scene: Path,
     tmp_path: Path,
 ) -> None:
-    """As the manifest has them."""
+    """As the manifest has them. Levels are nested unless residuals are asked for."""
     of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
     code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert code == 0
-    settings = RunArchive.open(tmp_path / "run").manifest.settings
-    assert (settings["joint"], settings["coarse_threshold"]) == (joint, coarse_threshold)
+    manifest = RunArchive.open(tmp_path / "run").manifest
+    assert {name: manifest.settings[name] for name in settings} == settings
+    assert [record.iterations for record in manifest.records] == iterations
+    assert [record.signed for record in manifest.records] == [False, "laplacian" in words]
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
@@ -428,7 +441,7 @@ def test_cuda_that_is_not_there(lapgs_run: Any, scene: Path) -> None:
 def test_nothing_is_left_of_a_refused_run(scene: Path, tmp_path: Path) -> None:
     """After an error the same process can run another checkout."""
     with pytest.raises(UserInputError):
-        run_hierarchy(STUBS["taming"], scene, tmp_path / "run", "--random_background")
+        run_residuals(STUBS["taming"], scene, tmp_path / "run", "--random_background")
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 30)
     assert archive.manifest.settings["backbone"]["name"] == "graphdeco"
     with cuda_on_cpu("fastgs"):

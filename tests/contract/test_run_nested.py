@@ -1,4 +1,4 @@
-"""Nested levels in a driven run of each stub: what a level starts from, what it renders, what is archived."""
+"""Nested levels, the default, in a driven run of each stub: what a level starts from, renders and leaves."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.rasterizers import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     NAMES,
-    NESTED_LIKE_OTHERS,
     STUBS,
+    THIRDS,
     WHITE,
     StopAt,
     captured,
     drive,
     loaded,
     run_hierarchy,
+    run_residuals,
 )
 
 DEGREE = 2
@@ -109,7 +111,7 @@ def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = F
     seen = Seen()
     with captured(folder, []), loaded(STUBS[name], scene, folder, *more) as adapter:
         watch(adapter, seen)
-        drive(adapter, hooks=(seen, *([StopAt(0)] if stop else [])), resume=resume, **NESTED_LIKE_OTHERS)
+        drive(adapter, hooks=(seen, *([StopAt(0)] if stop else [])), resume=resume, **THIRDS)
     return seen
 
 
@@ -213,22 +215,28 @@ def test_tamings_budget_is_shared_by_levels_that_go_on(run_of: Callable[[str], t
     assert 300 < coarse <= 600 < fine <= 1200
 
 
+def test_three_levels(tmp_path: Path) -> None:
+    make_sample_scene(tmp_path / "big", width=96, height=66, views=12, points=300, progress=False)
+    archive, _ = run_hierarchy(STUBS["fastgs"], tmp_path / "big", tmp_path / "run", "--iterations", 60, levels=3)
+    assert [(r.level, r.signed) for r in archive.manifest.records] == [(2, False), (1, False), (0, False)]
+
+
 def test_backgrounds_may_be_random(scene: Path, tmp_path: Path) -> None:
     """Nothing is composed that was rendered over another one."""
     more = ("--random_background", "--iterations", 30)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, **NESTED_LIKE_OTHERS)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more)
     assert archive.manifest.complete
 
 
 def test_runs_from_before_nesting_and_pruning_go_on_without(scene: Path, tmp_path: Path) -> None:
     folder, short = tmp_path / "run", ("--iterations", 30)
     with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, hooks=(StopAt(0),))
+        run_residuals(STUBS["graphdeco"], scene, folder, *short, hooks=(StopAt(0),))
     manifest = json.loads((folder / MANIFEST).read_text())
     assert manifest["settings"].pop("hierarchy") == "laplacian"
     assert manifest["settings"].pop("prune") == 0.0
     (folder / MANIFEST).write_text(json.dumps(manifest))
-    with pytest.raises(RunFolderError, match=r"started with another hierarchy \('laplacian', now 'nested'\)"):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **NESTED_LIKE_OTHERS)
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True)
+    with pytest.raises(RunFolderError, match=r"another hierarchy \('laplacian', now 'nested'\).*--hierarchy laplacian"):
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, **THIRDS)
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, folder, *short, resume=True)
     assert [record.signed for record in archive.manifest.records] == [False, True]

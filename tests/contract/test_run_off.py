@@ -93,7 +93,7 @@ class Failing(StageHook):
     """Breaks in the second stage."""
 
     def on_densify(self, context: StageContext) -> None:
-        if context.stage.signed:
+        if context.stage.level == 0:
             raise RuntimeError("from inside")
 
 

@@ -16,15 +16,15 @@ from lapgs_plugin.pruning import blended_pixels, least_blended
 from lapgs_plugin.rendering.compose import level_camera
 from lapgs_plugin.rendering.rasterizers import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
-from tests.contract.stub_runs import NAMES, NESTED_LIKE_OTHERS, STUBS, run_hierarchy
+from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, run_hierarchy, run_residuals
 
 SHARE = 0.05
 
 
-@pytest.mark.parametrize("options", [{}, NESTED_LIKE_OTHERS], ids=["laplacian", "nested"])
+@pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_least_seen_goes(
-    name: str, options: dict[str, Any], scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, hierarchy: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured: list[Tensor] = []
     fields: dict[int, tuple[GaussianField, GaussianField]] = {}
@@ -42,7 +42,7 @@ def test_what_is_least_seen_goes(
 
     monkeypatch.setattr(active_stage, "least_blended", noting)
     monkeypatch.setattr(ActiveStage, "_prune", watched)
-    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, **options)
+    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, hierarchy=hierarchy, **THIRDS)
     assert archive.manifest.complete
     assert list(fields) == [1, 0]
     rasterizer = rasterizer_for(archive.manifest, "cpu", archive.manifest.rasterizer).rasterizer
@@ -77,7 +77,7 @@ def test_looking_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeyp
     monkeypatch.setattr(active_stage, "least_blended", none)
     plys = []
     for share in (0.0, SHARE):
-        archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / str(share), prune=share, joint=0.25)
+        archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), prune=share, joint=0.25)
         plys.append([archive.field_path(level).read_bytes() for level in (1, 0)])
     assert plys[0] == plys[1]
     assert len(calls) == 2

@@ -22,17 +22,20 @@ from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.signed_color import signed_degree
 from tests.contract.stub_runs import (
     ITERATIONS,
+    KINDS,
     NAMES,
-    NESTED,
     STUBS,
+    THIRDS,
     WHITE,
     StopAt,
     Stub,
     captured,
     composed_psnr,
     drive,
+    drive_residuals,
     loaded,
     run_hierarchy,
+    run_residuals,
 )
 
 SHORT = ("--iterations", 30)
@@ -77,7 +80,7 @@ def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any
             return original(raster_settings=raster_settings)
 
         renderer.GaussianRasterizer = spy
-        drive(adapter, **options)
+        drive_residuals(adapter, **options)
     return found
 
 
@@ -96,14 +99,15 @@ def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, t
 def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_path: Path) -> None:
     """Blender images are blended over the background by the checkout, and by us when the run is rendered again."""
     more = ("--test_iterations", ITERATIONS, *["--white_background"] * white)
-    archive, result = run_hierarchy(STUBS["taming"], blender, tmp_path / "run", *more)
+    archive, result = run_residuals(STUBS["taming"], blender, tmp_path / "run", *more)
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
     assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 8e-5 seen: predictions are float16
 
 
+@pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_transparent_images_train(name: str, blender: Path, tmp_path: Path) -> None:
+def test_transparent_images_train(name: str, hierarchy: str, blender: Path, tmp_path: Path) -> None:
     """graphdeco masks its renders by alpha at each level's size; the others see the background in the photo."""
     compared: list[tuple[Tensor, Tensor]] = []
     with captured(tmp_path, []), loaded(STUBS[name], blender, tmp_path / "run", *WHITE) as adapter:
@@ -114,7 +118,7 @@ def test_transparent_images_train(name: str, blender: Path, tmp_path: Path) -> N
             return original(image, photo)
 
         adapter.train.l1_loss = spy
-        drive(adapter)
+        drive(adapter, hierarchy=hierarchy)
     assert RunArchive.open(tmp_path / "run").manifest.complete
     for image, photo in compared:
         clear = photo.shape[1] // 3 - 2  # the rows of the pyramid's blur left out
@@ -140,7 +144,7 @@ def deep(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
-    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
+    _, result = run_residuals(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
     shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
     used = [value > 0 for value in shown]
     assert used[0]
@@ -149,15 +153,16 @@ def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
 
 
 def test_depths_supervise_every_nested_level(deep: Path, tmp_path: Path) -> None:
-    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths", **NESTED)
+    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
     shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
     assert min(shown) > 0
 
 
-def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> None:
-    """What the base saves at its last iteration is what the residual saves at its first one, before it steps."""
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_exposures_go_on_from_stage_to_stage(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+    """What the base saves at its last iteration is what the next level saves at its first one, before it steps."""
     more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30, hierarchy=hierarchy, **THIRDS)
     base = json.loads(archive.path("level_1", "exposure.json").read_text())
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "again", *more, 31) as adapter:
         at_first: dict[str, Any] = {}
@@ -169,16 +174,17 @@ def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> Non
                 at_first.update(json.loads(Path(self.model_path, "exposure.json").read_text()))
 
         adapter.train.Scene.save = spy
-        drive(adapter)
+        drive(adapter, hierarchy=hierarchy, **THIRDS)
     assert at_first == base
     assert np.abs(np.array(list(base.values())) - np.eye(3, 4)).max() > 0.01, "they were trained"
 
 
-def test_exposures_survive_a_stop(scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_exposures_survive_a_stop(hierarchy: str, scene: Path, tmp_path: Path) -> None:
     more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations", 30)
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, *more, hooks=(StopAt(0),))
+        run_hierarchy(STUBS["graphdeco"], scene, folder, *more, hooks=(StopAt(0),), hierarchy=hierarchy, **THIRDS)
     base = json.loads((folder / "level_1" / "exposure.json").read_text())
     started: list[Tensor] = []
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, folder, *more) as adapter:
@@ -189,7 +195,7 @@ def test_exposures_survive_a_stop(scene: Path, tmp_path: Path) -> None:
             setup(self, training_args)
 
         adapter.train.GaussianModel.training_setup = spy
-        drive(adapter, resume=True)
+        drive(adapter, resume=True, hierarchy=hierarchy, **THIRDS)
     assert torch.equal(started[0], torch.tensor(list(base.values())))
 
 
@@ -204,7 +210,7 @@ def test_sparse_adam_trains_a_hierarchy(name: str, scene: Path, tmp_path: Path) 
 def test_where_images_lie_changes_nothing(name: str, scene: Path, tmp_path: Path) -> None:
     """On a GPU or not, in memory or on the disk, and wherever the checkout was told to keep its images."""
     (_, memory), (_, disk), (_, told) = (
-        run_hierarchy(STUBS[name], scene, tmp_path / how, *more, images_on=where)
+        run_residuals(STUBS[name], scene, tmp_path / how, *more, images_on=where)
         for how, where, more in (
             ("memory", "memory", ()),
             ("disk", "disk", ()),
@@ -218,7 +224,7 @@ def test_colours_evaluated_by_the_checkout_train_the_same(scene: Path, tmp_path:
     """--convert_SHs_python holds for the base; a residual has signed colours, which that code does not know."""
     stub = Stub("graphdeco", "graphdeco-aa", STUBS["graphdeco"].options)
     (_, raster), (_, python) = (
-        run_hierarchy(stub, scene, tmp_path / str(len(more)), *SHORT, *more) for more in ((), ("--convert_SHs_python",))
+        run_residuals(stub, scene, tmp_path / str(len(more)), *SHORT, *more) for more in ((), ("--convert_SHs_python",))
     )
     assert python.losses == pytest.approx(raster.losses, abs=1e-4)  # 0 seen
 
@@ -243,7 +249,7 @@ def test_a_viewer_sees_a_residual_around_grey(scene: Path, tmp_path: Path) -> No
         gui.conn = "somebody"
         gui.receive = lambda: (viewer, True, False, False, False, 1.0)
         gui.send = lambda pixels, verify: sent.append(np.frombuffer(pixels, np.uint8).reshape(15, 20, 3))
-        drive(adapter)
+        drive_residuals(adapter)
     assert len(sent) == 30
     assert sent[0].std() > 10, "the base, as it is"
     assert (sent[10] == 127).all(), "a residual that is still empty"

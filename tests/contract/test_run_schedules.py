@@ -13,7 +13,7 @@ from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.plan import Hierarchy, Stage, StagePlan
-from tests.contract.stub_runs import NAMES, NESTED, NESTED_LIKE_OTHERS, STUBS, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
@@ -181,7 +181,7 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
     """Published for 30,000 iterations: pruning at 18,000, 21,000, 24,000 and 27,000; all steps until 15,000, higher SH
     every 16th. A stage's last iteration does not step."""
     more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0)
-    found = record_fastgs(scene, tmp_path / "run", *more)
+    found = record_fastgs(scene, tmp_path / "run", *more, **THIRDS)
     assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
     assert found["step"] == [(n, i) for n in (200, 400) for i in range(1, n)]
     assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
@@ -190,7 +190,7 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
 @pytest.mark.parametrize("name", NAMES)
 def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Path, tmp_path: Path) -> None:
     base, finest = StagePlan.create(
-        (800, 533), TOTAL, split=HierarchyOptions(**NESTED).shares(), hierarchy=Hierarchy.NESTED
+        (800, 533), TOTAL, split=HierarchyOptions(hierarchy="nested").shares(), hierarchy=Hierarchy.NESTED
     )
     with loaded(STUBS[name], scene, tmp_path) as adapter:
         adapter.first_points(1_000)
@@ -201,10 +201,10 @@ def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Pat
     assert [opt.densify_until_iter for opt in stages] == [7_500, 5_000]
 
 
-@pytest.mark.parametrize("options", [{}, NESTED_LIKE_OTHERS], ids=["laplacian", "nested"])
+@pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_nested_levels_after_the_first_reset_no_opacities(
-    name: str, options: dict[str, Any], scene: Path, tmp_path: Path
+    name: str, hierarchy: str, scene: Path, tmp_path: Path
 ) -> None:
     """Neither at the interval nor, over white, where densification may begin."""
     more = ("--opacity_reset_interval", 8, "--white_background")
@@ -222,12 +222,12 @@ def test_nested_levels_after_the_first_reset_no_opacities(
             asked[self.stage_iterations] += 1
 
         model.training_setup, model.reset_opacity = training_setup, reset_opacity
-        drive(adapter, **options)
+        drive(adapter, hierarchy=hierarchy, **THIRDS)
     assert asked[30] > 1
-    assert (asked[60] == 0) == bool(options)
+    assert (asked[60] == 0) == (hierarchy == "nested")
 
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:
     more = ("--densify_from_iter", 50, "--densification_interval", 5)
-    with pytest.raises(UserInputError, match="level 1 would stop densifying at iteration 20 and start after 50"):
+    with pytest.raises(UserInputError, match="level 1 would stop densifying at iteration 30 and start after 50"):
         run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *more)

@@ -14,7 +14,7 @@ from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.watching import Watcher
-from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy
+from tests.contract.stub_runs import KINDS, NAMES, STUBS, run_hierarchy
 
 EVERY = 4
 SHORT = ("--iterations", 45, "--densify_until_iter", 40)
@@ -60,28 +60,31 @@ class Diary(Watcher):
         self.last = dict(fields())
 
 
+@pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_watcher_sees_every_stage_and_changes_nothing(
-    name: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    name: str, hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     diary = Diary()
     with caplog.at_level(logging.WARNING):
-        watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", *SHORT, watcher=diary)
+        watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", *SHORT, watcher=diary, hierarchy=hierarchy)
         said = len(caplog.records)
-        alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone", *SHORT)
+        alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone", *SHORT, hierarchy=hierarchy)
     assert len(caplog.records) == 2 * said  # a look says nothing that archiving does not
-    first, coarse, residual = diary.lines.index("stage 1"), diary.lines.index("stage 0"), diary.lines
-    assert residual[0] == "run 2"
-    assert residual[first + 1] == f"iteration {EVERY - 1} of level 1: [1]"
-    assert residual[coarse - 1] == "finished 1: [1]"
-    assert residual[coarse + 1] == f"iteration {EVERY - 1} of level 0: [0]"
-    assert residual[-1] == "finished 0: [0, 1]"  # the base was trained along at the end
+    first, coarse, lines = diary.lines.index("stage 1"), diary.lines.index("stage 0"), diary.lines
+    assert lines[0] == "run 2"
+    assert lines[first + 1] == f"iteration {EVERY - 1} of level 1: [1]"
+    assert lines[coarse - 1] == "finished 1: [1]"
+    assert lines[coarse + 1] == f"iteration {EVERY - 1} of level 0: [0]"
+    # The base of a residual was trained along at the end.
+    assert lines[-1] == f"finished 0: {[0] if hierarchy == 'nested' else [0, 1]}"
     assert max(diary.counts) > min(diary.counts)
     for level in (1, 0):
         for a, b in zip(watched.field(level).parameters.values(), alone.field(level).parameters.values(), strict=True):
             assert torch.equal(a, b)
-        assert torch.equal(diary.last[level].means, watched.field(level).means)
         assert watched.manifest.record(level).overhead_seconds["view"] > 0
+    for level, field in diary.last.items():
+        assert torch.equal(field.means, watched.field(level).means)
 
 
 def test_the_viewer_shows_a_checkout_on_the_cpu(scene: Path, tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
 
 
 def test_fields_that_are_trained_along_count(tmp_path: Path) -> None:
-    settings = replace(SETTINGS, joint=0.5)
+    settings = replace(SETTINGS, hierarchy="laplacian", joint=0.5)
     with make_archive(tmp_path / "run", settings) as archive:
         Trainer(ring_scene(), settings, archive, CpuRasterizer()).run()
     archive = RunArchive.open(tmp_path / "run")

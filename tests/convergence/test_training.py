@@ -27,6 +27,7 @@ from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
     iterations=60,
+    hierarchy="laplacian",
     sh_degree=1,
     sh_every=10,
     densification=Densification(start=3, until=45, every=5, reset_every=12, prune=0.02),
@@ -83,7 +84,9 @@ def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path:
 
 
 def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Path) -> None:
+    """The same one in every hierarchy."""
     archive = train(tmp_path / "run", scene, replace(SETTINGS, levels=1))
+    assert plys(archive) == plys(train(tmp_path / "nested", scene, replace(nested(), levels=1)))
     (record,) = archive.manifest.records
     assert (record.level, record.signed, record.iterations) == (0, False, 60)
     assert record.num_gaussians == len(archive.field(0)) <= record.peak_gaussians

@@ -59,7 +59,7 @@ def test_a_signed_level_where_none_belongs_is_refused(hierarchy: Hierarchy) -> N
 
 def test_parse_hierarchy() -> None:
     assert [parse_hierarchy(name) for name in ("laplacian", "nested")] == [Hierarchy.LAPLACIAN, Hierarchy.NESTED]
-    with pytest.raises(UserInputError, match="--hierarchy gaussian: expected laplacian or nested"):
+    with pytest.raises(UserInputError, match="--hierarchy gaussian: expected nested or laplacian"):
         parse_hierarchy("gaussian")
 
 

@@ -37,6 +37,7 @@ from tests.training_scene import blob_field, ring_scene
 
 SETTINGS = TrainSettings(
     iterations=60,
+    hierarchy="laplacian",
     sh_degree=1,
     sh_every=10,
     densification=Densification(start=3, until=45, every=5, reset_every=12),
@@ -103,11 +104,14 @@ def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(sc
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
     assert TrainSettings.from_manifest(manifest) == settings
-    older = {
-        k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in ("packed", "sparse_adam", "raster")
-    }
+    since = ("packed", "sparse_adam", "raster", "hierarchy")
+    older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
-    assert TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older})) == SETTINGS
+    found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
+    assert found == SETTINGS
+    assert (found.hierarchy, TrainSettings().hierarchy) == ("laplacian", "nested"), (
+        "which is no default of what is read"
+    )
 
 
 # --------------------------------------------------------------------------------------- gsplat's functions on a CPU

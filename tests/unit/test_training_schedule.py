@@ -16,14 +16,16 @@ from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSe
 from lapgs_plugin.training.views import view_index
 
 
-def schedules(settings: TrainSettings) -> list[StageSchedule]:
+def schedules(**values: Any) -> list[StageSchedule]:
+    """Of a base and its residuals."""
+    settings = TrainSettings(hierarchy="laplacian", **values)
     split = None if settings.split is None else parse_split(",".join(settings.split))
-    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, split)
+    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, split, Hierarchy.LAPLACIAN)
     return [StageSchedule.create(settings, stage) for stage in plan]
 
 
 def test_a_single_stage_of_30000_has_the_published_constants() -> None:
-    (schedule,) = schedules(TrainSettings(levels=1))
+    (schedule,) = schedules(levels=1)
     assert (schedule.densify_start, schedule.densify_until) == (500, 15_000)
     assert (schedule.densify_every, schedule.reset_every, schedule.sh_every) == (100, 3000, 1000)
     assert schedule.means_learning_rate(0) == pytest.approx(1.6e-4)
@@ -33,7 +35,7 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
 
 
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
-    base, residual = schedules(TrainSettings(levels=2, split=("1/3", "2/3")))
+    base, residual = schedules(levels=2, split=("1/3", "2/3"))
     assert (base.densify_until, residual.densify_until) == (5000, 10_000)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
@@ -42,7 +44,7 @@ def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
 
 def test_given_constants_are_kept_in_short_runs() -> None:
     chosen = Densification(start=7, until=600, every=11, reset_every=13)
-    base, residual = schedules(TrainSettings(iterations=900, split=("1/3", "2/3"), densification=chosen, sh_every=5))
+    base, residual = schedules(iterations=900, split=("1/3", "2/3"), densification=chosen, sh_every=5)
     assert (base.densify_until, residual.densify_until) == (200, 400)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (7, 11, 13)
@@ -50,24 +52,24 @@ def test_given_constants_are_kept_in_short_runs() -> None:
 
 
 def test_late_in_a_stage_eight_views_make_a_step() -> None:
-    base, residual = schedules(TrainSettings(iterations=30_000))
+    base, residual = schedules(iterations=30_000)
     for schedule in (base, residual):
         assert (schedule.gather_from, schedule.gather) == (11_251, 8)
         stepping = [i for i in range(1, 15_001) if schedule.steps(i)]
         assert stepping[:11_250] == list(range(1, 11_251))
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
-    assert schedules(TrainSettings(iterations=3000))[1].gather == 8
-    assert schedules(TrainSettings(iterations=2560))[1].gather == 8  # 40 steps of the last 320 iterations
-    assert schedules(TrainSettings(iterations=2550))[1].gather == 1
-    assert schedules(TrainSettings(iterations=2550, gather=4))[1].gather == 4
-    assert all(schedule.gather == 1 for schedule in schedules(TrainSettings(gather=1)))
+    assert schedules(iterations=3000)[1].gather == 8
+    assert schedules(iterations=2560)[1].gather == 8  # 40 steps of the last 320 iterations
+    assert schedules(iterations=2550)[1].gather == 1
+    assert schedules(iterations=2550, gather=4)[1].gather == 4
+    assert all(schedule.gather == 1 for schedule in schedules(gather=1))
 
 
 def test_pruning_waits_for_the_end_of_densification_and_for_a_step() -> None:
     def prunes(levels: int = 1, **densification: Any) -> list[int | None]:
-        settings = TrainSettings(levels=levels, densification=Densification(**densification))
-        return [schedule.prunes_after for schedule in schedules(settings)]
+        found = schedules(levels=levels, densification=Densification(**densification))
+        return [schedule.prunes_after for schedule in found]
 
     assert prunes() == [15_000]
     assert prunes(levels=2) == [7500, 7500]

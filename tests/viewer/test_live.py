@@ -38,10 +38,9 @@ def page() -> Iterator[Page]:
         yield page
 
 
-def train(folder: Path, watcher: Watcher, iterations: int) -> RunArchive:
-    settings = TrainSettings(
-        iterations=iterations, levels=2, sh_degree=1, densification=Densification(start=20, every=20)
-    )
+def train(folder: Path, watcher: Watcher, iterations: int, hierarchy: str = "laplacian") -> RunArchive:
+    calm = Densification(start=20, every=20)
+    settings = TrainSettings(iterations=iterations, hierarchy=hierarchy, sh_degree=1, densification=calm)
     scene = ring_scene()
     reference = SceneReference(str(scene.path), "full", True, scene.background, "colmap")
     manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
@@ -68,11 +67,16 @@ class Watched(LiveView):
 
 
 def watched_run(
-    folder: Path, page: Page, watcher: Watched, client_does: Callable[[WireClient], None], iterations: int = 150
+    folder: Path,
+    page: Page,
+    watcher: Watched,
+    client_does: Callable[[WireClient], None],
+    iterations: int = 150,
+    **options: str,
 ) -> RunArchive:
     """Train in a thread while a client looks on."""
     result: list[RunArchive] = []
-    thread = threading.Thread(target=lambda: result.append(train(folder, watcher, iterations)))
+    thread = threading.Thread(target=lambda: result.append(train(folder, watcher, iterations, **options)))
     thread.start()
     try:
         with wire_client(page.address) as client:
@@ -94,17 +98,20 @@ def same_bits(one: RunArchive, other: RunArchive) -> bool:
     )
 
 
-def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(page: Page, tmp_path: Path) -> None:
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(
+    page: Page, tmp_path: Path, hierarchy: str
+) -> None:
     watcher = Watched(page)
     watcher._percent.value = 50.0
 
     def look(client: WireClient) -> None:
         wait_for(lambda: client.listen(0.05) > 0 and any("training level 0 of 2" in text for text in client.words))
 
-    archive = watched_run(tmp_path / "watched", page, watcher, look)
+    archive = watched_run(tmp_path / "watched", page, watcher, look, hierarchy=hierarchy)
     assert watcher.looks > 3
     assert all(record.overhead_seconds["view"] > 0 for record in archive.manifest.records)
-    assert same_bits(archive, train(tmp_path / "alone", Watcher(), 150))
+    assert same_bits(archive, train(tmp_path / "alone", Watcher(), 150, hierarchy))
 
 
 def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: Path) -> None:
