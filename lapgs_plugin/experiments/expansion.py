@@ -13,6 +13,7 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.schema import Backbone, Experiment, SampleScene, Scenes, Variant, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
+from lapgs_plugin.plan import DEFAULT_HIERARCHY
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,12 @@ def _spec(
     seed: int,
 ) -> RunSpec:
     preset = PRESETS[backbone.preset].arguments(scene.name) if backbone.preset else []
-    # What sets up a hierarchy means nothing to a script that runs by itself.
-    options = {**backbone.options, **variant.options} if backbone.checkout is None or variant.method != "bare" else {}
+    options = {**backbone.options, **variant.options}
+    if variant.method != "bare":
+        # Said even where the file does not: what a result is of must not change with a default.
+        options = {"hierarchy": DEFAULT_HIERARCHY.value, **options}
+    elif backbone.checkout is not None:
+        options = {}  # what sets up a hierarchy means nothing to a script that runs by itself
     return RunSpec(
         scene=scene.name,
         dataset=scene.dataset,

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
+from lapgs_plugin.plan import DEFAULT_HIERARCHY, Hierarchy
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -22,6 +23,8 @@ else:
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without dashes in front and with underscores inside."""
+RESIDUAL_OPTIONS = {"supervision": "reconstructed", "inherit": None, "joint": 0.0, "residual_color_rate": None}
+"""Those that only residuals have, and what of them says no more than leaving them out; None where nothing does."""
 
 
 class _Part(BaseModel):
@@ -283,3 +286,18 @@ def _check_options(path: Path, experiment: Experiment, option_names: Mapping[str
         for variant in experiment.variants:
             if not variant.backbones or key in variant.backbones:
                 check(f"variant {variant.name!r}", variant.options, backbone.command)
+                if variant.method != "bare" or backbone.checkout is None:
+                    options = {**backbone.options, **variant.options}
+                    _check_residuals(f"{path}: variant {variant.name!r} on backbone {key!r}", options)
+
+
+def _check_residuals(where: str, options: Mapping[str, Any]) -> None:
+    """Refuse what the command would refuse, before the first run starts."""
+    if options.get("hierarchy", DEFAULT_HIERARCHY.value) != Hierarchy.NESTED.value:
+        return
+    for name, idle in RESIDUAL_OPTIONS.items():
+        if options.get(name, idle) != idle:
+            raise UserInputError(
+                f"{where} sets {name}, which is about residuals, and nested levels have none; leave it out, or add "
+                f'hierarchy = "{Hierarchy.LAPLACIAN.value}" to train residuals'
+            )

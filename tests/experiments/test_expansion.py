@@ -74,6 +74,21 @@ def test_variants_trained_alike_share_their_runs_and_a_new_name_repeats_none() -
     assert ids["xyz"] == ids["rho = 1"] != ids["other"]
 
 
+def test_a_run_says_which_hierarchy_it_trains() -> None:
+    """Results of residuals are not taken for those of what has become the default."""
+    variants = [
+        {"name": "nested", "options": {"hierarchy": "nested"}},
+        {"name": "default"},
+        {"name": "residuals", "options": {"hierarchy": "laplacian"}},
+    ]
+    planned = plan_runs(experiment(variants=variants), Selection(scenes=["a"], seeds=[0]))
+    for backbone in ("cpu", "fast"):
+        specs = {run.variant: run.spec for run in planned if run.spec.backbone == backbone}
+        found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
+        assert found == {"nested": "nested", "default": "nested", "residuals": "laplacian"}
+        assert specs["nested"].run_id == specs["default"].run_id != specs["residuals"].run_id
+
+
 def test_what_is_selected_is_what_is_run() -> None:
     selection = Selection(scenes=["b"], backbones=["fast"], variants=["bare"], seeds=[7], iterations=9)
     (run,) = plan_runs(experiment(), selection)
