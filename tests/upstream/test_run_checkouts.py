@@ -60,7 +60,8 @@ def test_two_levels(variable: str, hierarchy: str, scene: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
-    done = run(variable, scene, tmp_path / "run", "--levels", "3", "--prune", "0.01", "--breakdown")
+    options = ("--hierarchy", "laplacian", "--levels", "3", "--prune", "0.01", "--breakdown")
+    done = run(variable, scene, tmp_path / "run", *options)
     archive = RunArchive.open(done.folder)
     assert archive.available_levels == (2, 1, 0)
     assert archive.manifest.complete
