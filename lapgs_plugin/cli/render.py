@@ -85,8 +85,8 @@ def render(
     """Write the images of RUN: base, each residual, and their composition, for every view or along a camera path.
 
     Files are called <view>_base, <view>_residual_<level> and <view>_composed, in one folder for held-out and one for
-    training views. Base and residuals have their own level's size. In PNG residuals lie around mid-grey: zero is grey,
-    lighter adds, darker takes away.
+    training views. Base and residuals have their own level's size; of nested levels a residual is what its level adds.
+    In PNG residuals lie around mid-grey: zero is grey, lighter adds, darker takes away.
 
     Examples:
 
