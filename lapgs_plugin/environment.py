@@ -162,6 +162,11 @@ def torch_findings(probe: Probe, driver: str) -> list[Finding]:
     return [*found, Finding("GPU", "problem", f"driver {driver}, but PyTorch is built without CUDA", advice)]
 
 
+def gpus_are_hidden() -> bool:
+    """Whether CUDA_VISIBLE_DEVICES says that there are none."""
+    return os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
+
+
 def driver_version() -> str:
     """Version of the NVIDIA driver, "" without one."""
     output, error = _run(["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"])
@@ -266,18 +271,27 @@ def _applies(text: str) -> bool:
 
 
 def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:
-    """Whether gsplat's CUDA part can be used here. Its Python part, which training uses, is a package like others."""
-    spec = importlib.util.find_spec("gsplat")
-    if spec is None or not spec.submodule_search_locations:
+    """Whether gsplat's CUDA part can be used here. Its Python part, whose densification trains on a CPU as well, is a
+    package like others."""
+    built = gsplat_built()
+    if built is None:
         return Finding("gsplat CUDA part", "absent", "gsplat is not installed")
     if torch.error or not torch.facts["gpus"]:
         return Finding("gsplat CUDA part", "absent", "PyTorch sees no GPU to use it on")
-    if any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations):
+    if built:
         return Finding("gsplat CUDA part", "ok", "built")
     if nvcc:
         return Finding("gsplat CUDA part", "ok", "not built yet; gsplat compiles it at first use, for some minutes")
     advice = "install the CUDA toolkit, or a gsplat wheel built for this PyTorch"
     return Finding("gsplat CUDA part", "problem", "not built, and there is no nvcc to compile it", advice)
+
+
+def gsplat_built() -> bool | None:
+    """Whether the installed gsplat came with its CUDA part, or None without gsplat. Imports nothing."""
+    spec = importlib.util.find_spec("gsplat")
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    return any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
 
 
 def extension_finding(module: str, purpose: str) -> Finding:

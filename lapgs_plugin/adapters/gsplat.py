@@ -10,12 +10,10 @@ also asks how many Gaussians are visible.
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import weakref
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,6 +21,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters import gsplat_direct
 from lapgs_plugin.camera import Camera
+from lapgs_plugin.environment import gsplat_built
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.raster import FieldStack, RenderResult, Semantics
@@ -51,12 +50,11 @@ def missing() -> str:
     """Why gsplat cannot render on this machine, as a clause; empty where it can. Imports and compiles nothing."""
     if not torch.cuda.is_available():
         return "PyTorch sees no CUDA device"
-    spec = importlib.util.find_spec("gsplat")
-    if spec is None or not spec.submodule_search_locations:
+    built = gsplat_built()
+    if built is None:
         return "gsplat is not installed"
     from torch.utils.cpp_extension import CUDA_HOME
 
-    built = any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
     return "" if built or CUDA_HOME else "gsplat's CUDA part is not built, and there is no nvcc to build it"
 
 

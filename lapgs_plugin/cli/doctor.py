@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
 IMPORTED = ("OpenImageIO", "pycolmap")
 """Packages with compiled parts that no other probe imports."""
-NOT_IN_THE_WAY = ("GPU", "Kernel cache")
-"""What may be broken while training on the CPU still works."""
+NOT_IN_THE_WAY = ("Kernel cache",)
+"""What may be broken while training still works."""
+ON_THE_CPU = "`lapgs train --rasterizer cpu` does without"
 MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold red]!![/bold red]"}
 
 
@@ -88,19 +89,24 @@ def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
-    """What training will use, or what stands in its way."""
-    from lapgs_plugin.environment import Finding
+    """What `lapgs train` will use, or what stands in its way, by the rule of `training.backend.choose_rasterizer`."""
+    from lapgs_plugin.environment import Finding, gpus_are_hidden
 
     needed = [*sections["System"], *sections["PyTorch"], *sections["CPU rasterizer"], *sections["Packages"]]
     broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_IN_THE_WAY]
+    if gpus_are_hidden():
+        broken = [name for name in broken if name != "GPU"]
+    advice = "see the lines !!"
+    if broken == ["GPU"]:
+        advice += f"; {ON_THE_CPU}"
+    if not broken and torch.facts["gpus"]:
+        gsplat = sections["Backbones"][0]
+        if gsplat.status == "ok":
+            return [Finding("will use", "ok", f"gsplat on the GPU, {torch.facts['gpus'][0]}")]
+        broken, advice = [gsplat.name], f"{gsplat.advice or gsplat.detail}; {ON_THE_CPU}"
     if broken:
-        return [
-            Finding("will use", "problem", f"nothing until this is mended: {', '.join(broken)}", "see the lines !!")
-        ]
-    found = [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]
-    if torch.facts["gpus"]:
-        found.append(Finding("will not use", "absent", "the GPU: this version trains on the CPU"))
-    return found
+        return [Finding("will use", "problem", f"nothing until this is mended: {', '.join(broken)}", advice)]
+    return [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]
 
 
 def _print(sections: dict[str, list[Finding]]) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
 from lapgs_plugin.adapters import gsplat
-from lapgs_plugin.environment import driver_version
+from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.rendering.rasterizers import PlacedRasterizer
@@ -34,7 +32,7 @@ def choose_rasterizer(name: str) -> str:
     if name != AUTO:
         return name
     if not torch.cuda.is_available():
-        if os.environ.get("CUDA_VISIBLE_DEVICES") not in ("", "-1") and (driver := driver_version()):
+        if not gpus_are_hidden() and (driver := driver_version()):
             build = f"which is built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
             raise MissingExtraError(
                 f"there is a GPU with driver {driver}, and PyTorch {torch.__version__}, {build}, cannot use it; "

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
+from typing import Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from lapgs_plugin import environment
-from lapgs_plugin.cli.doctor import doctor
+from lapgs_plugin.cli.doctor import doctor, examine
 from lapgs_plugin.environment import Probe
 from tests.contract.stub_runs import CHECKOUTS
 
+probed = lru_cache(environment.run_probe)
 app = typer.Typer()
 app.command()(doctor)
 
@@ -38,6 +41,46 @@ def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.Monkey
     assert "[libfoo] is gone" in result.stdout  # not taken for markup
     assert "python -m pip install --force-reinstall torch" in result.stdout
     assert "nothing until this is mended" in result.stdout
+
+
+TORCH = {"version": "2.11.0", "cuda": "13.0", "gpus": [], "complaint": ""}
+GPU = "NVIDIA H200, 140 GiB"
+
+
+@pytest.mark.parametrize(
+    ("facts", "driver", "built", "hidden", "status", "detail"),
+    [
+        ({"gpus": [GPU]}, "580.1", True, None, "ok", f"gsplat on the GPU, {GPU}"),
+        ({"gpus": [GPU]}, "580.1", None, None, "problem", "nothing until this is mended: gsplat CUDA part"),
+        ({"gpus": [GPU]}, "580.1", False, None, "problem", "nothing until this is mended: gsplat CUDA part"),
+        ({"complaint": "too old"}, "470.1", True, None, "problem", "nothing until this is mended: GPU"),
+        ({"cuda": None}, "580.1", True, None, "problem", "nothing until this is mended: GPU"),
+        ({"complaint": "no device"}, "580.1", True, "", "ok", "the CPU rasterizer"),
+        ({}, "", True, None, "ok", "the CPU rasterizer"),
+    ],
+)
+def test_what_training_will_use(
+    monkeypatch: pytest.MonkeyPatch,
+    facts: dict[str, Any],
+    driver: str,
+    built: bool | None,
+    hidden: str | None,
+    status: str,
+    detail: str,
+) -> None:
+    """As `choose_rasterizer` has it: a GPU that cannot be used stands in the way, unless it is hidden."""
+    found = Probe({**TORCH, **facts})
+    monkeypatch.setattr(environment, "run_probe", lambda *given: found if given == ("torch",) else probed(*given))
+    monkeypatch.setattr(environment, "driver_version", lambda: driver)
+    monkeypatch.setattr(environment, "gsplat_built", lambda: built)
+    monkeypatch.setattr(environment.shutil, "which", lambda name, path=None: None)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if hidden is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    (conclusion,) = examine()["lapgs train"]
+    assert conclusion.status == status
+    assert conclusion.detail.startswith(detail)
+    assert ("--rasterizer cpu" in conclusion.advice) == (status == "problem")
 
 
 def test_the_current_folder_is_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
