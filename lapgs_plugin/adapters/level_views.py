@@ -95,8 +95,9 @@ class PhotoAlbum:
         return self._photos[key]
 
     def smallest_size(self) -> tuple[int, int]:
-        """(width, height) of the image with the fewest pixels."""
-        return min((photo.size for photo in self._photos.values()), key=lambda size: size[0] * size[1])
+        """Smallest width and smallest height over all images, as `Scene.smallest_size` has it."""
+        sizes = [photo.size for photo in self._photos.values()]
+        return min(width for width, _ in sizes), min(height for _, height in sizes)
 
 
 def view_name(key: str) -> str:

@@ -18,6 +18,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.signed_color import signed_degree
 from tests.contract.stub_runs import (
@@ -103,6 +104,19 @@ def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_p
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
     assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 8e-5 seen: predictions are float16
+
+
+def test_photos_on_end_between_photos_across(blender: Path, tmp_path: Path) -> None:
+    """Evaluation asks the scene for the size that a run was planned at, as the run asked the checkout's cameras."""
+    mixed = tmp_path / "scene"
+    shutil.copytree(blender, mixed)
+    for path in (mixed / "train" / "r_1.png", mixed / "test" / "r_0.png"):
+        Image.open(path).transpose(Image.Transpose.ROTATE_90).save(path)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], mixed, tmp_path / "run", *SHORT)
+    width, height = load_scene(mixed, progress=False).smallest_size
+    assert width == height
+    assert archive.manifest.records[-1].image_size == (width, height)
+    assert evaluate_run(archive)["num_views"] == len(list((mixed / "test").iterdir()))
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)
