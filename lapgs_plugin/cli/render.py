@@ -153,13 +153,13 @@ def _write_clip(
     panels: bool,
     image_format: str,
 ) -> None:
-    from lapgs_plugin.rendering.clip import VIDEO, clip_size, parse_size, render_clip
+    from lapgs_plugin.rendering.clip import VIDEO, clip_size, is_video, parse_size, render_clip
 
     if out.suffix.lower() in OTHER_VIDEOS:
         raise UserInputError(f"--out {out}: expected an {VIDEO} file or a folder for images")
-    if out.suffix == VIDEO and image_format != "png":
+    if is_video(out) and image_format != "png":
         raise UserInputError(f"--format {image_format}: a video has 8 bits; give --out a folder")
-    if out.suffix != VIDEO:
+    if not is_video(out):
         refuse({"--frame-rate": frame_rate}, f"needs an {VIDEO} file as --out")
     wanted = None if size is None else parse_size(size)
     render_clip(

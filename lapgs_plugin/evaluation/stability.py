@@ -1,7 +1,7 @@
 """Flicker along a camera path: what changes between two frames besides the camera.
 
 Each pixel of a frame is followed to the frame before by its rendered depth. Where both frames see the same surface,
-their their colours are compared. Detail that is fixed to its surfaces gives zero, detail that swims does not, and a
+their colours are compared. Detail that is fixed to its surfaces gives zero, detail that swims does not, and a
 residual might swim: image pyramids know nothing of surfaces. What shines changes as well, in every method: the figure
 is for comparing fields of one scene along one path, and both are followed by the same depth.
 """
@@ -156,7 +156,7 @@ def path_frames(
         if single is not None:
             images[SINGLE] = single.render(camera).composed[0].to(images[COMPOSITION]).clamp(0.0, 1.0)
         depth = render_depth(surface.rasterizer, surface.field(solid), camera)
-        yield Frame(camera, depth, images)
+        yield Frame(camera, depth.to(images[COMPOSITION].device), images)
 
 
 def evaluate_stability(

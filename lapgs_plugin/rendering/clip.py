@@ -43,6 +43,11 @@ def parse_size(text: str) -> tuple[int, int]:
     return size
 
 
+def is_video(out: Path) -> bool:
+    """Whether a clip of that name is one file, and no folder of images."""
+    return out.suffix.lower() == VIDEO
+
+
 def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tuple[int, int]:
     """Width and height of each view of a clip.
 
@@ -55,7 +60,7 @@ def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tupl
         UserInputError: a video of an odd size was asked for.
     """
     width, height = wanted or (camera.width, camera.height)
-    if out.suffix != VIDEO or width % 2 == height % 2 == 0:
+    if not is_video(out) or width % 2 == height % 2 == 0:
         return width, height
     if wanted is not None:
         raise UserInputError(
@@ -91,10 +96,8 @@ def render_clip(
         LapgsError: what is written cannot be.
     """
     shown = renderer.levels - level + 1 if panels else 1
-    writer = (
-        video_writer(out, (size[0] * shown, size[1]), fps) if out.suffix == VIDEO else _image_writer(out, image_format)
-    )
-    raw = out.suffix != VIDEO and image_format == "exr"
+    writer = video_writer(out, (size[0] * shown, size[1]), fps) if is_video(out) else _image_writer(out, image_format)
+    raw = not is_video(out) and image_format == "exr"
     with item_progress("frames") as progress, writer as write:
         task = progress.add_task(f"Rendering {out.name}", total=len(cameras))
         for camera in cameras:

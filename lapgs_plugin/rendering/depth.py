@@ -31,6 +31,10 @@ class DepthImage:
     depth: Tensor
     cover: Tensor
 
+    def to(self, device: torch.device) -> DepthImage:
+        """The same on a device."""
+        return DepthImage(self.depth.to(device), self.cover.to(device))
+
 
 @torch.no_grad()
 def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> DepthImage:

@@ -74,7 +74,7 @@ def test_a_video_plays_and_shows_the_path(run: Path, path_file: Path, tmp_path: 
 @needs_video
 @pytest.mark.parametrize("trajectory", ["orbit", "spline"])
 def test_paths_of_the_scene_at_any_size(run: Path, trajectory: str, tmp_path: Path) -> None:
-    out = tmp_path / "new" / "clip.mp4"
+    out = tmp_path / "new" / "clip.MP4"
     lapgs_render(run, "--trajectory", trajectory, "--frames", 7, "--size", "80x32", "--panels", "--out", out)
     frames = video_frames(out)
     assert [frame.shape for frame in frames] == [(32, 3 * 80, 3)] * 7
