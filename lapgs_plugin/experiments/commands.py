@@ -22,6 +22,8 @@ IMPORTED = "lapgs"
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that the schedules of 3DGS codebases are written for."""
 NEVER = "-1"
+NEGATIONS = {"fused-adam": ["--no-fused-adam"]}
+"""How the options are switched off that are on by themselves."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change what a saved field looks like, see `lapgs import-run --set`."""
 
@@ -199,7 +201,7 @@ def _as_options(options: Mapping[str, Any]) -> list[str]:
     for name, value in options.items():
         option = name.replace("_", "-")
         if isinstance(value, bool):
-            words.append(f"--{option}" if value else f"--no-{option}")
+            words += [f"--{option}"] if value else NEGATIONS.get(option, [])
         else:
             words += [f"--{option}", str(value)]
     return words

@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments import commands
 from lapgs_plugin.experiments.commands import Places, run_steps
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
 from lapgs_plugin.experiments.schema import Experiment
@@ -128,6 +132,17 @@ def test_commands_of_the_built_in_trainer(tmp_path: Path) -> None:
     assert measuring.command[-4:] == ("eval", str(tmp_path / "r"), "--lpips", "none")
     (bare,) = run_steps(run_spec(method="bare"), tmp_path, None, tmp_path / "r", None)
     assert words_after(bare.command, "--levels") == ["1"]
+
+
+@pytest.mark.parametrize("command", ["train", "run"])
+def test_flags_on_and_off_are_words_that_the_command_knows(command: str) -> None:
+    parameters = typer.main.get_command(app).commands[command].params
+    allowed = _option_names()[command]
+    flags = [option for option in parameters if option.name in allowed and getattr(option, "is_flag", False)]
+    assert flags
+    for flag in flags:
+        assert commands._as_options({flag.name: True}) == [flag.opts[0]]
+        assert commands._as_options({flag.name: False}) == flag.secondary_opts
 
 
 def test_commands_of_a_checkout(tmp_path: Path) -> None:
