@@ -16,6 +16,7 @@ from lapgs_plugin.cli.options import (
     InheritOption,
     SupervisionOption,
     check_residual_options,
+    given_options,
 )
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
 
 MEMORY = "Memory and speed"
+
+OF_OFF = {"off", "script", "arguments", "record", "backbone", "device", "verbose"}
+"""What `--off` goes with."""
 
 CONTEXT = {"allow_interspersed_args": False}
 """Everything after the script belongs to the script, options included."""
@@ -176,6 +180,11 @@ def run(
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
+    if off and (idle := sorted(given_options(context) - OF_OFF)):
+        options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
+        raise UserInputError(
+            f"{options_given} with --off: nothing is replaced, so there is nothing for that to act on; leave it out"
+        )
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
     check_residual_options(hierarchy, {"--inherit": inherit, "--residual-color-rate": residual_color_rate})
@@ -206,8 +215,6 @@ def run(
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
     checkout, words = require_script(script).parent, arguments or []
-    if off and view:
-        raise UserInputError("--view with --off: nothing is replaced, so nothing can be watched; leave one out")
     watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
     kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
     on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()

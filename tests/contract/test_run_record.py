@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -70,6 +71,24 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
     measured = evaluate_run(archive)
     assert measured["psnr"] == pytest.approx(values["psnr"], abs=1e-4)
     assert measured["ssim"] == pytest.approx(values["ssim"], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (("--breakdown",), "--breakdown"),
+        (("--record", "--test-every", 5), "--test-every"),
+        (("--resume", "--prune", 0.0, "--levels", 2), "--levels, --prune, --resume"),
+        (("--no-fused-adam",), "--fused-adam"),
+    ],
+)
+def test_options_that_off_has_no_use_for(scene: Path, tmp_path: Path, given: tuple[Any, ...], named: str) -> None:
+    stub = STUBS["fastgs"]
+    words = ["run", "--off", *map(str, given), "--device", "cpu", str(stub.script)]
+    error = CliRunner().invoke(app, [*words, *arguments(stub, scene, tmp_path / "out")]).exception
+    assert isinstance(error, UserInputError)
+    assert str(error).startswith(f"{named} with --off: nothing is replaced")
+    assert not (tmp_path / "out").exists()
 
 
 def test_record_without_off(scene: Path, tmp_path: Path) -> None:
