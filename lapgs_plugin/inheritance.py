@@ -41,6 +41,18 @@ def parse_inheritance(text: str) -> tuple[str, float]:
         ) from error
 
 
+def check_inheritance(mode: str, ratio: float) -> None:
+    """Raise what `inherit` would about these arguments, before there is a field.
+
+    Raises:
+        UserInputError: an unknown mode, or a ratio outside (0, 1].
+    """
+    if mode not in INHERIT_MODES:
+        raise UserInputError(f"--inherit {mode}: expected {', '.join(INHERIT_MODES)}")
+    if not 0.0 < ratio <= 1.0:
+        raise UserInputError(f"--inherit {ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)")
+
+
 class Inherited(NamedTuple):
     """A new field and the Gaussians of the old one that it came from.
 
@@ -100,10 +112,7 @@ def inherit(
     Raises:
         UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
     """
-    if mode not in INHERIT_MODES:
-        raise UserInputError(f"--inherit {mode}: expected {', '.join(INHERIT_MODES)}")
-    if not 0.0 < ratio <= 1.0:
-        raise UserInputError(f"inheritance ratio {ratio}: expected above 0 and at most 1 (1 inherits every Gaussian)")
+    check_inheritance(mode, ratio)
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _draw(len(field), ratio, generator).to(field.means.device)

@@ -271,8 +271,14 @@ def check_joint_share(share: float) -> None:
         raise UserInputError(f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25")
 
 
+def check_seed(seed: int) -> None:
+    """Raise a UserInputError about a seed that not every generator takes."""
+    if not 0 <= seed < 2**32:
+        raise UserInputError(f"--seed {seed}: expected 0 to {2**32 - 1}")
+
+
 def check_prune_share(share: float) -> None:
-    """Refuse a share of all blending that cannot be pruned.
+    """Refuse a share of what is seen that cannot be pruned, see `pruning`.
 
     Raises:
         UserInputError: it is not from 0 to below 1.

@@ -32,7 +32,7 @@ def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:
 
 
 def least_blended(pixels: Tensor, share: float) -> Tensor:
-    """(n,) bool, the most Gaussians that together make up at most a share of all that is blended.
+    """(n,) bool, the most Gaussians that together make up at most a share of the sum of `pixels`.
 
     Args:
         pixels: (n,) of each, not negative.

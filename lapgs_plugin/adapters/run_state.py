@@ -19,6 +19,7 @@ from lapgs_plugin.adapters.shim import RasterizerShim, StageRendering
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.imagestore import PLACES, PRECISIONS
+from lapgs_plugin.inheritance import check_inheritance
 from lapgs_plugin.plan import (
     DEFAULT_HIERARCHY,
     RESIDUAL_COLOR_RATE,
@@ -26,6 +27,7 @@ from lapgs_plugin.plan import (
     Stage,
     check_joint_share,
     check_prune_share,
+    check_seed,
     coarse_factor,
     joint_share,
     parse_hierarchy,
@@ -60,8 +62,8 @@ class HierarchyOptions:
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
         coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
             None: by the hierarchy.
-        prune: share of all blending that the Gaussians make up together which are removed when a stage's densification
-            ends; 0 for none.
+        prune: share of what is seen whose Gaussians are removed when a stage's densification ends, see `pruning`; 0 for
+            none.
         images_on: "gpu", "memory", "disk", or "auto" to let their size decide.
         prediction_precision: what cached predictions are stored as before Up, a key of `imagestore.PRECISIONS`.
         fused_adam: let PyTorch's Adam step each tensor in one kernel.
@@ -92,6 +94,8 @@ class HierarchyOptions:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         self.shares()
+        check_seed(self.seed)
+        check_inheritance(self.inherit, self.inherit_ratio)
         check_joint_share(self.joint_share)
         check_prune_share(self.prune)
         for option, factor in (

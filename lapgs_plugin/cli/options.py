@@ -37,8 +37,9 @@ GridOption = Annotated[
     ),
 ]
 PRUNE_HELP = (
-    "When a stage's densification ends, remove the Gaussians least seen, as many as make up this share of all blending "
-    "together: 0.005 takes about a fifth of them."
+    "When a stage's densification ends, remove the least visible Gaussians: each counts with the pixels that it makes "
+    "up in the view that shows most of it, and the least go that make up this share of the sum. 0.005 takes about a "
+    "fifth of them."
 )
 
 
@@ -54,3 +55,9 @@ def check_residual_options(hierarchy: str, given: Mapping[str, object]) -> None:
     """
     if parse_hierarchy(hierarchy) is Hierarchy.NESTED:
         require_no_residuals({option: (value, None) for option, value in given.items()})
+
+
+def given_options(context: typer.Context) -> set[str]:
+    """Parameters that stand on the command line, as opposed to those left at their defaults."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from lapgs_plugin.cli.options import (
     InheritOption,
     SupervisionOption,
     check_residual_options,
+    given_options,
 )
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -50,7 +52,7 @@ def train(
     background: Annotated[
         str, typer.Option(help="Behind the scene and behind transparent pixels: black, white or R,G,B from 0 to 1.")
     ] = "black",
-    seed: Annotated[int, typer.Option(help="The same seed and settings give the same bits.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed and settings give the same bits on a CPU.")] = 0,
     levels: Annotated[
         int, typer.Option(rich_help_panel=HIERARCHY, help="Number of levels; 1 is a plain single field, the baseline.")
     ] = 2,
@@ -87,8 +89,8 @@ def train(
         typer.Option(
             rich_help_panel=SCHEDULE,
             min=1,
-            help="Views whose gradients make one step in the last quarter of a stage, if it is long enough for 40 of "
-            "them; 1 steps with every view as 3DGS does.",
+            help="Views whose gradients are added up for each optimizer step in the last quarter of a stage, once "
+            "densification has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         ),
     ] = 8,
     densify_from: Annotated[
@@ -108,10 +110,18 @@ def train(
             f"gives coarse levels fewer Gaussians. Default: {NESTED_COARSE_THRESHOLD:g}, and 1 for residuals.",
         ),
     ] = None,
-    densify_every: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations in between.")] = 100,
+    densify_every: Annotated[
+        int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations between two densifications.")
+    ] = 100,
     prune: Annotated[float, typer.Option(rich_help_panel=SCHEDULE, help=PRUNE_HELP)] = 0.0,
     opacity_reset_every: Annotated[
-        int | None, typer.Option(rich_help_panel=SCHEDULE, help="Default: 3000 of 30000.")
+        int | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            min=0,
+            help="Iterations between two resets of all opacities; 0 never resets. Default: 3000 of 30000, and of "
+            "nested levels in the base alone.",
+        ),
     ] = None,
     strategy: Annotated[
         str,
@@ -132,7 +142,7 @@ def train(
         bool, typer.Option("--packed", rich_help_panel=GSPLAT, help="Less memory where a view sees little; slower.")
     ] = False,
     sparse_adam: Annotated[
-        bool, typer.Option("--sparse-adam", rich_help_panel=GSPLAT, help="Step the Gaussians of the view alone.")
+        bool, typer.Option("--sparse-adam", rich_help_panel=GSPLAT, help="Step only the Gaussians that the view shows.")
     ] = False,
     rasterizer: Annotated[
         str,
@@ -249,17 +259,22 @@ def train(
     reference = SceneReference(str(scene.absolute()), resolution, hold_out, _color(background), images=images, kind="")
     console = Console(stderr=True)
     if resume:
-        given = _given(context) - ({"rasterizer"} if rasterizer == AUTO else set())
+        given = given_options(context) - ({"rasterizer"} if rasterizer == AUTO else set())
         archive = _resume(out, _options(reference, settings, rasterizer), given)
         reference = replace(archive.manifest.scene, path=reference.path)
         loaded = _load(reference)
+        kept = {
+            name: value for name, value in (("cache", cache), ("cache_precision", cache_precision)) if name in given
+        }
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(rasterizer), overwrite)
+        kept = {}
     with archive:
         _run(
             archive,
             loaded,
             console,
+            kept,
             threads=threads,
             test_every=test_every,
             breakdown=breakdown,
@@ -282,12 +297,6 @@ def _color(text: str) -> tuple[float, float, float]:
     if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
         raise UserInputError(f"--background {text!r}: expected three values from 0 to 1")
     return red, green, blue
-
-
-def _given(context: typer.Context) -> set[str]:
-    """Options that stand on the command line, as opposed to those left at their defaults."""
-    sources = {name: context.get_parameter_source(name) for name in context.params}
-    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
@@ -378,6 +387,7 @@ def _run(
     archive: RunArchive,
     scene: Scene,
     console: Console,
+    kept: Mapping[str, Any],
     *,
     threads: int | None,
     test_every: int | None,
@@ -386,20 +396,21 @@ def _run(
     resume: bool,
     watcher: Watcher,
 ) -> None:
-    """Train with a progress display."""
+    """Train with a progress display; `kept` says anew where predictions are and how precisely, for a run continued."""
     import torch
 
     from lapgs_plugin.reference_raster.threads import one_pool
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import ProgressMonitor
     from lapgs_plugin.training.settings import TrainSettings
-    from lapgs_plugin.training.trainer import Trainer
+    from lapgs_plugin.training.trainer import Trainer, check_cache
 
     if threads is not None:
         torch.set_num_threads(threads)
     manifest = archive.manifest
-    settings = TrainSettings.from_manifest(manifest)
+    settings = replace(TrainSettings.from_manifest(manifest), **kept)
     placed = training_rasterizer(manifest.rasterizer, settings)
+    check_cache(settings, placed.device)
     with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
         trainer = Trainer(
             scene=scene,

@@ -8,12 +8,14 @@ from typing import Any
 
 from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.inheritance import check_inheritance
 from lapgs_plugin.plan import (
     DEFAULT_HIERARCHY,
     Hierarchy,
     Stage,
     check_joint_share,
     check_prune_share,
+    check_seed,
     coarse_factor,
     nested_densify_until,
     parse_hierarchy,
@@ -25,8 +27,8 @@ from lapgs_plugin.supervision import joint_from, parse_supervision
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""
 LATE_SHARE = 0.25
-"""Of a stage, its last, in which the gradients of some views make one step. Positions hardly move any more, and what
-single views disagree about is noise; earlier, steps are what is short."""
+"""Of a stage, its last, in which the gradients of some views make one step, once densification has ended. Positions
+hardly move any more, and what single views disagree about is noise; earlier, steps are what is short."""
 LEAST_STEPS = 40
 """In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views
 lost 0.08 dB, of one field 0.13."""
@@ -68,13 +70,13 @@ class Densification:
     start: int | None = None
     until: int | None = None
     every: int = 100
-    reset_every: int | None = None
+    reset_every: int | None = None  # 0: never
     grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
     coarse_threshold: float | None = None  # factor on it each time that images are halved; None: by the hierarchy
     strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
     absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
     cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
-    prune: float = 0.0  # share of all blending that those make up together which are removed when densification ends
+    prune: float = 0.0  # share of what is seen that goes when densification ends, see `pruning`
 
 
 @dataclass(frozen=True)
@@ -110,10 +112,8 @@ class TrainSettings:
             raise UserInputError(f"--strategy {self.densification.strategy}: expected {' or '.join(STRATEGIES)}")
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
-        if not 0.0 < self.inherit_ratio <= 1.0:
-            raise UserInputError(
-                f"--inherit {self.inherit_ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)"
-            )
+        check_seed(self.seed)
+        check_inheritance(self.inherit, self.inherit_ratio)
         check_joint_share(self.joint)
         if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED:
             require_no_residuals(
@@ -127,12 +127,32 @@ class TrainSettings:
         if factor is not None and not (factor > 0.0 and math.isfinite(factor)):
             raise UserInputError(f"--coarse-threshold {factor}: expected a positive factor")
         check_prune_share(self.densification.prune)
-        if self.densification.prune and self.densification.strategy == "mcmc":
-            raise UserInputError("--prune with --strategy mcmc: it moves Gaussians that are not seen; leave one out")
+        if (resets := self.densification.reset_every) is not None and resets < 0:
+            raise UserInputError(f"--opacity-reset-every {resets}: expected a number of iterations, or 0 for never")
+        self._check_strategy()
         if self.gather < 1:
             raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+
+    def _check_strategy(self) -> None:
+        """Refuse what the strategy has no use for."""
+        given = self.densification
+        if given.strategy != "mcmc":
+            if given.cap_max != Densification.cap_max:
+                raise UserInputError(f"--cap-max {given.cap_max}: only --strategy mcmc has a limit; leave it out")
+            return
+        idle = {
+            "--prune": given.prune,
+            "--absgrad": given.absgrad,
+            "--coarse-threshold": given.coarse_threshold,
+            "--opacity-reset-every": given.reset_every,
+        }
+        if options := [option for option, value in idle.items() if value]:
+            raise UserInputError(
+                f"{', '.join(options)} with --strategy mcmc: it moves transparent Gaussians, looks at no gradient and "
+                "resets nothing; leave one out"
+            )
 
     def densification_of(self, stage: Stage) -> Densification:
         """Density control of a stage: as set, with a threshold for its size."""
@@ -203,16 +223,20 @@ class StageSchedule:
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
-        late = round(stage.iterations * LATE_SHARE)
         resets = constant(given.reset_every, 3000, 300)
+        if given.reset_every == 0 or (before and given.reset_every is None):
+            resets = stage.iterations + 1  # never
         until = constant(given.until, REFERENCE_ITERATIONS * 5 // 6 if given.strategy == "mcmc" else 15_000, 1)
         of_stage = round(until * stage.iterations / settings.iterations)
+        densify_until = nested_densify_until(of_stage) if before else of_stage
+        # A refinement replaces parameters, and with them the gradients that wait for those of other views.
+        late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         return cls(
             iterations=stage.iterations,
             densify_start=constant(given.start, 500, 1),
-            densify_until=nested_densify_until(of_stage) if before else of_stage,
+            densify_until=densify_until,
             densify_every=given.every,
-            reset_every=stage.iterations + 1 if before and given.reset_every is None else resets,
+            reset_every=resets,
             sh_every=constant(settings.sh_every, 1000, 1),
             sh_degree=settings.sh_degree,
             means_first=settings.learning_rates.means_first,
@@ -229,9 +253,8 @@ class StageSchedule:
 
     @property
     def prunes_after(self) -> int | None:
-        """The first iteration with a step since densification has ended; None without one, or with none after it."""
-        ends = range(self.densify_until, self.iterations if self.densify_until > self.densify_start else 0)
-        return next((iteration for iteration in ends if self.steps(iteration)), None)
+        """The iteration that ends densification; None where there is none, or nothing comes after it."""
+        return self.densify_until if self.densify_start < self.densify_until < self.iterations else None
 
     def means_learning_rate(self, iteration: int) -> float:
         """Log-linear decay from the first iteration to the last, in units of the scene's extent."""

@@ -139,5 +139,6 @@ def view_index(iteration: int, count: int, seed: int, level: int) -> int:
 @lru_cache(maxsize=4)
 def _order(count: int, seed: int) -> list[int]:
     """The views of an epoch."""
-    order: list[int] = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    generator = torch.Generator().manual_seed(seed % 2**63)  # all that it takes; dates as seeds go beyond it
+    order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order

@@ -108,7 +108,10 @@ def test_runs_from_before_nesting_go_on_with_residuals(tmp_path: Path) -> None:
     other = lapgs(*words, "--hierarchy", "nested")
     assert other.returncode == 2
     assert "--hierarchy asks for nested, but the run" in other.stderr.replace("\n", " ")
-    done = lapgs(*words)
+    misplaced = lapgs(*words, "--cache", "gpu")
+    assert misplaced.returncode == 2
+    assert "gpu: expected memory or disk" in misplaced.stderr.replace("\n", " ")
+    done = lapgs(*words, "--cache", "disk", "--cache-precision", "float16")  # another place than it was started with
     assert done.returncode == 0, done.stderr
     assert [record.signed for record in RunArchive.open(run).manifest.records] == [False, True]
 

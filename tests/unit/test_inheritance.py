@@ -166,7 +166,7 @@ def test_scales_of_a_subset_follow_its_own_spacing() -> None:
 
 @pytest.mark.parametrize("ratio", [0.0, -0.5, 1.0001, math.nan, math.inf])
 def test_ratios_outside_the_unit_interval_are_refused(ratio: float) -> None:
-    with pytest.raises(UserInputError, match="expected above 0 and at most 1"):
+    with pytest.raises(UserInputError, match="expected a ratio above 0 and at most 1"):
         inherit(base_field(), "xyz", ratio)
 
 

@@ -99,7 +99,7 @@ def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
 
 
 def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
-    strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500)
+    strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500, reset_every=None)
     settings = replace(SETTINGS, densification=strategy, packed=True, raster={"antialiasing": True})
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())

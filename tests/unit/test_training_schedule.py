@@ -66,15 +66,14 @@ def test_late_in_a_stage_eight_views_make_a_step() -> None:
     assert all(schedule.gather == 1 for schedule in schedules(gather=1))
 
 
-def test_pruning_waits_for_the_end_of_densification_and_for_a_step() -> None:
+def test_pruning_waits_for_the_end_of_densification() -> None:
     def prunes(levels: int = 1, **densification: Any) -> list[int | None]:
         found = schedules(levels=levels, densification=Densification(**densification))
         return [schedule.prunes_after for schedule in found]
 
     assert prunes() == [15_000]
     assert prunes(levels=2) == [7500, 7500]
-    # Steps of eight views from 22,501 on: the first one at or after 25,001 is the 314th of them.
-    assert prunes(until=25_001) == [22_500 + 8 * 313]
+    assert prunes(until=25_001) == [25_001]
     assert prunes(until=30_000) == [None]
     assert prunes(until=500) == prunes(until=0) == [None]
 
@@ -83,6 +82,31 @@ def test_pruning_waits_for_the_end_of_densification_and_for_a_step() -> None:
 def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epoch: int) -> None:
     seen = Counter(view_index(epoch * count + i + 1, count, seed, level) for i in range(count))
     assert seen == Counter(range(count))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 20), st.integers(0, 100_000))
+def test_every_seed_orders_views(seed: int, level: int, epoch: int) -> None:
+    """A date, as 20240101, once asked the generator for more than 64 bits."""
+    assert sorted(view_index(epoch * 3 + i + 1, 3, seed, level) for i in range(3)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("until", "begins"), [(None, 22_501), (22_000, 22_501), (25_000, 25_001), (29_679, 29_680)])
+def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, begins: int) -> None:
+    """A refinement in between would throw the gradients away that wait for those of other views."""
+    (schedule,) = schedules(levels=1, densification=Densification(until=until))
+    assert next(i for i in range(1, 30_001) if not schedule.steps(i)) == begins
+
+
+@pytest.mark.parametrize("until", [29_681, 30_000, 40_000])
+def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
+    """What is left is too short for 40 steps of 8 views."""
+    (schedule,) = schedules(levels=1, densification=Densification(until=until))
+    assert all(schedule.steps(i) for i in range(1, 30_001))
+
+
+def test_opacities_are_never_reset_where_that_is_asked_for() -> None:
+    for schedule in schedules(densification=Densification(reset_every=0)):
+        assert not any(i % schedule.reset_every == 0 for i in range(1, schedule.iterations + 1))
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
@@ -103,6 +127,19 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"densification": Densification(prune=1.0)}, "--prune 1.0: expected a share from 0"),
         ({"densification": Densification(prune=math.nan)}, "--prune nan"),
         ({"densification": Densification(prune=0.01, strategy="mcmc")}, "--prune with --strategy mcmc"),
+        (
+            {"densification": Densification(reset_every=9, strategy="mcmc")},
+            "--opacity-reset-every with --strategy mcmc",
+        ),
+        (
+            {"densification": Densification(absgrad=True, coarse_threshold=2.0, strategy="mcmc")},
+            "--absgrad, --coarse-threshold with --strategy mcmc",
+        ),
+        ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
+        ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
+        ({"inherit": "most"}, "--inherit most: expected geometry"),
+        ({"seed": -1}, "--seed -1: expected 0 to 4294967295"),
+        ({"seed": 2**32}, "--seed 4294967296"),
     ],
 )
 def test_bad_settings_say_what_is_expected(values: dict[str, Any], message: str) -> None:
