@@ -296,7 +296,8 @@ class RunArchive:
         Args:
             path: the folder.
             resume: hold it for writing.
-            check: False leaves fields unlooked at until `field` reads them, for whoever can do with some of them.
+            check: False leaves fields unlooked at until `field` reads them, for callers to whom a part of a run
+                is of use.
 
         Raises:
             RunFolderError: there is no run, it was written by another version, a level's PLY is missing or cut short,

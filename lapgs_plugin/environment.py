@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import packaging.requirements
+from packaging.version import Version
 
 PACKAGE = "lapgs_plugin"
 PROBE_TIMEOUT = 60.0
@@ -260,14 +261,19 @@ def own_requirements() -> list[Requirement]:
         texts = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
         return []
-    return [_parse_requirement(text) for text in texts if _applies(text)]
+    extras = ("", *(metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()))
+    parsed = [packaging.requirements.Requirement(text) for text in texts]
+    return [
+        _own(requirement, extra)
+        for requirement in parsed
+        for extra in extras
+        if _applies(requirement, extra) and not (extra and _applies(requirement, ""))
+    ]
 
 
-def _applies(text: str) -> bool:
-    """Whether a requirement's marker, extras aside, holds here."""
-    marker = packaging.requirements.Requirement(text).marker
-    extra = _parse_requirement(text).extra
-    return marker is None or marker.evaluate({"extra": extra})
+def _applies(requirement: packaging.requirements.Requirement, extra: str) -> bool:
+    """Whether a requirement's marker, the extra aside, holds here."""
+    return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
 def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:
@@ -313,25 +319,15 @@ def _package_finding(requirement: Requirement) -> Finding:
     install = f"python -m pip install '{requirement.text}'"
     if version is None:
         return Finding(requirement.name, "problem", "not installed", install)
-    if _numbers(version) < _numbers(requirement.minimum):
+    if requirement.minimum and Version(version) < Version(requirement.minimum):
         detail = f"{version} is older than {requirement.minimum}, which is needed"
         return Finding(requirement.name, "problem", detail, install)
     return Finding(requirement.name, "ok", version)
 
 
-def _parse_requirement(text: str) -> Requirement:
-    specification, _, marker = text.partition(";")
-    name = re.match(r"[\w.-]+", specification)
-    minimum = re.search(r">=\s*([\w.]+)", specification)
-    extra = re.search(r"extra\s*==\s*['\"]([\w.-]+)['\"]", marker)
-    assert name is not None, f"metadata of {PACKAGE} holds the requirement {text!r}"
-    return Requirement(name[0], specification.strip(), minimum[1] if minimum else "", extra[1] if extra else "")
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    """The leading numeric part of a version: (2, 4, 1) of "2.4.1+cpu"."""
-    matched = re.match(r"\d+(?:\.\d+)*", version)
-    return tuple(int(part) for part in matched[0].split(".")) if matched else ()
+def _own(requirement: packaging.requirements.Requirement, extra: str) -> Requirement:
+    minimum = next((bound.version for bound in requirement.specifier if bound.operator == ">="), "")
+    return Requirement(requirement.name, f"{requirement.name}{requirement.specifier}", minimum, extra)
 
 
 def _version(distribution: str) -> str | None:

@@ -1,4 +1,5 @@
-"""Our own GPU kernels are used where they work and are right, which is found out on the machine itself."""
+"""Decides, on the machine itself, whether our own GPU kernels compile and agree with PyTorch; callers fall back to
+PyTorch's operations where they do not."""
 
 from __future__ import annotations
 

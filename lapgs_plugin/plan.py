@@ -30,9 +30,10 @@ less to say than it has gradients, and every Gaussian it adds is carried to the 
 
 NESTED_DENSIFY_SHARE = 2 / 3
 NESTED_DENSIFY_LEAST = 4000
-"""Of the iterations in which a stage would densify, those in which a field that goes on does, and how many these are at
-least, where there are so many. It has its surfaces, and what it adds late in a long run costs more time than it is
-worth; in a short one it is what is missing (fox, 3,000 iterations: 0.4 dB)."""
+"""A stage that continues the coarser level's field densifies for this share of the iterations in which it otherwise
+would, but for at least as many as the second says, or for all where there are fewer. It has its surfaces, and what it
+adds late in a long run costs more time than it is worth; in a short one it is what is missing (fox, 3,000 iterations:
+0.4 dB)."""
 
 JOINT_SHARE = 0.25
 """Share of a residual stage of `lapgs run`, its last, in which the finished fields are trained along.

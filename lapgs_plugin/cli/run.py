@@ -90,8 +90,8 @@ def run(
         float | None,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Of residuals: share of each residual stage, its last, in which the finished fields are trained "
-            f"along; 0 leaves them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
+            help="Of residuals: share of each residual stage, its last, in which the finished coarser fields are "
+            f"optimized too; 0 leaves them as they are, as in the paper. Default: {JOINT_SHARE:g}.",
         ),
     ] = None,
     grid: GridOption = "camera",
@@ -114,7 +114,11 @@ def run(
     prune: Annotated[float, typer.Option(rich_help_panel=HIERARCHY, help=PRUNE_HELP)] = 0.0,
     seed: Annotated[
         int,
-        typer.Option(rich_help_panel=HIERARCHY, help="Of the draw of inherited Gaussians; the script seeds its own."),
+        typer.Option(
+            rich_help_panel=HIERARCHY,
+            min=0,
+            help="Decides which Gaussians are inherited (--inherit with a ratio); the script has its own seeds.",
+        ),
     ] = 0,
     images_on: Annotated[
         str,

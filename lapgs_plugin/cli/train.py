@@ -78,8 +78,8 @@ def train(
         float,
         typer.Option(
             rich_help_panel=HIERARCHY,
-            help="Of residuals: share of each residual stage, its last, in which the finished fields are trained "
-            "along, such as 0.25; 0 leaves them as they are, as in the paper.",
+            help="Of residuals: share of each residual stage, its last, in which the finished coarser fields are "
+            "optimized too, such as 0.25; 0 leaves them as they are, as in the paper.",
         ),
     ] = 0.0,
     grid: GridOption = "camera",

@@ -183,15 +183,6 @@ def random_case(
     return Case(name, field, camera, background)
 
 
-def training_case(width: int, height: int, n: int, *, seed: int = 0) -> Case:
-    """A scene as training sees it: SH degree 3, about 40 Gaussians blended a pixel, in float32."""
-    camera = make_camera(width, height)
-    spread = math.sqrt(width * height / n)  # distance in pixels of neighbours, were they in one plane
-    case = random_case(n, width, height, seed=seed, camera=camera, pixels=(0.5 * spread, 3.4 * spread), name="training")
-    logits = torch.randn(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 2.0
-    return replace(case, field=case.field.with_parameters({"opacity_logits": logits})).to(torch.float32)
-
-
 # ----------------------------------------------------------------------------------- adversarial scenes, by name
 
 

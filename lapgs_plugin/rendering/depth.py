@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,10 +9,8 @@ from torch import Tensor
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.field import GaussianField
+from lapgs_plugin.inheritance import SH_C0
 from lapgs_plugin.raster import Rasterizer
-
-SH_CONSTANT = math.sqrt(1.0 / (4.0 * math.pi))
-"""What the first SH coefficient is multiplied by."""
 
 SMALLEST_COVER = 1e-6
 
@@ -48,6 +45,6 @@ def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -
     pose = camera.world_to_camera.to(field.means)
     along = field.means @ pose[2, :3] + pose[2, 3]  # (n,)
     colors = torch.stack([along, torch.ones_like(along), torch.zeros_like(along)], dim=1)  # (n, 3)
-    asking = replace(field.with_parameters({"sh": colors[:, None] / SH_CONSTANT}), signed=True)
+    asking = replace(field.with_parameters({"sh": colors[:, None] / SH_C0}), signed=True)
     weighted, cover, _ = rasterizer(asking, camera, background=torch.zeros(3).to(field.means), sh_degree=0).image
     return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)

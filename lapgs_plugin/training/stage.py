@@ -66,9 +66,9 @@ class StageRun:
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        joint_from: the iteration from which the finished fields are trained along; None when they never are.
+        joint_from: the iteration from which the finished fields are trained too; None when they never are.
         thaw: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
-        joint: they, once it has come to that.
+        joint: those fields while they are being trained; None before.
         breakdown: told which part of an iteration begins.
 
     The field, the images and the background are on one device, where the stage is trained.
