@@ -10,12 +10,18 @@
 
 Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
 after its PLY is on the disk: a run killed at any moment is a run that opens, with the levels that were finished.
+
+Finished fields that were trained along with level k are replaced when it is finished, or stay as they were. First they
+are written to point_cloud.with_level_<k>.ply beside their predecessors. From the moment the manifest lists level k they
+are the fields of their levels; then they are renamed, if need be by whoever opens the run for writing next. Those of a
+level that is not listed count for nothing.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -45,6 +51,8 @@ FORMAT_VERSION = 1
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
+TRAINED_ALONG = "point_cloud.with_level_{}.ply"
+"""Of a finished level's field as it was trained along with a finer one, until it is in its place."""
 
 
 @dataclass(frozen=True)
@@ -312,6 +320,8 @@ class RunArchive:
                 with one_line_errors(folder):
                     _remove_scratch(folder)
             archive = cls(folder, manifest, lock)
+            if resume:
+                archive._settle_fields()
             if check:
                 archive._check_fields()
         except BaseException:
@@ -348,7 +358,17 @@ class RunArchive:
         return self._folder.joinpath(*parts)
 
     def field_path(self, level: int) -> Path:
+        """The PLY of a level: the field as it was last trained with a level that is finished."""
+        for later in reversed(self.available_levels):
+            if (waiting := self._waiting_path(level, later)).exists():
+                return waiting
+        return self._settled_path(level)
+
+    def _settled_path(self, level: int) -> Path:
         return self.path(f"level_{level}", PLY)
+
+    def _waiting_path(self, level: int, later: int) -> Path:
+        return self.path(f"level_{level}", TRAINED_ALONG.format(later))
 
     def field(self, level: int) -> GaussianField:
         """The field of a finished level, float32 on the CPU.
@@ -366,9 +386,16 @@ class RunArchive:
         return replace(loaded, signed=record.signed)
 
     def finish_level(
-        self, record: LevelRecord, field: GaussianField, optimizer_state: dict[str, Any] | None = None
+        self,
+        record: LevelRecord,
+        field: GaussianField,
+        optimizer_state: dict[str, Any] | None = None,
+        trained_along: Mapping[int, GaussianField] | None = None,
     ) -> None:
         """Keep the field of a trained level: its PLY first, then the manifest that lists it, and no checkpoint of it.
+
+        Until the manifest is written, the run is what it was; from then on it has this level and all of
+        `trained_along`, whatever happens.
 
         Args:
             record: of the level `manifest.next_level`; the seconds that writing takes are added to its overhead as
@@ -376,16 +403,24 @@ class RunArchive:
             field: as trained.
             optimizer_state: for full inheritance, what `optimizer_state` gives to the next level; kept until that one
                 is finished.
+            trained_along: what finished fields have become meanwhile, by level, each with as many Gaussians as before.
 
         Raises:
-            FieldError: the field holds NaN or inf; nothing is written.
+            FieldError: a field holds NaN or inf; nothing is written.
+            RunFolderError: a level of `trained_along` is not finished; nothing is written.
         """
         self._require_lock()
-        assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
-        field.require_finite()
-        path = self.field_path(record.level)
+        trained_along = trained_along or {}
+        _require_field_of(record, field)
+        for level, thawed in trained_along.items():
+            _require_field_of(self._manifest.record(level), thawed)
+        path = self._settled_path(record.level)
         overhead = Overhead(record.overhead_seconds)
         with overhead.timed("archive"):
+            for level, thawed in trained_along.items():
+                waiting = self._waiting_path(level, record.level)
+                with one_line_errors(waiting):
+                    thawed.save_ply(waiting)
             with one_line_errors(path):
                 path.parent.mkdir(exist_ok=True)
                 field.save_ply(path)
@@ -395,27 +430,21 @@ class RunArchive:
         manifest = replace(self._manifest, records=(*self._manifest.records, record))
         self._write_json(MANIFEST, asdict(manifest))
         self._manifest = manifest
+        self._settle_fields()
         with one_line_errors(self._folder):
             self.path(CHECKPOINT).unlink(missing_ok=True)
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
 
-    def replace_field(self, level: int, field: GaussianField) -> None:
-        """Put a field that was trained on in the place of what it was when its level was finished.
-
-        Args:
-            level: a finished one.
-            field: with as many Gaussians.
-
-        Raises:
-            FieldError: the field holds NaN or inf; nothing is written.
-            RunFolderError: the level is not finished.
-        """
-        self._require_lock()
-        record = self._manifest.record(level)
-        assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
-        field.require_finite()
-        with one_line_errors(self.field_path(level)):
-            field.save_ply(self.field_path(level))
+    def _settle_fields(self) -> None:
+        """Put fields that were trained along in their places, and away those whose level was not finished after all."""
+        for level in range(self._manifest.levels):
+            for later in reversed(range(level)):
+                waiting = self._waiting_path(level, later)
+                with one_line_errors(waiting):
+                    if later not in self.available_levels:
+                        waiting.unlink(missing_ok=True)
+                    elif waiting.exists():
+                        waiting.replace(self._settled_path(level))
 
     def optimizer_state(self, level: int) -> dict[str, Any]:
         """The optimizer state that a finished level left for the next one, its tensors on the CPU.
@@ -423,7 +452,7 @@ class RunArchive:
         Raises:
             RunFolderError: there is none, or it cannot be read.
         """
-        path = self.field_path(level).with_name(OPTIMIZER)
+        path = self.path(f"level_{level}", OPTIMIZER)
         if not path.exists():
             raise RunFolderError(
                 f"{path} does not exist, and the next level goes on with it; start again with --overwrite"
@@ -542,6 +571,19 @@ class RunArchive:
         assert self._lock is not None, "open the run with resume=True to write to it"
 
 
+def _require_field_of(record: LevelRecord, field: GaussianField) -> None:
+    """Check that a field is what a record is of, and may be archived.
+
+    Raises:
+        FieldError: it holds NaN or inf.
+    """
+    assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
+    try:
+        field.require_finite()
+    except FieldError as error:
+        raise FieldError(f"level {record.level}: {error}") from error
+
+
 def _torch_save(state: dict[str, Any], stream: BinaryIO) -> None:
     """torch.save that lets the OSError of a full disk through; torch replaces it by a RuntimeError."""
     try:
@@ -610,6 +652,8 @@ def _remove_results(folder: Path) -> None:
     for level in folder.glob("level_*/"):
         (level / PLY).unlink(missing_ok=True)
         (level / OPTIMIZER).unlink(missing_ok=True)
+        for waiting in level.glob(TRAINED_ALONG.format("*")):
+            waiting.unlink()
         if not any(level.iterdir()):
             level.rmdir()
 

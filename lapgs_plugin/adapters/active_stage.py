@@ -268,8 +268,6 @@ class ActiveStage:
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
         finished = self._finish(gaussians, field, self._carried(gaussians), self._moments(gaussians))
-        if self._joint is not None:
-            self._joint.archive_fields()  # before their residual: that one builds on what they are now
         self._archive_level(finished, seconds, memory)
         self._context.watcher.stage_finished(stage, lambda: self._fields(gaussians))
         return finished
@@ -279,7 +277,7 @@ class ActiveStage:
         field = self._archive.field(self.stage.level)
         gaussians = self._adapter.model_of(self._whole_call, field.to(self._device))
         left: dict[str, Any] = {"carried": {}, "moments": {}}
-        if self._archive.field_path(self.stage.level).with_name(OPTIMIZER).exists():
+        if self._archive.path(f"level_{self.stage.level}", OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
         carried = {
             name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
@@ -347,6 +345,7 @@ class ActiveStage:
             ),
             field,
             left if stage.level > 0 and any(left.values()) else None,
+            None if self._joint is None else self._joint.export_fields(),
         )
 
     def _finish(

@@ -143,16 +143,14 @@ class JointLevels:
         adapter = self._context.adapter
         return {one.of.stage.level: adapter.snapshot(one.gaussians, one.of.stage.signed) for one in self._fields}
 
-    def archive_fields(self) -> None:
-        """Put what the fields have become in the place of what they were.
-
-        Raises:
-            FieldError: one holds NaN or inf.
-        """
+    def export_fields(self) -> dict[int, GaussianField]:
+        """What the fields have become, by level, as `BackboneAdapter.export_field` gives them, on the CPU."""
+        adapter = self._context.adapter
+        exported = {}
         for one in self._fields:
             stage = one.of.stage
-            field = self._context.adapter.export_field(one.gaussians, signed=stage.signed).to("cpu")
-            self._archive.replace_field(stage.level, field)
+            exported[stage.level] = adapter.export_field(one.gaussians, signed=stage.signed).to("cpu")
+        return exported
 
 
 class _Follow:

@@ -410,10 +410,8 @@ class Trainer:
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
         )
-        for level, thawed in ({} if run.joint is None else run.joint.fields).items():
-            self.archive.replace_field(level, thawed)
         moments = run.model.optimizer_moments() if self._heir_wants_moments(run.stage) else None
-        self.archive.finish_level(record, field, moments)
+        self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property

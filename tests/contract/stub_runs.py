@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import random
 import re
 import runpy
 import sys
@@ -13,6 +14,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
@@ -218,6 +222,15 @@ class StopAt(StageHook):
     def on_stage_start(self, stage: Stage) -> None:
         if stage.level == self.level:
             raise KeyboardInterrupt
+
+
+class Seeded(StageHook):
+    """Lets every stage draw the same, whatever was drawn before it: then a resumed run can end as a whole one."""
+
+    def on_stage_start(self, stage: Stage) -> None:
+        random.seed(stage.level)
+        np.random.seed(stage.level)
+        torch.manual_seed(stage.level)
 
 
 def composed_psnr(archive: RunArchive) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ from lapgs_plugin.adapters import joint
 from lapgs_plugin.adapters.joint import JointLevels
 from lapgs_plugin.adapters.level_views import view_name
 from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.plan import Stage
 from lapgs_plugin.pyramid import Pyramid
@@ -24,6 +27,7 @@ from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
     STUBS,
+    Seeded,
     StopAt,
     captured,
     composed_psnr,
@@ -31,6 +35,7 @@ from tests.contract.stub_runs import (
     loaded,
     run_residuals,
 )
+from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
 
 
 class FieldsAt(StageHook):
@@ -203,6 +208,94 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
     assert stopped.available_levels == (1,)
     for part, value in stopped.field(1).parameters.items():
         assert torch.equal(before.fields[1][part], value)
+
+
+def three_levels(
+    scene: Path, folder: Path, *hooks: StageHook, name: str = "graphdeco", resume: bool = True
+) -> RunArchive:
+    """A short run, its last two stages half joint.
+
+    Predictions in float32: a resumed run makes them anew level by level, which in float16 rounds once more.
+    """
+    iterations = 60 if name == "taming" else 12
+    archive, _ = run_hierarchy(
+        STUBS[name],
+        scene,
+        folder,
+        *("--iterations", iterations),
+        levels=3,
+        joint=0.5,
+        prediction_precision="float32",
+        hooks=(Seeded(), *hooks),
+        resume=resume,
+    )
+    return archive
+
+
+def two_finished(scene: Path, folder: Path, name: str = "graphdeco") -> Path:
+    """The same without its last stage."""
+    with captured(folder, []), pytest.raises(KeyboardInterrupt):
+        three_levels(scene, folder, StopAt(0), name=name, resume=False)
+    return folder
+
+
+def plys(archive: RunArchive) -> list[bytes]:
+    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+
+
+def test_a_run_killed_while_it_archives_them_ends_as_others(
+    odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed at any write after the last stage, and resumed."""
+    whole = three_levels(odd, tmp_path / "whole", resume=False)
+    begun = two_finished(odd, tmp_path / "begun")
+    base = plys(RunArchive.open(begun))
+    assert all(before != after for before, after in zip(base, plys(whole)[:2], strict=True)), "they were trained along"
+    writes = FailingWrites(monkeypatch, Killed)
+    left, done = 0, False
+    while not done:
+        folder = shutil.copytree(begun, tmp_path / str(left))
+        with contextlib.suppress(Killed), captured(folder, []):
+            three_levels(odd, folder, FailAfterStage(writes, 0, left))
+            done = True
+        writes.left = sys.maxsize
+        killed = RunArchive.open(folder)
+        assert plys(killed) == (plys(whole) if killed.manifest.complete else base)
+        assert plys(three_levels(odd, folder)) == plys(whole)
+        assert {path.name for path in folder.glob("level_*/*.ply")} == {"input.ply", "point_cloud.ply"}
+        left += 1
+    assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_disk_that_is_full_when_a_stage_ends_leaves_what_was_finished(
+    name: str, odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = three_levels(odd, tmp_path / "whole", name=name, resume=False)
+    folder = two_finished(odd, tmp_path / "run", name)
+    before = plys(RunArchive.open(folder))
+    writes = FailingWrites(monkeypatch, disk_full)
+    with captured(folder, []), pytest.raises(RunFolderError, match=r"No space left.*what was finished .* is unharmed"):
+        three_levels(odd, folder, FailAfterStage(writes, 0, 4), name=name)  # in the second PLY
+    writes.left = sys.maxsize
+    assert plys(RunArchive.open(folder)) == before
+    assert plys(three_levels(odd, folder, name=name)) == plys(whole)
+
+
+def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = two_finished(odd, tmp_path / "run")
+    before = plys(RunArchive.open(folder))
+    original = JointLevels.export_fields
+
+    def poisoned(levels: JointLevels) -> Any:
+        fields = original(levels)
+        fields[1].means[0, 0] = torch.nan
+        return fields
+
+    monkeypatch.setattr(JointLevels, "export_fields", poisoned)
+    with captured(folder, []), pytest.raises(FieldError, match="level 1: x is NaN or inf for 1 of"):
+        three_levels(odd, folder)
+    assert plys(RunArchive.open(folder)) == before
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 import torch
 
 from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
-from lapgs_plugin.errors import TrainingDivergedError, TrainingStoppedError
+from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.plan import Stage
@@ -23,6 +26,7 @@ from lapgs_plugin.training.interrupt import stop_request
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
+from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
 from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
@@ -33,6 +37,7 @@ SETTINGS = TrainSettings(
     densification=Densification(start=3, until=45, every=5, reset_every=12, prune=0.02),
     joint=0.25,
 )
+SHORT = replace(SETTINGS, levels=3, iterations=24)
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +124,71 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
         assert plys(archive) == plys(whole)
         places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
+
+
+@pytest.fixture(scope="module")
+def large() -> Scene:
+    """Of three levels."""
+    return ring_scene(size=(96, 64))
+
+
+@pytest.fixture(scope="module")
+def two_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three levels, stopped in its last and without a checkpoint: all of that level will be trained again."""
+    path = tmp_path_factory.mktemp("two") / "run"
+    with make_archive(path, SHORT) as archive:
+        with pytest.raises(TrainingStoppedError):
+            Trainer(large, SHORT, archive, CpuRasterizer(), monitor=StopAt(0, 1)).run()
+        archive.path("checkpoint.pt").unlink()
+    return path
+
+
+def resume(path: Path, scene: Scene, **options: object) -> RunArchive:
+    with RunArchive.open(path, resume=True) as archive:
+        Trainer(scene, SHORT, archive, CpuRasterizer(), **options).run(resume=True)
+    return RunArchive.open(path)
+
+
+def files(folder: Path) -> set[Path]:
+    return {path.relative_to(folder) for path in folder.rglob("*")}
+
+
+def test_a_run_killed_while_it_archives_fields_trained_along_ends_as_others(
+    large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed at any write after the last stage, and resumed."""
+    whole = train(tmp_path / "whole", large, SHORT)
+    base = [(two_finished / f"level_{level}" / "point_cloud.ply").read_bytes() for level in (2, 1)]
+    assert plys(whole)[0] != base[0], "the coarser fields were trained along"
+    assert plys(whole)[1] != base[1]
+    writes = FailingWrites(monkeypatch, Killed)
+    left, done = 0, False
+    while not done:
+        folder = shutil.copytree(two_finished, tmp_path / str(left))
+        with contextlib.suppress(Killed):
+            resume(folder, large, user_hooks=[FailAfterStage(writes, 0, left)])
+            done = True
+        writes.left = sys.maxsize
+        killed = RunArchive.open(folder)
+        assert plys(killed) == (plys(whole) if killed.manifest.complete else base)
+        again = resume(folder, large)
+        assert plys(again) == plys(whole)
+        assert files(folder) == files(whole.path())
+        left += 1
+    assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
+
+
+def test_a_disk_that_is_full_when_a_stage_ends_leaves_the_fields_before_it(
+    large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = train(tmp_path / "whole", large, SHORT)
+    folder = shutil.copytree(two_finished, tmp_path / "run")
+    writes = FailingWrites(monkeypatch, disk_full)
+    with pytest.raises(RunFolderError, match=r"No space left.*what was finished before is unharmed"):
+        resume(folder, large, user_hooks=[FailAfterStage(writes, 0, 4)])  # in the second PLY
+    writes.left = sys.maxsize
+    assert plys(RunArchive.open(folder)) == plys(RunArchive.open(two_finished))
+    assert plys(resume(folder, large)) == plys(whole)
 
 
 @pytest.mark.parametrize("levels", [2, 3])

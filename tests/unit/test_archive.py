@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import signal
@@ -27,6 +26,7 @@ from lapgs_plugin.archive import (
 )
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.field import GaussianField
+from tests.mishaps import FailingWrites, Killed, disk_full
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
 
@@ -267,47 +267,14 @@ def test_values_damaged_after_opening_are_found_on_reading(tmp_path: Path) -> No
 # Crashes
 
 
-class Killed(BaseException):
-    """Stands for the end of the process."""
-
-
-class MortalProcess:
-    """Dies at a chosen fsync or rename; once dead nothing is cleaned up, as after SIGKILL."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.calls_left = sys.maxsize
-        real_fsync, real_replace, real_unlink = os.fsync, Path.replace, Path.unlink
-
-        def fsync(descriptor: int) -> None:
-            self._use_call()
-            real_fsync(descriptor)
-
-        def rename(path: Path, target: Path) -> Path:
-            self._use_call()
-            return real_replace(path, target)
-
-        def unlink(path: Path, missing_ok: bool = False) -> None:
-            if self.calls_left >= 0:
-                real_unlink(path, missing_ok=missing_ok)
-
-        monkeypatch.setattr(os, "fsync", fsync)
-        monkeypatch.setattr(Path, "replace", rename)
-        monkeypatch.setattr(Path, "unlink", unlink)
-
-    def _use_call(self) -> None:
-        self.calls_left -= 1
-        if self.calls_left < 0:
-            raise Killed
-
-
 def test_a_run_killed_at_any_write_opens_with_what_was_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    process = MortalProcess(monkeypatch)
+    writes = FailingWrites(monkeypatch, Killed)
     outcomes: list[int | None] = []
     while outcomes[-1:] != [2]:
         folder, finished = tmp_path / str(len(outcomes)), None
-        process.calls_left = len(outcomes)
+        writes.left = len(outcomes)
         with contextlib.suppress(Killed), RunArchive.create(folder, manifest()) as archive:
             finished = 0
             for level in (1, 0):
@@ -315,7 +282,7 @@ def test_a_run_killed_at_any_write_opens_with_what_was_finished(
                 finish(archive, level)
                 finished += 1
         outcomes.append(finished)
-        process.calls_left = sys.maxsize
+        writes.left = sys.maxsize
         if not (folder / "manifest.json").exists():
             assert finished is None
             RunArchive.create(folder, manifest()).close()  # what is left there is no obstacle
@@ -330,6 +297,128 @@ def test_a_run_killed_at_any_write_opens_with_what_was_finished(
                 finish(again, again.manifest.next_level)
             assert again.available_levels == (1, 0)
     assert set(outcomes) == {None, 0, 1, 2}
+
+
+# Fields that were trained along
+
+
+def thawed_fields(seed: int = 9) -> dict[int, GaussianField]:
+    """What the two finished levels of three become along with the third."""
+    return {level: replace(level_field(level, 3), means=torch.full((4 + level, 3), float(seed))) for level in (2, 1)}
+
+
+def two_of_three(folder: Path) -> RunArchive:
+    archive = RunArchive.create(folder, manifest(3))
+    finish(archive, 2)
+    finish(archive, 1)
+    return archive
+
+
+def finish_with_others(archive: RunArchive) -> None:
+    archive.finish_level(record(0, 3), level_field(0, 3), trained_along=thawed_fields())
+
+
+def assert_all_or_nothing(archive: RunArchive) -> None:
+    """Either the last level is there and with it what the others became, or none of it."""
+    for level, thawed in thawed_fields().items():
+        expected = thawed if archive.manifest.complete else level_field(level, 3)
+        assert torch.equal(archive.field(level).means, expected.means)
+
+
+SETTLED = {"manifest.json", ".lock", *(f"level_{level}/point_cloud.ply" for level in range(3))}
+
+
+def test_fields_trained_along_take_their_predecessors_places(tmp_path: Path) -> None:
+    with two_of_three(tmp_path) as archive:
+        finish_with_others(archive)
+        assert set(snapshot(tmp_path)) == SETTLED
+        assert_all_or_nothing(archive)
+        assert [archive.field(level).signed for level in (2, 1, 0)] == [False, True, True]
+    assert_all_or_nothing(RunArchive.open(tmp_path))
+
+
+def test_fields_trained_along_are_kept_with_their_level_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed at any write and between any two: who reads, who goes on, and what lies there in the end."""
+    writes = FailingWrites(monkeypatch, Killed)
+    complete: list[bool] = []
+    done = False
+    while not done:
+        folder = tmp_path / str(len(complete))
+        with two_of_three(folder) as archive, contextlib.suppress(Killed):
+            writes.left = len(complete)
+            finish_with_others(archive)
+            done = True
+        writes.left = sys.maxsize
+        reader = RunArchive.open(folder)
+        assert_all_or_nothing(reader)
+        complete.append(reader.manifest.complete)
+        with RunArchive.open(folder, resume=True) as again:
+            assert again.manifest == reader.manifest
+            assert_all_or_nothing(again)
+            names = set(snapshot(folder))
+            assert names - {"level_0/point_cloud.ply"} == SETTLED - {"level_0/point_cloud.ply"}
+            if not complete[-1]:
+                finish_with_others(again)
+        assert_all_or_nothing(RunArchive.open(folder))
+        assert set(snapshot(folder)) == SETTLED
+    # Of each of three PLYs an fsync, its renaming and its folder's fsync; of the manifest the same, the second counts.
+    assert complete == [False] * 11 + [True] * 4
+
+
+def test_a_disk_that_is_full_at_any_write_leaves_the_fields_and_a_second_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes = FailingWrites(monkeypatch, disk_full)
+    for left in range(10):
+        folder = tmp_path / str(left)
+        with two_of_three(folder) as archive:
+            before = [archive.field_path(level).read_bytes() for level in (2, 1)]
+            writes.left = left
+            with pytest.raises(RunFolderError, match=r"No space left.*free some space.*what was finished .* unharmed"):
+                finish_with_others(archive)
+            writes.left = sys.maxsize
+            assert [archive.field_path(level).read_bytes() for level in (2, 1)] == before
+            assert_all_or_nothing(RunArchive.open(folder))
+            finish_with_others(archive)
+        assert_all_or_nothing(RunArchive.open(folder))
+        assert set(snapshot(folder)) == SETTLED
+
+
+def test_nan_in_a_field_trained_along_leaves_everything(tmp_path: Path) -> None:
+    with two_of_three(tmp_path) as archive:
+        before = snapshot(tmp_path)
+        thawed = thawed_fields()
+        thawed[1].means[2, 1] = torch.nan
+        with pytest.raises(FieldError, match="level 1: y is NaN"):
+            archive.finish_level(record(0, 3), level_field(0, 3), trained_along=thawed)
+        assert snapshot(tmp_path) == before
+
+
+def test_only_finished_levels_can_have_been_trained_along(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest(3)) as archive:
+        before = snapshot(tmp_path)
+        with pytest.raises(RunFolderError, match="level 1 is not in this run"):
+            archive.finish_level(record(2, 3), level_field(2, 3), trained_along={1: level_field(1, 3)})
+        assert snapshot(tmp_path) == before
+
+
+def test_what_waits_for_a_level_never_comes_into_another_run(tmp_path: Path) -> None:
+    """Neither when that run is replaced, nor when replacing it is interrupted before it is removed."""
+    for remove_at_once in (True, False):
+        folder = tmp_path / str(remove_at_once)
+        two_of_three(folder).close()
+        for later in (1, 0):
+            level_field(0, 3).save_ply(folder / "level_2" / f"point_cloud.with_level_{later}.ply")
+        if remove_at_once:
+            RunArchive.create(folder, manifest(3), overwrite=True).close()
+        else:
+            (folder / "manifest.json").write_text(json.dumps(asdict(manifest(3))))
+        with RunArchive.open(folder, resume=True) as archive:
+            finish(archive, 2)
+            finish(archive, 1)
+            assert_level_is_whole(archive, 2)
 
 
 @posix_only
@@ -377,29 +466,24 @@ def test_writing_needs_the_hold(tmp_path: Path) -> None:
 # A full disk
 
 
-def no_space(_: int) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writes = FailingWrites(monkeypatch, disk_full)
     with RunArchive.create(tmp_path, manifest()) as archive:
         finish(archive, 1)
         archive.save_checkpoint({"iteration": 3})
         archive.write_metrics({"psnr": 1.0})
         archive.append_history({"level": 0, "iteration": 1})
         before = snapshot(tmp_path)
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", no_space)
-            for write in (
-                lambda: finish(archive, 0),
-                lambda: archive.save_checkpoint({"iteration": 4}),
-                lambda: archive.write_metrics({"psnr": 2.0}),
-                lambda: archive.rewind_history(0, 0),
-            ):
-                with pytest.raises(
-                    RunFolderError, match=r"cannot be written: No space left.*free some space.*--resume"
-                ):
-                    write()
+        writes.left = 0
+        for write in (
+            lambda: finish(archive, 0),
+            lambda: archive.save_checkpoint({"iteration": 4}),
+            lambda: archive.write_metrics({"psnr": 2.0}),
+            lambda: archive.rewind_history(0, 0),
+        ):
+            with pytest.raises(RunFolderError, match=r"cannot be written: No space left.*free some space.*--resume"):
+                write()
+        writes.left = sys.maxsize
         assert snapshot(tmp_path) == before
         finish(archive, 0)
     assert RunArchive.open(tmp_path).available_levels == (1, 0)
