@@ -253,6 +253,7 @@ class ActiveStage:
         stage = self.stage
         width, height = stage.image_size
         place = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._images.targets.where]
+        self._archive.rewind_history(stage.level, 0)  # a run that stopped inside this stage trains all of it again
         logger.info(
             "level %d: %d iterations at %dx%d, images on the %s", stage.level, stage.iterations, width, height, place
         )
@@ -267,6 +268,9 @@ class ActiveStage:
         self._hooks.stage_ends(stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=stage.signed).to("cpu")
+        if self._images.test and (stage.level == 0 or self._context.test_every is not None):
+            with self.overhead.timed("evaluation"):
+                self._report_held_out(gaussians, stage.iterations)
         finished = self._finish(gaussians, field, self._carried(gaussians), self._moments(gaussians))
         self._archive_level(finished, seconds, memory)
         self._context.watcher.stage_finished(stage, lambda: self._fields(gaussians))
@@ -356,9 +360,6 @@ class ActiveStage:
         moments: Mapping[str, dict[str, Tensor]],
     ) -> Finished:
         predictions = None
-        if self._images.test and (self.stage.level == 0 or self._context.test_every is not None):
-            with self.overhead.timed("evaluation"):
-                self._report_held_out(gaussians, self.stage.iterations)
         if self.stage.level > 0 and not self._options.nested:
             with self.overhead.timed("cache"):
                 predictions = self._predict(gaussians)

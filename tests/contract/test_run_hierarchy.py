@@ -257,3 +257,39 @@ def test_a_run_stopped_between_stages_goes_on(name: str, scene: Path, tmp_path: 
     assert archive.available_levels == (1, 0)
     assert archive.field_path(1).read_bytes() == base
     assert result.output.count("Number of points at initialisation") == 1, "only the second stage was trained"
+
+
+class StopInside(StageHook):
+    """Ctrl-C at an iteration of a stage."""
+
+    def __init__(self, level: int, iteration: int) -> None:
+        self._place = (level, iteration)
+
+    def before_render(self, context: StageContext) -> None:
+        if (context.stage.level, context.iteration) == self._place:
+            raise KeyboardInterrupt
+
+
+def noted(archive: RunArchive) -> list[tuple[int, int, set[str]]]:
+    """Where in the run each entry of a history belongs, and what it says."""
+    return [(entry["level"], entry["iteration"], set(entry)) for entry in archive.history()]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(name: str, scene: Path, tmp_path: Path) -> None:
+    """Stopped in both, and resumed once more when it was complete."""
+    folder = tmp_path / "run"
+
+    def train(*hooks: StageHook, folder: Path = folder, resume: bool = True) -> RunArchive:
+        short = ("--iterations", 30, "--densify_from_iter", 0, "--densification_interval", 3)
+        return run_hierarchy(STUBS[name], scene, folder, *short, hooks=hooks, resume=resume, test_every=4)[0]
+
+    whole = noted(train(folder=tmp_path / "whole", resume=False))
+    for level, iteration in ((1, 7), (0, 15)):
+        with captured(folder, []), pytest.raises(KeyboardInterrupt):
+            train(StopInside(level, iteration), resume=level == 0)
+        assert noted(RunArchive.open(folder))[-1][:2] == (level, iteration), "entries that are to be dropped"
+    for archive in (train(), train()):
+        assert noted(archive) == whole
+        elapsed = [entry["elapsed"] for entry in archive.history() if "elapsed" in entry]
+        assert elapsed == sorted(elapsed)
