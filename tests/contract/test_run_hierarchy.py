@@ -282,7 +282,7 @@ def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(name: str, s
 
     def train(*hooks: StageHook, folder: Path = folder, resume: bool = True) -> RunArchive:
         short = ("--iterations", 30, "--densify_from_iter", 0, "--densification_interval", 3)
-        return run_hierarchy(STUBS[name], scene, folder, *short, hooks=hooks, resume=resume, test_every=4)[0]
+        return run_residuals(STUBS[name], scene, folder, *short, hooks=hooks, resume=resume, test_every=4)[0]
 
     whole = noted(train(folder=tmp_path / "whole", resume=False))
     for level, iteration in ((1, 7), (0, 15)):

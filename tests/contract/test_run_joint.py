@@ -218,7 +218,7 @@ def three_levels(
     Predictions in float32: a resumed run makes them anew level by level, which in float16 rounds once more.
     """
     iterations = 60 if name == "taming" else 12
-    archive, _ = run_hierarchy(
+    archive, _ = run_residuals(
         STUBS[name],
         scene,
         folder,
