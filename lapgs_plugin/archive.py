@@ -192,6 +192,10 @@ class Manifest:
         for record in self.records:
             if record.level == level:
                 return record
+        if not 0 <= level < self.levels:
+            raise RunFolderError(
+                f"level {level} is not in this run, expected 0 to {self.levels - 1}; choose one of them"
+            )
         finished = ", ".join(str(record.level) for record in self.records) or "none"
         raise RunFolderError(
             f"level {level} is not in this run (finished: {finished} of {self.levels}); "
@@ -286,7 +290,8 @@ class RunArchive:
         if _is_run(folder):
             if not overwrite:
                 raise RunFolderError(
-                    f"{folder} already holds a run; continue it with --resume or replace it with --overwrite"
+                    f"{folder} already holds a run; continue it with --resume (`lapgs train`, `lapgs run`) or replace "
+                    "it with --overwrite"
                 )
             return
         entries = list(folder.iterdir()) if folder.exists() else []
@@ -633,11 +638,16 @@ def _read_manifest(folder: Path) -> Manifest:
 
 
 def _is_run(folder: Path) -> bool:
-    """Whether the manifest was written by any version of this package; others' manifest.json files are not ours."""
+    """Whether the manifest was written by any version of this package; others' manifest.json files are not ours.
+
+    One that cannot be read any more is ours where it lies beside a history.
+    """
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except OSError:
         return False
+    except ValueError:
+        return (folder / HISTORY).is_file()
     return isinstance(values, dict) and "lapgs_plugin" in str(values.get("created_by"))
 
 

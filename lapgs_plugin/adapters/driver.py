@@ -250,6 +250,10 @@ class HierarchyDriver:
                 self._context.watcher.run_started(archive)
                 try:
                     self._run_stages(call, scene, plan, archive, path, Path(scratch))
+                except KeyboardInterrupt:
+                    kept = ", ".join(map(str, archive.available_levels)) or "none"
+                    logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
+                    raise
                 finally:
                     # A run that stops in between makes its images again when it goes on.
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)

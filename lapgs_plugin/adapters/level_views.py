@@ -64,6 +64,12 @@ class PhotoAlbum:
         def make_camera(*args: Any, **kwargs: Any) -> Any:
             # The image would be copied to the GPU only to be taken from there.
             camera = original(*args, **{**kwargs, "data_device": "cpu"})
+            channels = len(camera.original_image)
+            if channels != 3:
+                raise UserInputError(
+                    f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
+                    "scene's images as RGB"
+                )
             key = f"{len(self._photos):05d}-{camera.image_name}"
             self._photos[key] = Photo.of(camera.original_image)
             del camera.original_image

@@ -63,7 +63,7 @@ def render(
         ),
     ] = None,
     frame_rate: Annotated[
-        float | None, typer.Option(min=1.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
+        float | None, typer.Option(min=1.0, max=1000.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
     ] = None,
     size: Annotated[
         str | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -94,12 +95,14 @@ def train(
         ),
     ] = 8,
     densify_from: Annotated[
-        int | None, typer.Option(rich_help_panel=SCHEDULE, help="First densification. Default: 500 of 30000.")
+        int | None, typer.Option(rich_help_panel=SCHEDULE, min=0, help="First densification. Default: 500 of 30000.")
     ] = None,
     densify_until: Annotated[
         int | None,
         typer.Option(
-            rich_help_panel=SCHEDULE, help="Last one, of the whole run; stages scale it. Default: 15000 of 30000."
+            rich_help_panel=SCHEDULE,
+            min=0,
+            help="Last one, of the whole run; stages scale it. Default: 15000 of 30000.",
         ),
     ] = None,
     coarse_threshold: Annotated[
@@ -154,7 +157,9 @@ def train(
     ] = "auto",
     threads: Annotated[
         int | None,
-        typer.Option(rich_help_panel=RUN, min=1, help="Processor threads. Default: all this process may use."),
+        typer.Option(
+            rich_help_panel=RUN, min=1, max=1024, help="Processor threads. Default: all this process may use."
+        ),
     ] = None,
     cache: Annotated[
         str,
@@ -214,9 +219,11 @@ def train(
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
     """
     from rich.console import Console
+    from rich.markup import escape
 
     from lapgs_plugin.archive import SceneReference
     from lapgs_plugin.inheritance import parse_inheritance
+    from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.training.backend import ANTIALIASING, AUTO, choose_rasterizer
     from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, TrainSettings
 
@@ -260,9 +267,10 @@ def train(
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if rasterizer == AUTO else set())
-        archive = _resume(out, _options(reference, settings, rasterizer), given)
+        archive = _resume(out, scene, _options(reference, settings, rasterizer), given)
         reference = replace(archive.manifest.scene, path=reference.path)
         loaded = _load(reference)
+        require_same_scene(archive, scene, loaded.smallest_size)
         kept = {
             name: value for name, value in (("cache", cache), ("cache_precision", cache_precision)) if name in given
         }
@@ -283,7 +291,11 @@ def train(
             watcher=watcher,
         )
     keep_preview(out.absolute())
-    console.print(f"[bold]{out}[/bold] holds the run; look at it with `lapgs eval {out}` and `lapgs render {out}`")
+    name, word = escape(str(out)), escape(shlex.quote(str(out)))
+    console.print(
+        f"[bold]{name}[/bold] holds the run; look at it with `lapgs eval {word}` and `lapgs render {word}`",
+        soft_wrap=True,
+    )
 
 
 def _color(text: str) -> tuple[float, float, float]:
@@ -329,14 +341,23 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
     }
 
 
-def _resume(out: Path, wanted: dict[str, Any], given: set[str]) -> RunArchive:
-    """Open a run to continue it, refusing options that say something else than the run was started with."""
+def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> RunArchive:
+    """Open a run to continue it, refusing a scene and options that are others than the run was started with.
+
+    A scene may have moved: then there is none any more where it was.
+    """
     from lapgs_plugin.archive import RunArchive
     from lapgs_plugin.training.settings import TrainSettings
 
     archive = RunArchive.open(out, resume=True)
     try:
         manifest = archive.manifest
+        before = Path(manifest.scene.path)
+        if before.exists() and scene.exists() and not before.samefile(scene):
+            raise UserInputError(
+                f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
+                "start again with --overwrite"
+            )
         started_with = _options(manifest.scene, TrainSettings.from_manifest(manifest), manifest.rasterizer)
         for name in sorted(given & wanted.keys()):
             if wanted[name] != started_with[name]:

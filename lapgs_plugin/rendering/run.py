@@ -50,7 +50,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         eval=reference.eval,
         background=reference.background,
     )
-    _require_same(archive, scene.path, scene.smallest_size)
+    require_same_scene(archive, scene.path, scene.smallest_size)
     return scene
 
 
@@ -64,7 +64,7 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     cameras = [*train.values(), *test.values()]
     smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
-    _require_same(archive, path, smallest)
+    require_same_scene(archive, path, smallest)
     return train, test
 
 
@@ -79,8 +79,17 @@ def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneRefer
     return reference, path
 
 
-def _require_same(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
-    """Refuse a scene whose images are not of the size that was trained, before figures of it mislead."""
+def require_same_scene(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
+    """Refuse a scene whose images are not of the size that was trained, before figures of it mislead.
+
+    Args:
+        archive: the run.
+        path: of the scene, for the message.
+        smallest: its `Scene.smallest_size`.
+
+    Raises:
+        RunFolderError: a finished level had another size.
+    """
     for record in archive.manifest.records:
         size = level_size(smallest, record.level)
         if size != record.image_size:

@@ -129,7 +129,7 @@ def read_trajectory(path: Path) -> list[Camera]:
     for index, frame in enumerate(frames):
         try:
             cameras.append(_read_camera({**values, **frame}))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise UserInputError(
                 f"--trajectory {path}: the camera of frame {index} is not usable: {reason}; expected a rigid 4x4 "

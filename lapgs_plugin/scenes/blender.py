@@ -30,6 +30,8 @@ TEST_FILE = "transforms_test.json"
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+SHORTEST_FOCAL = 1e-3
+"""Of a side of the image; shorter ones are of files that hold other units than radians."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
@@ -154,12 +156,18 @@ def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np
         fx = _focal(values, "x", width)
         fy = _focal(values, "y", height) or fx
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         if isinstance(error, SceneError):
             raise
         raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export the scene again") from error
     if fx is None or fy is None:
         raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export the scene again")
+    for focal, side in ((fx, width), (fy, height)):
+        if 0.0 < focal < SHORTEST_FOCAL * side:
+            raise SceneError(
+                f"{where} has a focal length of {focal:g} pixels for {side} of the image, expected more than a "
+                "thousandth of them; export the scene again"
+            )
     return Camera(width, height, fx, fy, cx, cy, torch.from_numpy(world_to_camera))
 
 
@@ -175,6 +183,8 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
 def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Positions and colours (n, 3) of the scene's PLY; None if it has none."""
     named = values.get("ply_file_path")
+    if named is not None and not isinstance(named, str):
+        raise SceneError(f"{path}: ply_file_path is {named!r}, expected the name of a file; export the scene again")
     file = path / named if named else next((path / name for name in POINT_FILES if (path / name).is_file()), None)
     if file is None:
         return None

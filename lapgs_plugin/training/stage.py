@@ -241,7 +241,7 @@ class StageRun:
 
     def _note_loss(self, loss: float, iteration: int) -> None:
         if not math.isfinite(loss):
-            raise self._diverged(f"the loss is {loss}", iteration)
+            raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
         past = self.progress.loss
         self.progress.loss = loss if math.isnan(past) else LOSS_SMOOTHING * past + (1 - LOSS_SMOOTHING) * loss
 
@@ -253,7 +253,7 @@ class StageRun:
 
     def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(
-            f"training diverged at level {self.stage.level}, iteration {iteration}: {what}; expected finite values; "
+            f"training diverged at level {self.stage.level}, iteration {iteration}: {what}; "
             "finished levels and the last checkpoint are kept, start again with other settings"
         )
 

@@ -14,11 +14,11 @@ import torch
 from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.camera import Camera
-from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError
+from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.hooks import HookDispatcher, StageHook
-from lapgs_plugin.imagestore import ImageStore, place
+from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore, place
 from lapgs_plugin.inheritance import field_from_points, inherit
 from lapgs_plugin.overhead import Overhead
 from lapgs_plugin.peak_memory import PeakMemory
@@ -63,11 +63,14 @@ def check_cache(settings: TrainSettings, device: torch.device) -> None:
     """Refuse a place for predictions that the device of a run does not have.
 
     Raises:
-        UserInputError: as `ImageStore.check`.
+        UserInputError: there is no such place, or no such precision.
     """
-    where = "memory" if settings.cache == AUTO else settings.cache
-    precision = "float32" if settings.cache_precision == AUTO else settings.cache_precision
-    ImageStore.check(where, precision, device)
+    if settings.cache not in (AUTO, *PLACES):
+        raise UserInputError(f"--cache {settings.cache}: expected {', '.join((AUTO, *PLACES))}")
+    if settings.cache_precision not in (AUTO, *PRECISIONS):
+        raise UserInputError(f"--cache-precision {settings.cache_precision}: expected {', '.join((AUTO, *PRECISIONS))}")
+    if settings.cache == "gpu" and device.type != "cuda":
+        raise UserInputError("--cache gpu: expected memory or disk, as a CPU trains this run")
 
 
 def warm_up(

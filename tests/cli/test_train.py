@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.files import LOCK, MANIFEST
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.viewer.preview import read_preview
 from tests.cli.run_folder import write_run, write_scene
@@ -70,7 +71,9 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
         (("--strategy", "luck"), "expected default or mcmc"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),
-        (("--cache", "gpu", "--rasterizer", "cpu"), "gpu: expected memory or disk"),
+        (("--cache", "gpu", "--rasterizer", "cpu"), "--cache gpu: expected memory or disk"),
+        (("--cache", "tape"), "--cache tape: expected auto, gpu, memory, disk"),
+        (("--cache-precision", "int4"), "--cache-precision int4: expected auto, float32, float16, uint8"),
         (("--resolution", "8k"), "expected 1k, 2k, 4k"),
         (("--background", "2,0,0"), "from 0 to 1"),
         (("--resume",), "is not a run"),
@@ -87,6 +90,20 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert message in last
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "run" / "manifest.json").exists()
+
+
+def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(tmp_path: Path) -> None:
+    scene, other = write_scene(tmp_path / "scene"), write_scene(tmp_path / "other")
+    run = write_run(tmp_path / "run", scene, finished=1)
+    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != LOCK}
+    refused = lapgs("train", other, "-o", run, "--resume")
+    assert refused.returncode == 2
+    assert f"was started with the scene {scene}" in refused.stderr.replace("\n", " ")
+    assert {path: path.read_bytes() for path in files} == files
+    shutil.rmtree(scene)
+    smaller = write_scene(tmp_path / "smaller", size=(24, 16))
+    assert "give the scene of" in lapgs("train", smaller, "-o", run, "--resume").stderr.replace("\n", " ")
+    assert {path: path.read_bytes() for path in files} == files
 
 
 def test_residuals_are_trained_where_they_are_asked_for(scene: Path, tmp_path: Path) -> None:

@@ -246,10 +246,13 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_run_stopped_between_stages_goes_on(name: str, scene: Path, tmp_path: Path) -> None:
+def test_a_run_stopped_between_stages_goes_on(
+    name: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), caplog.at_level("INFO", "lapgs_plugin"):
         run_residuals(STUBS[name], scene, folder, hooks=(StopAt(0),), joint=0.0)
+    assert caplog.messages[-1] == f"stopped; finished levels in {folder}: 1; --resume continues after them"
     stopped = RunArchive.open(folder)
     assert stopped.available_levels == (1,)
     base = stopped.field_path(1).read_bytes()

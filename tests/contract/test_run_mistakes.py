@@ -279,7 +279,7 @@ def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *short)
     before = {level: archive.field_path(level).read_bytes() for level in (1, 0)}
     for name in ("graphdeco", "taming"):
-        with pytest.raises(RunFolderError, match=r"already holds a run; continue it with --resume or replace it"):
+        with pytest.raises(RunFolderError, match=r"already holds a run; continue it with --resume .* or replace it"):
             run_hierarchy(STUBS[name], scene, folder, *short)
     with pytest.raises(RunFolderError, match="started with another"):
         run_hierarchy(STUBS["graphdeco"], scene, folder, *short, resume=True, grid="even")

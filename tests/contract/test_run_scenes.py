@@ -18,6 +18,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.signed_color import signed_degree
@@ -104,6 +105,17 @@ def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_p
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
     assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 8e-5 seen: predictions are float16
+
+
+def test_grey_photos_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
+    """The checkouts read one channel of them, and fail in the first loss."""
+    grey = tmp_path / "scene"
+    shutil.copytree(scene, grey)
+    for path in (grey / "images").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    with pytest.raises(UserInputError, match=r"reads 1 channel\(s\) of it, expected 3; save the scene's images as RGB"):
+        run_hierarchy(STUBS["graphdeco"], grey, tmp_path / "run", *SHORT)
+    assert not (tmp_path / "run" / "manifest.json").exists()
 
 
 def test_photos_on_end_between_photos_across(blender: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lapgs_plugin.archive import (
     FORMAT_VERSION,
+    MANIFEST,
     LevelRecord,
     Manifest,
     RunArchive,
@@ -130,6 +131,21 @@ def test_a_field_with_nan_is_not_archived(tmp_path: Path) -> None:
 
 
 # Starting where something is already
+
+
+def test_a_run_whose_manifest_is_damaged_can_be_replaced(tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        finish(archive, 1)
+        archive.append_history({"level": 1, "iteration": 1})
+    (tmp_path / MANIFEST).write_text('{"format')
+    with pytest.raises(RunFolderError, match="already holds a run"):
+        RunArchive.create(tmp_path, manifest())
+    with RunArchive.create(tmp_path, manifest(), overwrite=True) as archive:
+        assert archive.available_levels == ()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / MANIFEST).write_text("not ours")
+    with pytest.raises(RunFolderError, match="is not empty and not a run"):
+        RunArchive.create(tmp_path / "other", manifest(), overwrite=True)
 
 
 def test_an_existing_run_is_refused_and_unharmed(tmp_path: Path) -> None:

@@ -151,6 +151,8 @@ EYE = np.eye(4).tolist()
         ({**GOOD, "frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "not a rotation and a translation"),
         ({**GOOD, "frames": [{"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "not a rotation and"),
         ({**GOOD, "frames": [{"transform_matrix": [[math.nan] * 4] * 4}]}, "NaN or inf"),
+        ({"w": 64, "h": 48, "camera_angle_x": 0, "frames": [{"transform_matrix": EYE}]}, "frame 0 is not usable: "),
+        ({**GOOD, "w": math.inf, "frames": [{"transform_matrix": EYE}]}, "frame 0 is not usable: "),
         ({**GOOD, "fl_x": -3, "frames": [{"transform_matrix": EYE}]}, "focal lengths -3 and -3"),
         ({**GOOD, "w": "wide", "frames": [{"transform_matrix": EYE}]}, "frame 0 is not usable: invalid literal"),
         ({**GOOD, "frames": ["here"]}, "frame 0 is not usable"),
