@@ -223,7 +223,6 @@ def train(
 
     from lapgs_plugin.archive import SceneReference
     from lapgs_plugin.inheritance import parse_inheritance
-    from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.training.backend import ANTIALIASING, AUTO, choose_rasterizer
     from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, TrainSettings
 
@@ -267,10 +266,7 @@ def train(
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if rasterizer == AUTO else set())
-        archive = _resume(out, scene, _options(reference, settings, rasterizer), given)
-        reference = replace(archive.manifest.scene, path=reference.path)
-        loaded = _load(reference)
-        require_same_scene(archive, scene, loaded.smallest_size)
+        archive, loaded = _resume(out, scene, _options(reference, settings, rasterizer), given)
         kept = {
             name: value for name, value in (("cache", cache), ("cache_precision", cache_precision)) if name in given
         }
@@ -341,12 +337,13 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
     }
 
 
-def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> RunArchive:
-    """Open a run to continue it, refusing a scene and options that are others than the run was started with.
+def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> tuple[RunArchive, Scene]:
+    """Open a run to continue it, and its scene, refusing a scene and options that are others than it was started with.
 
     A scene may have moved: then there is none any more where it was.
     """
     from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.training.settings import TrainSettings
 
     archive = RunArchive.open(out, resume=True)
@@ -366,10 +363,12 @@ def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> 
                     f"{option} asks for {wanted[name]}, but the run in {out} was started with {started_with[name]}; "
                     "leave the option out to continue it, or start again with --overwrite"
                 )
+        loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
+        require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:
         archive.close()
         raise
-    return archive
+    return archive, loaded
 
 
 def _load(reference: SceneReference) -> Scene:
