@@ -319,7 +319,7 @@ def _package_finding(requirement: Requirement) -> Finding:
     install = f"python -m pip install '{requirement.text}'"
     if version is None:
         return Finding(requirement.name, "problem", "not installed", install)
-    if requirement.minimum and Version(version) < Version(requirement.minimum):
+    if requirement.minimum and Version(version).release < Version(requirement.minimum).release:
         detail = f"{version} is older than {requirement.minimum}, which is needed"
         return Finding(requirement.name, "problem", detail, install)
     return Finding(requirement.name, "ok", version)
