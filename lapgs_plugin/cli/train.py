@@ -266,19 +266,19 @@ def train(
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if rasterizer == AUTO else set())
-        archive, loaded = _resume(out, scene, _options(reference, settings, rasterizer), given)
-        kept = {
-            name: value for name, value in (("cache", cache), ("cache_precision", cache_precision)) if name in given
-        }
+        kept = {"cache": cache, "cache_precision": cache_precision}
+        archive, loaded, settings = _resume(
+            *(out, scene, _options(reference, settings, rasterizer), given),
+            {name: value for name, value in kept.items() if name in given},
+        )
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(rasterizer), overwrite)
-        kept = {}
     with archive:
         _run(
             archive,
             loaded,
+            settings,
             console,
-            kept,
             threads=threads,
             test_every=test_every,
             breakdown=breakdown,
@@ -337,14 +337,21 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
     }
 
 
-def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> tuple[RunArchive, Scene]:
-    """Open a run to continue it, and its scene, refusing a scene and options that are others than it was started with.
+def _resume(
+    out: Path, scene: Path, wanted: dict[str, Any], given: set[str], anew: Mapping[str, Any]
+) -> tuple[RunArchive, Scene, TrainSettings]:
+    """Open a run to continue it, refusing a scene and options that are others than it was started with.
 
     A scene may have moved: then there is none any more where it was.
+
+    Returns:
+        The run, its scene, and its settings, of which `anew` gives those that may change.
     """
     from lapgs_plugin.archive import RunArchive
     from lapgs_plugin.rendering.run import require_same_scene
+    from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.settings import TrainSettings
+    from lapgs_plugin.training.trainer import check_cache
 
     archive = RunArchive.open(out, resume=True)
     try:
@@ -355,7 +362,8 @@ def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> 
                 f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
                 "start again with --overwrite"
             )
-        started_with = _options(manifest.scene, TrainSettings.from_manifest(manifest), manifest.rasterizer)
+        settings = TrainSettings.from_manifest(manifest)
+        started_with = _options(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys()):
             if wanted[name] != started_with[name]:
                 option = "--eval" if name == "hold_out" else "--" + name.replace("_", "-")
@@ -363,12 +371,14 @@ def _resume(out: Path, scene: Path, wanted: dict[str, Any], given: set[str]) -> 
                     f"{option} asks for {wanted[name]}, but the run in {out} was started with {started_with[name]}; "
                     "leave the option out to continue it, or start again with --overwrite"
                 )
+        settings = replace(settings, **anew)
+        check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
         loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:
         archive.close()
         raise
-    return archive, loaded
+    return archive, loaded, settings
 
 
 def _load(reference: SceneReference) -> Scene:
@@ -406,8 +416,8 @@ def _create(
 def _run(
     archive: RunArchive,
     scene: Scene,
+    settings: TrainSettings,
     console: Console,
-    kept: Mapping[str, Any],
     *,
     threads: int | None,
     test_every: int | None,
@@ -416,21 +426,18 @@ def _run(
     resume: bool,
     watcher: Watcher,
 ) -> None:
-    """Train with a progress display; `kept` says anew where predictions are and how precisely, for a run continued."""
+    """Train with a progress display."""
     import torch
 
     from lapgs_plugin.reference_raster.threads import one_pool
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import ProgressMonitor
-    from lapgs_plugin.training.settings import TrainSettings
-    from lapgs_plugin.training.trainer import Trainer, check_cache
+    from lapgs_plugin.training.trainer import Trainer
 
     if threads is not None:
         torch.set_num_threads(threads)
     manifest = archive.manifest
-    settings = replace(TrainSettings.from_manifest(manifest), **kept)
     placed = training_rasterizer(manifest.rasterizer, settings)
-    check_cache(settings, placed.device)
     with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
         trainer = Trainer(
             scene=scene,
