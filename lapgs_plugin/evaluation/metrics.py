@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from lapgs_plugin import supervision
+from lapgs_plugin.ops.photometric_loss import in_torch
 
 SMALLEST_MSE = 1e-10
 """Mean squared errors below this, which float32 images hardly resolve, count as this: no PSNR is above 100 dB."""
@@ -27,17 +27,17 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 @torch.no_grad()
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Mean structural similarity of one image as 3DGS computes it, see `supervision.ssim`.
+    """Mean structural similarity of one image as 3DGS computes it, see `in_torch.ssim`.
 
     Args:
         image, target: (3, h, w) of the same type and device, clamped to [0, 1] here.
     """
     image, target = image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)
     if image.device.type == "cpu":
-        from lapgs_plugin.reference_raster.loss import ssim_cpu
+        from lapgs_plugin.ops.photometric_loss.in_numba import ssim_cpu
 
         return float(ssim_cpu(image, target))
-    return float(supervision.ssim(image, target))
+    return float(in_torch.ssim(image, target))
 
 
 def mean_quality(pairs: Iterable[tuple[Tensor, Tensor]]) -> dict[str, float]:

@@ -76,3 +76,11 @@ SLOT = 16
 CAMERA = 21
 ROTATION, TRANSLATION, POSITION = 0, 9, 12
 FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, LIMIT_X, LIMIT_Y = range(15, CAMERA)
+
+SIGNED_COLOR_BIT = -(2**31)
+"""The bit of a call's `sh_degree` that asks for signed colour: the sign bit of C's int.
+
+Rasterizers patched with `patches/*.toml` strip it in both passes. Of all bits this one is harmless where it is not
+known: an unpatched build takes the degree for one below 1 and reads the first coefficient only, whereas any other high
+bit would be taken for a degree above 3 and read coefficients that a field of lower degree does not have.
+"""

@@ -11,15 +11,16 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import Manifest, RunArchive
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import level_size
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
-from lapgs_plugin.rendering.raising import add_raised
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample import add_raised
+from lapgs_plugin.rendering.field_offload import Residence
+from lapgs_plugin.runs.archive import Manifest, RunArchive
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
@@ -54,11 +55,6 @@ class Composition:
             {level: images[index] for level, images in band.items()} for band in (self.residuals, self.composed)
         )
         return Composition(self.base[index], residuals, composed)
-
-
-def level_camera(camera: Camera, level: int) -> Camera:
-    """The camera of a pyramid level, from the camera of the full-resolution view."""
-    return camera.resized(*level_size((camera.width, camera.height), level))
 
 
 def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) -> Tensor:

@@ -11,10 +11,10 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.kernel_check import is_right
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.ops.self_check import is_right
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
 
@@ -123,7 +123,7 @@ class Densifier:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
         given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
         if gradient.device.type == "cuda" and statistics_in_triton():
-            from lapgs_plugin.training.densification_triton import add_statistics
+            from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
             add_statistics(*given)
         else:
@@ -155,7 +155,7 @@ def statistics_in_triton() -> bool:
     """Whether our kernel sums up what PyTorch's operations do."""
 
     def difference() -> float:
-        from lapgs_plugin.training.densification_triton import add_statistics
+        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
         gradient = torch.linspace(-1, 1, 600, device="cuda").view(300, 2)
         radii = torch.arange(300, dtype=torch.int32, device="cuda") % 3

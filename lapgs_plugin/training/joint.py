@@ -12,12 +12,12 @@ from typing import Any
 
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer, render_image
-from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.raising import add_raised, raised
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample import add_raised, raised
 from lapgs_plugin.training.model import TrainableField
 
 

@@ -12,14 +12,14 @@ import torch
 from gsplat.strategy.ops import remove
 from torch import Tensor
 
-from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_image
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.pruning import blended_pixels, least_blended
-from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.upsampled_images import RaisedImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField

@@ -11,25 +11,28 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
-from lapgs_plugin.breakdown import Breakdown, breakdown_on
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision
 from lapgs_plugin.hooks import HookDispatcher, StageHook
-from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore, place
-from lapgs_plugin.inheritance import field_from_points, inherit
-from lapgs_plugin.overhead import Overhead
-from lapgs_plugin.peak_memory import PeakMemory
-from lapgs_plugin.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer, render_image
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
-from lapgs_plugin.rendering.raised_images import RaisedImages
-from lapgs_plugin.rendering.raising import raised
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.upsample import raised
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.runs.archive import CACHE, LevelRecord, RunArchive
+from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.image_store import PLACES, PRECISIONS, ImageStore, place
+from lapgs_plugin.runs.overhead import Overhead
+from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.upsampled_images import RaisedImages
+from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
 from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
 from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.joint import JointFields
@@ -38,7 +41,6 @@ from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import AUTO, StageSchedule, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
-from lapgs_plugin.watching import Watcher
 
 TRAIN, TEST = "train", "test"
 """Folders of cached predictions, by the views that they are of."""

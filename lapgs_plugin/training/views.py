@@ -9,12 +9,12 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.imagestore import EIGHT_BIT_TOLERANCE, ImageStore, place
-from lapgs_plugin.plan import level_size
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.runs.image_store import EIGHT_BIT_TOLERANCE, ImageStore, place
+from lapgs_plugin.runs.upsampled_images import RaisedImages
 from lapgs_plugin.scenes.scene import View
 
 

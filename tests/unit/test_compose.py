@@ -11,14 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.field_offload import Residence
 
 BACKGROUND = (0.2, 0.5, 0.9)
 CAMERA = Camera(45, 30, fx=40.0, fy=41.0, cx=21.0, cy=16.0, world_to_camera=torch.eye(4))

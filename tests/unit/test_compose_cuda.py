@@ -12,13 +12,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer, missing
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer, missing
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.field_offload import Residence
 from tests.training_scene import blob_field, ring_camera
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(bool(missing()), reason=f"needs gsplat on a GPU: {missing()}")]

@@ -11,16 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.adapters.gsplat_stack import GsplatStack
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import FieldStack, StackingRasterizer
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack, StackingRasterizer
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, level_camera
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
+from lapgs_plugin.rendering.field_offload import Residence
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.gsplat_on_cpu import gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor
 
-from lapgs_plugin import imagestore
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
-from lapgs_plugin.imagestore import AHEAD, ImageStore, _PageLocked, _release, place
+from lapgs_plugin.runs import image_store as imagestore
+from lapgs_plugin.runs.image_store import AHEAD, ImageStore, _PageLocked, _release, place
 
 ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
 

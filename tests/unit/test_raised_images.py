@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.imagestore import ImageStore
-from lapgs_plugin.pyramid import GRIDS, Pyramid
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid
+from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.upsampled_images import RaisedImages
 from tests.unit.test_imagestore import on_every_device
 
 SIZES = {"a": (6, 10), "b": (7, 9)}

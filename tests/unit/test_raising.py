@@ -19,17 +19,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.kernel_check import is_right
-from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
-from lapgs_plugin.rendering import raising
-from lapgs_plugin.rendering.raising import add_raised, raised
+from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid, transposed_taps
+from lapgs_plugin.ops import upsample as raising
+from lapgs_plugin.ops.self_check import is_right
+from lapgs_plugin.ops.upsample import add_raised, raised
 
 TRITON = """
 import os
 os.environ["TRITON_INTERPRET"] = "1"
 import torch
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample.in_triton import add_raised_triton, raised_triton
 for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
     for grid in ("camera", "even"):
         h, w = shape[-2:]
@@ -120,7 +120,7 @@ def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
         raised_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
         add_raised_triton=lambda pyramid, coarse, fine: factor * pyramid.up(coarse, fine.shape[-2:]) + fine,
     )
-    monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.raising_triton", kernels)
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.ops.upsample.in_triton", kernels)
 
 
 def is_used() -> bool:
@@ -178,7 +178,7 @@ def test_the_kernel_of_a_gpu_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
-    from lapgs_plugin.rendering.raising import _triton_works
+    from lapgs_plugin.ops.upsample import _triton_works
 
     assert _triton_works()
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")

@@ -14,15 +14,15 @@ from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from torch import Tensor
 
-from lapgs_plugin.adapters import gsplat as gsplat_adapter
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
+from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training import views as training_views

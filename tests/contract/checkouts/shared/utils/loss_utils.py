@@ -2,7 +2,7 @@
 
 import torch
 
-from lapgs_plugin import supervision
+from lapgs_plugin.ops.photometric_loss import in_torch
 
 
 def l1_loss(network_output, gt):
@@ -10,4 +10,4 @@ def l1_loss(network_output, gt):
 
 
 def ssim(img1, img2):
-    return supervision.ssim(img1, img2)
+    return in_torch.ssim(img1, img2)

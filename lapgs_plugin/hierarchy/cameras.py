@@ -1,0 +1,31 @@
+"""Cameras at the sizes of pyramid levels."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.hierarchy.plan import level_size
+
+
+def level_camera(camera: Camera, level: int) -> Camera:
+    """The camera of a pyramid level, from the camera of the full-resolution view."""
+    return camera.resized(*level_size((camera.width, camera.height), level))
+
+
+def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> Tensor:
+    """The intrinsics of a pyramid level's camera, for loops that keep cameras as matrices.
+
+    Odd sizes are rounded up, and the field of view stays: focal lengths are not simply halved.
+
+    Args:
+        intrinsics: (..., 3, 3) matrices K of the full-resolution camera.
+        size: (width, height) of the full-resolution image.
+        level: 0 is full resolution.
+
+    Returns:
+        (..., 3, 3) with the type and device of `intrinsics`.
+    """
+    width, height = level_size(size, level)
+    factors = intrinsics.new_tensor([width / size[0], height / size[1], 1.0])
+    return intrinsics * factors[:, None]

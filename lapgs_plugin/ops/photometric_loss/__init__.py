@@ -1,0 +1,68 @@
+"""The photometric loss of 3DGS, L1 + SSIM: which version computes it on which device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from importlib import import_module
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
+from lapgs_plugin.ops.self_check import is_right, largest
+
+
+def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
+    """3DGS's loss, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable with respect to the prediction.
+
+    On the CPU a fused kernel computes it together with its gradient. On a GPU SSIM comes from the package `fused_ssim`
+    where that is installed, else from plain PyTorch.
+
+    Args:
+        prediction, target: (3, h, w), the target without gradient.
+        ssim_weight: lambda, in [0, 1].
+
+    Returns:
+        The loss, a scalar.
+    """
+    if prediction.device.type == "cpu":
+        from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
+
+        return photometric_loss_cpu(prediction, target, ssim_weight)
+    fused = fused_ssim()
+    if fused is None or prediction.dtype != torch.float32:
+        return photometric_loss_torch(prediction, target, ssim_weight)
+    if _l1_in_triton():
+        from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+
+        # Numbers that only scale others cost a launch each, and another on the way back.
+        rest = weighted_l1(prediction.contiguous(), target.contiguous(), 1.0 - ssim_weight, ssim_weight)
+        return torch.sub(rest, fused(prediction[None], target[None]), alpha=ssim_weight)
+    l1 = (prediction - target).abs().mean()
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(prediction[None], target[None]))
+
+
+@lru_cache(maxsize=1)
+def _l1_in_triton() -> bool:
+    def difference() -> float:
+        from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+
+        target = torch.linspace(0, 1, 3000, device="cuda")
+        prediction = (2 * target.square()).requires_grad_()
+        losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
+        gradients = [torch.autograd.grad(3.0 * loss, prediction)[0] * len(target) for loss in losses]
+        pairs = (losses, gradients)
+        return largest((one - other).abs() for one, other in pairs)
+
+    return is_right("L1 in several operations instead of one kernel", difference, 1e-4)
+
+
+@lru_cache(maxsize=1)
+def fused_ssim() -> Callable[[Tensor, Tensor], Tensor] | None:
+    """The function of that name from the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without it."""
+    try:
+        found: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
+    except ImportError:
+        return None
+    return found
