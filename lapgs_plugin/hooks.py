@@ -21,7 +21,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hierarchy.supervision import Supervision, supervised_pair
+from lapgs_plugin.hierarchy.supervision import Supervision
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
 
@@ -102,7 +102,7 @@ class Composition(StageHook):
 
 
 class SupervisionLoss(StageHook):
-    """The photometric loss of one of the three supervisions.
+    """Compare what a supervision says with the photometric loss.
 
     Args:
         supervision: which one.
@@ -114,9 +114,9 @@ class SupervisionLoss(StageHook):
         self._ssim_weight = ssim_weight
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
-        prediction, target = supervised_pair(
-            self._supervision, image, context.target, context.accumulated, context.coarse_target
-        )
+        prediction, target = image, context.target
+        if context.accumulated is not None:  # the base is always compared with its target
+            prediction, target = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
         return photometric_loss(prediction, target, self._ssim_weight)
 
 

@@ -25,7 +25,7 @@ from lapgs_plugin.checkouts.level_views import make_level_view
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, goes_on, nested_densify_until
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, continues_field, nested_densify_until
 
 logger = logging.getLogger(__name__)
 
@@ -139,9 +139,9 @@ class StageWindow:
     coarse_threshold: float
 
     @property
-    def goes_on(self) -> bool:
+    def continues_field(self) -> bool:
         """Whether the field of the level before is trained on."""
-        return goes_on(self.stage, self.levels)
+        return continues_field(self.stage, self.levels)
 
     def scaled(self, iterations: int) -> int:
         """A constant of the whole run's schedule, as the same share of this stage."""
@@ -231,7 +231,7 @@ class BackboneAdapter(ABC):
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
         until = window.scaled(opt.densify_until_iter)
-        opt.densify_until_iter = nested_densify_until(until) if window.goes_on else until
+        opt.densify_until_iter = nested_densify_until(until) if window.continues_field else until
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
         for name in self.info.densify_thresholds:
             setattr(opt, name, getattr(opt, name) * window.coarse_threshold**window.stage.level)

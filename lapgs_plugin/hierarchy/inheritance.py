@@ -12,8 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-
-INHERIT_MODES = ("geometry", "xyz", "full")
+from lapgs_plugin.hierarchy.settings import parse_inheritance
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every side."""
@@ -22,35 +21,6 @@ INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SQUARED_DISTANCE = 1e-7
 """Floor of the mean squared distance to the neighbours, in squared world units: points may coincide."""
-
-
-def parse_inheritance(text: str) -> tuple[str, float]:
-    """A mode and a ratio from what --inherit takes: MODE, RATIO or MODE:RATIO.
-
-    Raises:
-        UserInputError: it is none of these.
-    """
-    mode, _, ratio = text.partition(":")
-    try:
-        if mode not in INHERIT_MODES:
-            mode, ratio = "geometry", text
-        return mode, float(ratio or 1.0)
-    except ValueError as error:
-        raise UserInputError(
-            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
-        ) from error
-
-
-def check_inheritance(mode: str, ratio: float) -> None:
-    """Raise what `inherit` would about these arguments, before there is a field.
-
-    Raises:
-        UserInputError: an unknown mode, or a ratio outside (0, 1].
-    """
-    if mode not in INHERIT_MODES:
-        raise UserInputError(f"--inherit {mode}: expected {', '.join(INHERIT_MODES)}")
-    if not 0.0 < ratio <= 1.0:
-        raise UserInputError(f"--inherit {ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)")
 
 
 class Inherited(NamedTuple):
@@ -112,7 +82,7 @@ def inherit(
     Raises:
         UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
     """
-    check_inheritance(mode, ratio)
+    parse_inheritance(f"{mode}:{ratio}")  # raises what is to be said of them
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _draw(len(field), ratio, generator).to(field.means.device)

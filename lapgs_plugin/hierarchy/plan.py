@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
@@ -20,13 +20,11 @@ DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
 }
 """Share of the iterations of each stage, coarsest first.
 
-Three and four levels are split as in the paper. Its main tables give two levels 1/3, 2/3; halves gave it 0.12 dB more
-in 3.5 % more time (its ablation on the split). On the one scene of docs/training.md: +0.55 dB at 1/4, -0.29 at 1/8.
+Three and four levels are split as in the paper, two as nested levels are.
 """
 
-NESTED_COARSE_THRESHOLD = 2.0
-"""What nested levels multiply thresholds for densification by, for each time that images are halved: a coarse image has
-less to say than it has gradients, and every Gaussian it adds is carried to the end."""
+RESIDUAL_SPLIT = (Fraction(1, 3), Fraction(2, 3))
+"""The same for a base and one residual: the paper's main tables."""
 
 NESTED_DENSIFY_SHARE = 2 / 3
 NESTED_DENSIFY_LEAST = 4000
@@ -34,16 +32,6 @@ NESTED_DENSIFY_LEAST = 4000
 would, but for at least as many as the second says, or for all where there are fewer. It has its surfaces, and what it
 adds late in a long run costs more time than it is worth; in a short one it is what is missing (fox, 3,000 iterations:
 0.4 dB)."""
-
-JOINT_SHARE = 0.25
-"""Share of a residual stage of `lapgs run`, its last, in which the finished fields are trained along.
-
-FastGS on bonsai: 31.06 dB without, 31.48 with it, 31.55 bare. The built-in trainer leaves it out unless asked: it gave
-0.18 dB on the sample scene and took 0.17 on fox (docs/training.md).
-"""
-
-RESIDUAL_COLOR_RATE = 4.0
-"""Factor of `lapgs run` on the SH learning rates of residual stages."""
 
 
 class Hierarchy(str, Enum):
@@ -61,19 +49,6 @@ fast, next to nothing; these need no patched rasterizer, and a frame takes what 
 
 It is no default of what is read: runs that do not say what their levels are were trained before there was a choice, as
 `Hierarchy.LAPLACIAN`."""
-
-
-def parse_hierarchy(name: str) -> Hierarchy:
-    """The hierarchy called `name`.
-
-    Raises:
-        UserInputError: there is none of that name.
-    """
-    try:
-        return Hierarchy(name)
-    except ValueError as error:
-        known = " or ".join(hierarchy.value for hierarchy in Hierarchy)
-        raise UserInputError(f"--hierarchy {name}: expected {known}") from error
 
 
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
@@ -205,45 +180,9 @@ class StagePlan:
         )
 
 
-def parse_split(text: str) -> tuple[Fraction, ...]:
-    """Shares from "1/3,2/3" or "0.25,0.75".
-
-    Raises:
-        UserInputError: a share is not a number.
-    """
-    try:
-        return tuple(Fraction(part.strip()) for part in text.split(","))
-    except (ValueError, ZeroDivisionError) as error:
-        raise UserInputError(f"--split {text!r}: expected fractions separated by commas, such as 1/3,2/3") from error
-
-
-def require_no_residuals(given: Mapping[str, tuple[object, object]]) -> None:
-    """Refuse options about residuals, of which nested levels have none.
-
-    Args:
-        given: by option, its value and the value that it has when it is left out.
-
-    Raises:
-        UserInputError: a value is another one.
-    """
-    for option, (value, left_out) in given.items():
-        if value != left_out:
-            raise UserInputError(
-                f"{option} {value}: is about residuals, and nested levels have none; leave it out, or add "
-                f"--hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
-            )
-
-
-def goes_on(stage: Stage, levels: int) -> bool:
-    """Whether a stage of so many levels trains the field of the stage before on."""
+def continues_field(stage: Stage, levels: int) -> bool:
+    """Return whether a stage, one of `levels`, continues training the previous level's field."""
     return not stage.signed and stage.level < levels - 1
-
-
-def coarse_factor(given: float | None, hierarchy: Hierarchy) -> float:
-    """What thresholds for densification are multiplied by for each halving: as given, or by the hierarchy if None."""
-    if given is not None:
-        return given
-    return NESTED_COARSE_THRESHOLD if hierarchy is Hierarchy.NESTED else 1.0
 
 
 def nested_densify_until(until: int) -> int:
@@ -253,36 +192,3 @@ def nested_densify_until(until: int) -> int:
     (5000, 4000, 750)
     """
     return min(until, max(round(NESTED_DENSIFY_SHARE * until), NESTED_DENSIFY_LEAST))
-
-
-def joint_share(given: float | None, hierarchy: Hierarchy) -> float:
-    """The share of each residual stage that trains finished fields along: as given, or `lapgs run`'s if None."""
-    if given is not None:
-        return given
-    return JOINT_SHARE if hierarchy is Hierarchy.LAPLACIAN else 0.0
-
-
-def check_joint_share(share: float) -> None:
-    """Refuse what is no share.
-
-    Raises:
-        UserInputError: it is below 0 or above 1.
-    """
-    if not 0.0 <= share <= 1.0:
-        raise UserInputError(f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25")
-
-
-def check_seed(seed: int) -> None:
-    """Raise a UserInputError about a seed that not every generator takes."""
-    if not 0 <= seed < 2**32:
-        raise UserInputError(f"--seed {seed}: expected 0 to {2**32 - 1}")
-
-
-def check_prune_share(share: float) -> None:
-    """Refuse a share of what is seen that cannot be pruned, see `pruning`.
-
-    Raises:
-        UserInputError: it is not from 0 to below 1.
-    """
-    if not 0.0 <= share < 1.0:
-        raise UserInputError(f"--prune {share}: expected a share from 0, where nothing is pruned, to below 1, as 0.005")

@@ -28,8 +28,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.settings import GRIDS
 
-GRIDS = ("camera", "even")
 MIXED_GRID = "mixed"
 """Down of "even" and Up of "camera": the grid of runs that the paper authors' release trained."""
 BLUR_RADIUS = 2

@@ -113,7 +113,7 @@ class ActiveStage:
     @property
     def resets_opacities(self) -> bool:
         """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
-        return not self.window.goes_on
+        return not self.window.continues_field
 
     # What the replaced symbols ask for.
 
@@ -207,7 +207,7 @@ class ActiveStage:
         self._memory.note(self._images.bytes_on_device)
         self._images.drop_predictions()
         self._joint = JointLevels(self._context, self._finished, self._archive, self._images, self._path)
-        self._joint.follow(gaussians, self._options.residual_color_rate)
+        self._joint.follow(gaussians, self._options.color_factor)
         self._trained_along = sum(record.num_gaussians for record in self._archive.manifest.records)
         self._rendering.accumulated = self._joint
 
@@ -409,7 +409,7 @@ class ActiveStage:
             return
         options = self._options
         generator = torch.Generator().manual_seed(options.seed)
-        mode = options.inheritance
+        mode = options.inherit_mode
         field, self._kept = inherit(self._before.field, mode, options.inherit_ratio, generator)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
@@ -438,7 +438,7 @@ class ActiveStage:
 
     def _moments(self, gaussians: Any) -> dict[str, dict[str, Tensor]]:
         """Optimizer state by parameter group on the CPU, if the next stage inherits it."""
-        if self._options.inheritance != "full" or self.stage.level == 0:
+        if self._options.inherit_mode != "full" or self.stage.level == 0:
             return {}
         state = {}
         for optimizer in self._adapter.optimizers(gaussians):

@@ -28,7 +28,7 @@ from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCal
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.level_views import PhotoAlbum
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan, parse_hierarchy
+from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CudaExtension
@@ -38,7 +38,8 @@ from lapgs_plugin.runner.hooking import HookCaller
 from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.joint import FinishedStage
-from lapgs_plugin.runner.run_state import Finished, HierarchyOptions, LoadedScene, RunContext
+from lapgs_plugin.runner.run_state import Finished, LoadedScene, RunContext
+from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.shim import RasterizerShim
 from lapgs_plugin.runs.archive import CACHE, Manifest, RunArchive, SceneReference
 from lapgs_plugin.runs.watching import Watcher
@@ -69,7 +70,7 @@ class HierarchyDriver:
     def __init__(
         self,
         adapter: BackboneAdapter,
-        options: HierarchyOptions,
+        options: RunSettings,
         *,
         device: str = "cuda",
         resume: bool = False,
@@ -231,7 +232,7 @@ class HierarchyDriver:
     # The run.
 
     def _train(self, call: TrainingCall) -> None:
-        hierarchy = parse_hierarchy(self._options.hierarchy)
+        hierarchy = self._options.kind
         self._adapter.refuse(call, self._options.levels, hierarchy)
         folder = Path(call.dataset.model_path or _folder_as_the_checkouts_name_it()).absolute()
         if not self._resume:
@@ -243,7 +244,7 @@ class HierarchyDriver:
                 self._album.smallest_size(),
                 call.opt.iterations,
                 self._options.levels,
-                self._options.shares(),
+                self._options.shares,
                 hierarchy,
             )
             with self._open_archive(folder, self._manifest(call, plan)) as archive:
@@ -275,7 +276,7 @@ class HierarchyDriver:
         for stage in plan:
             options = self._options
             window = StageWindow(
-                stage, start, plan.iterations, plan.levels, options.residual_color_rate, options.coarse_factor
+                stage, start, plan.iterations, plan.levels, options.color_factor, options.coarse_factor
             )
             active = ActiveStage(self._context, call, scene, archive, window, tuple(finished), before, path)
             self._active = active

@@ -11,9 +11,10 @@ import torch
 from lapgs_plugin.checkouts.level_views import PhotoAlbum
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision
-from lapgs_plugin.runner.run_state import HierarchyOptions, LoadedScene
-from lapgs_plugin.runs.image_store import PRECISIONS, ImageStore, place
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
+from lapgs_plugin.runner.run_state import LoadedScene
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.image_store import PRECISIONS, ImageStore, chosen_precision, place
 from lapgs_plugin.runs.upsampled_images import RaisedImages
 
 
@@ -35,19 +36,19 @@ class StageImages:
         album: PhotoAlbum,
         scene: LoadedScene,
         stage: Stage,
-        options: HierarchyOptions,
+        options: RunSettings,
         device: torch.device,
         folder: Path,
         accumulated: RaisedImages | None,
     ) -> None:
         self._album, self._stage, self._options = album, stage, options
         self._device, self._folder = device, folder
-        self._pyramid, self._supervision = Pyramid(options.grid), parse_supervision(options.supervision)
+        self._pyramid, self._supervision = Pyramid(options.grid), SUPERVISIONS[options.supervision]
         self.train, self.test = scene.train, scene.test
         self._keys = {id(camera): album.key(camera) for camera in self.cameras}
         self.accumulated = accumulated
         self.targets = self._store(self._target_precision(stage.level), stage.level, "targets")
-        of_laplacian = stage.signed and self._supervision is Supervision.GT_LAPLACIAN
+        of_laplacian = stage.signed and self._supervision.needs_coarse
         self.coarse = self._raised("float16", stage.level + 1, "coarse") if of_laplacian else None
 
     @property
@@ -61,7 +62,7 @@ class StageImages:
     @property
     def composed_keys(self) -> frozenset[str]:
         """Views whose rendered residual is composed: all, but for the ablations that supervise residuals alone."""
-        cameras = self.cameras if self._supervision is Supervision.RECONSTRUCTED else self.test
+        cameras = self.cameras if self._supervision.composes else self.test
         return frozenset(self.key(camera) for camera in cameras)
 
     def key(self, camera: Any) -> str:
@@ -86,7 +87,8 @@ class StageImages:
 
     def new_predictions(self) -> RaisedImages:
         """Room for I_hat^l of every view, from which the next stage will have Up(I_hat^l)."""
-        return self._raised(self._options.prediction_precision, self._stage.level, "predictions")
+        precision = chosen_precision(self._options.prediction_precision, self._device)
+        return self._raised(precision, self._stage.level, "predictions")
 
     def drop_predictions(self) -> None:
         """Let go of what the stages before predict: from here on it is rendered."""

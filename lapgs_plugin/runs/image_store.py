@@ -32,8 +32,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
 from lapgs_plugin.files import one_line_errors
+from lapgs_plugin.hierarchy.settings import AUTO, PLACES
 
-PLACES = ("gpu", "memory", "disk")
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "uint8": torch.uint8}
 
 GPU_LIMIT = 1 << 30
@@ -56,6 +56,13 @@ def place(total_bytes: int, device: torch.device | str) -> str:
         return "memory"
     available = torch.cuda.get_device_properties(torch.device(device)).total_memory
     return "gpu" if total_bytes <= min(GPU_LIMIT, GPU_SHARE * available) else "memory"
+
+
+def chosen_precision(precision: str, device: torch.device | str) -> str:
+    """Return a precision that images are stored in: as given, or what "auto" means on the device that looks at them."""
+    if precision != AUTO:
+        return precision
+    return "float16" if torch.device(device).type == "cuda" else "float32"
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,11 @@ import torch
 
 from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.rasterizers import gsplat
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.training.settings import TrainSettings
-
-AUTO = "auto"
-ANTIALIASING = "antialiasing"
-"""Key of `TrainSettings.raster`, as rasterizers and manifests call it."""
 
 
 def choose_rasterizer(name: str) -> str:
@@ -55,7 +52,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
     """
     if name == gsplat.NAME:
         rasterizer = gsplat.GsplatRasterizer(
-            antialiasing=bool(settings.raster.get(ANTIALIASING, False)),
+            antialiasing=settings.antialiased,
             packed=settings.packed,
             absgrad=settings.densification.absgrad,
             own_radii=True,
@@ -64,7 +61,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
     made = make_rasterizer(name)
     asked = {
         "--strategy mcmc": settings.densification.strategy == "mcmc",
-        "--antialiased": settings.raster.get(ANTIALIASING, False),
+        "--antialiased": settings.antialiased,
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,
     }

@@ -1,28 +1,18 @@
-"""What a user can choose for a built-in training run, and what each stage's schedule makes of it."""
+"""What a user can choose for a built-in training run, and what each stage's schedule makes of it. Imports no torch."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.inheritance import check_inheritance
-from lapgs_plugin.hierarchy.plan import (
-    DEFAULT_HIERARCHY,
-    Hierarchy,
-    Stage,
-    check_joint_share,
-    check_prune_share,
-    check_seed,
-    coarse_factor,
-    nested_densify_until,
-    parse_hierarchy,
-    require_no_residuals,
-)
-from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.hierarchy.supervision import joint_from, parse_supervision
-from lapgs_plugin.runs.archive import Manifest
+from lapgs_plugin.hierarchy.plan import Stage, nested_densify_until
+from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.options import option
+
+if TYPE_CHECKING:
+    from lapgs_plugin.runs.archive import Manifest
 
 LATE_SHARE = 0.25
 """Of a stage, its last, in which the gradients of some views make one step, once densification has ended. Positions
@@ -34,11 +24,17 @@ REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
 STRATEGIES = ("default", "mcmc")
+GROW_THRESHOLD = 2e-4
+"""Threshold of densification on screen-space gradients, in normalised device coordinates: 3DGS's."""
 ABSGRAD_THRESHOLD = 8e-4
 """What `grow_grad2d` becomes for absolute gradients, which do not cancel and are larger: gsplat's recommendation."""
 
-AUTO = "auto"
-"""Where predictions are kept and how precisely, left to the device."""
+ANTIALIASING = "antialiasing"
+"""Key of `TrainSettings.raster`, as rasterizers and manifests call it."""
+
+SCHEDULE = "Schedule"
+GSPLAT = "gsplat"
+RUN = "Run"
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that the manifest has fields of its own for."""
@@ -51,7 +47,7 @@ class LearningRates:
     means_first: float = 1.6e-4
     means_last: float = 1.6e-6
     sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
-    residual_sh: float = 1e-2  # the same for residual fields, which start from zero colour and have fewer iterations
+    residual_sh: float | None = None  # the same for residual fields; None: `residual_color_rate` times `sh`
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
@@ -65,71 +61,70 @@ class Densification:
     "mcmc" the second is 25,000. `every` never shrinks: its statistics need about that many views.
     """
 
-    start: int | None = None
-    until: int | None = None
-    every: int = 100
-    reset_every: int | None = None  # 0: never
-    grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
-    coarse_threshold: float | None = None  # factor on it each time that images are halved; None: by the hierarchy
-    strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
-    absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
-    cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
-    prune: float = 0.0  # share of what is seen that goes when densification ends, see `pruning`
+    start: int | None = option(
+        None, "First densification. Default: 500 of 30000.", panel=SCHEDULE, names=("--densify-from",), least=0
+    )
+    until: int | None = option(
+        None,
+        "Last densification, of the whole run; stages scale it. Default: 15000 of 30000.",
+        panel=SCHEDULE,
+        names=("--densify-until",),
+        least=0,
+    )
+    every: int = option(
+        100, "Iterations between two densifications.", panel=SCHEDULE, names=("--densify-every",), least=1
+    )
+    reset_every: int | None = option(
+        None,
+        "Iterations between two resets of all opacities; 0 never resets. Default: 3000 of 30000, and of nested levels "
+        "in the base alone.",
+        panel=SCHEDULE,
+        names=("--opacity-reset-every",),
+    )
+    grow_grad2d: float | None = None
+    """Threshold on the screen-space gradient, in normalised device coordinates; None: 2e-4, `ABSGRAD_THRESHOLD` of
+    absolute gradients."""
+    strategy: str = option(
+        "default", "Density control: default (3DGS's heuristics) or mcmc (Kheradmand et al. 2024).", panel=SCHEDULE
+    )
+    absgrad: bool = option(False, "Densify by absolute gradients (AbsGS).", panel=SCHEDULE)
+    cap_max: int = option(1_000_000, "Most Gaussians of a level, for --strategy mcmc.", panel=SCHEDULE, least=1)
 
 
 @dataclass(frozen=True)
-class TrainSettings:
+class TrainSettings(HierarchySettings):
     """Everything that decides the result of a run besides the scene."""
 
-    iterations: int = 30_000
-    levels: int = 2
-    hierarchy: str = DEFAULT_HIERARCHY.value
-    split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
-    grid: str = "camera"
-    supervision: str = "reconstructed"
-    inherit: str = "geometry"
-    inherit_ratio: float = 1.0
-    joint: float = 0.0  # share of a residual stage, its last, in which finished fields are trained along
-    gather: int = 8  # views whose gradients make one step late in a stage
-    sh_degree: int = 3
+    iterations: int = option(
+        30_000, "Optimizer steps, all stages together. The 3DGS schedule shrinks with it.", least=1
+    )
+    gather: int = option(
+        8,
+        "Views whose gradients are added up for each optimizer step in the last quarter of a stage, once densification "
+        "has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
+        panel=SCHEDULE,
+        names=("--accumulate-views", "--gather"),
+    )
+    sh_degree: int = option(3, "Highest SH degree, 0 to 3.", panel=SCHEDULE)
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
-    seed: int = 0
-    cache: str = AUTO
-    cache_precision: str = AUTO
     learning_rates: LearningRates = field(default_factory=LearningRates)
     densification: Densification = field(default_factory=Densification)
-    packed: bool = False  # gsplat: keep what is computed of visible Gaussians alone
-    sparse_adam: bool = False  # gsplat: step visible Gaussians alone
-    raster: dict[str, Any] = field(default_factory=dict)  # what images depend on, as {"antialiasing": True}
+    antialiased: bool = option(False, "Dim Gaussians that are smaller than a pixel.", panel=GSPLAT)
+    packed: bool = option(False, "Less memory where a view sees little; slower.", panel=GSPLAT)
+    sparse_adam: bool = option(False, "Step only the Gaussians that the view shows.", panel=GSPLAT)
 
     def __post_init__(self) -> None:
-        parse_supervision(self.supervision)
-        Pyramid(self.grid)
+        super().__post_init__()
         if self.densification.strategy not in STRATEGIES:
             raise UserInputError(f"--strategy {self.densification.strategy}: expected {' or '.join(STRATEGIES)}")
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
-        check_seed(self.seed)
-        check_inheritance(self.inherit, self.inherit_ratio)
-        check_joint_share(self.joint)
-        if parse_hierarchy(self.hierarchy) is Hierarchy.NESTED:
-            require_no_residuals(
-                {
-                    "--supervision": (self.supervision, "reconstructed"),
-                    "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
-                    "--joint": (self.joint, 0.0),
-                }
-            )
-        factor = self.densification.coarse_threshold
-        if factor is not None and not (factor > 0.0 and math.isfinite(factor)):
-            raise UserInputError(f"--coarse-threshold {factor}: expected a positive factor")
-        check_prune_share(self.densification.prune)
         if (resets := self.densification.reset_every) is not None and resets < 0:
             raise UserInputError(f"--opacity-reset-every {resets}: expected a number of iterations, or 0 for never")
         self._check_strategy()
         if self.gather < 1:
-            raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
+            raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -141,9 +136,9 @@ class TrainSettings:
                 raise UserInputError(f"--cap-max {given.cap_max}: only --strategy mcmc has a limit; leave it out")
             return
         idle = {
-            "--prune": given.prune,
+            "--prune": self.prune,
             "--absgrad": given.absgrad,
-            "--coarse-threshold": given.coarse_threshold,
+            "--coarse-threshold": self.coarse_threshold,
             "--opacity-reset-every": given.reset_every,
         }
         if options := [option for option, value in idle.items() if value]:
@@ -152,39 +147,99 @@ class TrainSettings:
                 "resets nothing; leave one out"
             )
 
-    def densification_of(self, stage: Stage) -> Densification:
-        """Density control of a stage: as set, with a threshold for its size."""
-        factor = coarse_factor(self.densification.coarse_threshold, parse_hierarchy(self.hierarchy))
-        return replace(self.densification, grow_grad2d=self.densification.grow_grad2d * factor**stage.level)
+    @property
+    def raster(self) -> dict[str, Any]:
+        """Settings of the rasterizer that images depend on, as the manifest has them."""
+        return {ANTIALIASING: True} if self.antialiased else {}
 
-    def joint_from(self, stage: Stage) -> int | None:
-        """The iteration of a stage from which the finished fields are trained along; None when they never are."""
-        return joint_from(stage, self.joint, parse_supervision(self.supervision))
+    def densification_of(self, stage: Stage) -> Densification:
+        """Return density control of a stage: as set, with a threshold for its size."""
+        given = self.densification
+        whole = given.grow_grad2d or (ABSGRAD_THRESHOLD if given.absgrad else GROW_THRESHOLD)
+        return replace(given, grow_grad2d=whole * self.coarse_factor**stage.level)
+
+    @property
+    def rates(self) -> LearningRates:
+        """Learning rates with nothing left to other settings."""
+        given = self.learning_rates
+        return given if given.residual_sh is not None else replace(given, residual_sh=given.sh * self.color_factor)
 
     def for_manifest(self) -> dict[str, Any]:
-        """The settings as keyword arguments of `Manifest`: those it names itself, and the rest under "settings"."""
-        values = asdict(self)
+        """Return the settings as keyword arguments of `Manifest`: those it names itself, and the rest as "settings"."""
+        values = {**self.resolved(), "raster": self.raster}
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
     @classmethod
     def from_manifest(cls, manifest: Manifest) -> TrainSettings:
-        """The settings a run was started with.
+        """Return the settings that a run was started with.
 
         Raises:
             RunFolderError: they hold a key this version does not know or lack one.
         """
-        # Runs of the first weeks know nothing of what came with gsplat, of joint training, gathered views and nesting.
-        later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"}
-        values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
+        values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
+        values = _of_this_version(values)
+        values.pop("raster", None)  # `antialiased` says it
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
                 f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
                 f"match); continue it with {manifest.created_by}"
             )
         values["learning_rates"] = LearningRates(**values["learning_rates"])
-        values["densification"] = Densification(**{"coarse_threshold": None, "prune": 0.0, **values["densification"]})
-        values["split"] = None if values["split"] is None else tuple(values["split"])
+        values["densification"] = Densification(**values["densification"])
         return cls(**values)
+
+
+def _of_this_version(given: dict[str, Any]) -> dict[str, Any]:
+    """Bring settings of an older run to their present names and places."""
+    values = {**LEFT_OUT_ONCE, **given}
+    density, rates = dict(values["densification"]), dict(values["learning_rates"])
+    for name in ("coarse_threshold", "prune"):
+        values.setdefault(name, density.pop(name, None if name == "coarse_threshold" else 0.0))
+    for old, new in (("cache", "images_on"), ("cache_precision", "prediction_precision")):
+        if old in values:
+            values[new] = values.pop(old)
+    if (ratio := values.pop("inherit_ratio", 1.0)) != 1.0:
+        values["inherit"] = f"{values['inherit']}:{ratio:g}"
+    if isinstance(values["split"], (list, tuple)):
+        values["split"] = ",".join(values["split"])
+    elif values["split"] is None and "cache" in given and values["levels"] == 2:
+        values["split"] = "1/2,1/2"  # what None meant then, of residuals too
+    values.setdefault("antialiased", bool(values.get("raster")))
+    values.setdefault("residual_color_rate", None)
+    return {**values, "densification": density, "learning_rates": rates}
+
+
+LEFT_OUT_ONCE = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"}
+"""Settings that runs of the first weeks do not name, and what they were."""
+
+
+@dataclass(frozen=True)
+class TrainingControl:
+    """How a run is carried out and watched; its result does not depend on it, but for the rasterizer's rounding."""
+
+    rasterizer: str = option(
+        AUTO,
+        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
+        "else cpu.",
+        panel=RUN,
+    )
+    threads: int | None = option(
+        None, "Processor threads. Default: all this process may use.", panel=RUN, least=1, most=1024
+    )
+    test_every: int | None = option(
+        None, "Measure held-out PSNR this often. Default: at the end of each stage.", panel=RUN, least=1
+    )
+    breakdown: bool = option(
+        False,
+        "Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
+        panel=RUN,
+    )
+    checkpoint_every: int | None = option(
+        None,
+        "Iterations between checkpoints; by default one is written every minute. Ctrl-C writes one too.",
+        panel=RUN,
+        least=1,
+    )
 
 
 @dataclass(frozen=True)

@@ -216,7 +216,7 @@ class StageRun:
 
     def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
         changed = self.densifier.after_step(self.model, context.iteration, result, view.camera)
-        if (share := self.settings.densification.prune) and context.iteration == self.schedule.prunes_after:
+        if (share := self.settings.prune) and context.iteration == self.schedule.prunes_after:
             self._prune(share)
             changed = True
         if changed:

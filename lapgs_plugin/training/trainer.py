@@ -18,16 +18,17 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import raised
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.runs.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
-from lapgs_plugin.runs.image_store import PLACES, PRECISIONS, ImageStore, place
+from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
 from lapgs_plugin.runs.overhead import Overhead
 from lapgs_plugin.runs.peak_memory import PeakMemory
 from lapgs_plugin.runs.upsampled_images import RaisedImages
@@ -38,7 +39,7 @@ from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import AUTO, StageSchedule, TrainSettings
+from lapgs_plugin.training.settings import StageSchedule, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
 
@@ -56,23 +57,17 @@ def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
     Raises:
         UserInputError: levels, split and image size do not go together.
     """
-    split = None if settings.split is None else parse_split(",".join(settings.split))
-    hierarchy = parse_hierarchy(settings.hierarchy)
-    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split, hierarchy)
+    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, settings.shares, settings.kind)
 
 
-def check_cache(settings: TrainSettings, device: torch.device) -> None:
-    """Refuse a place for predictions that the device of a run does not have.
+def check_storage(settings: TrainSettings, device: torch.device) -> None:
+    """Refuse a place for images that the device of a run does not have.
 
     Raises:
-        UserInputError: there is no such place, or no such precision.
+        UserInputError: there is no such place.
     """
-    if settings.cache not in (AUTO, *PLACES):
-        raise UserInputError(f"--cache {settings.cache}: expected {', '.join((AUTO, *PLACES))}")
-    if settings.cache_precision not in (AUTO, *PRECISIONS):
-        raise UserInputError(f"--cache-precision {settings.cache_precision}: expected {', '.join((AUTO, *PRECISIONS))}")
-    if settings.cache == "gpu" and device.type != "cuda":
-        raise UserInputError("--cache gpu: expected memory or disk, as a CPU trains this run")
+    if settings.images_on == "gpu" and device.type != "cuda":
+        raise UserInputError("--images-on gpu: expected memory or disk, as a CPU trains this run")
 
 
 def warm_up(
@@ -86,7 +81,7 @@ def warm_up(
     """Run every kernel of an iteration once, so that compiling them is not taken for training."""
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
     first = field_from_points(ahead, ahead, settings.sh_degree).to(device)
-    model = TrainableField.create(first, settings.learning_rates, extent=1.0, sparse=settings.sparse_adam)
+    model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
     camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
     result = rasterizer(model.field, camera, background=black)
     image = result.image + render_image(rasterizer, model.field, camera, black)
@@ -136,8 +131,8 @@ class Trainer:
     def __post_init__(self) -> None:
         self.plan = make_plan(self.scene, self.settings)
         self._pyramid = Pyramid(self.settings.grid)
-        self._supervision = parse_supervision(self.settings.supervision)
-        check_cache(self.settings, self.device)
+        self._supervision = SUPERVISIONS[self.settings.supervision]
+        check_storage(self.settings, self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
         self._train_cache: RaisedImages | None = None
@@ -201,12 +196,12 @@ class Trainer:
     def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
         """The field a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
         torch.manual_seed(self.settings.seed * 1000 + stage.level)  # split positions; the same however we got here
-        rates, extent = self.settings.learning_rates, self.scene.extent
+        rates, extent = self.settings.rates, self.scene.extent
         sparse = self.settings.sparse_adam
         if checkpoint is not None:
             return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
         with self._overhead.timed("inheritance"):
-            if goes_on(stage, self.plan.levels):
+            if continues_field(stage, self.plan.levels):
                 field = self.archive.field(stage.level + 1)
                 model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
@@ -218,20 +213,22 @@ class Trainer:
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
             field, kept = inherit(
-                self.archive.field(stage.level + 1), self.settings.inherit, self.settings.inherit_ratio, generator
+                self.archive.field(stage.level + 1), self.settings.inherit_mode, self.settings.inherit_ratio, generator
             )
             model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
-            if self.settings.inherit == "full":
+            if self.settings.inherit_mode == "full":
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
     def _heir_wants_moments(self, stage: Stage) -> bool:
         """Whether the stage after this one goes on with Adam's state."""
-        return stage.level > 0 and (self.plan.hierarchy is Hierarchy.NESTED or self.settings.inherit == "full")
+        return stage.level > 0 and self.settings.inherit_mode == "full"
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
-        schedule = StageSchedule.create(self.settings, stage, coarser if goes_on(stage, self.plan.levels) else 0)
+        schedule = StageSchedule.create(
+            self.settings, stage, coarser if continues_field(stage, self.plan.levels) else 0
+        )
         if self._images is not None:
             self._images.close()
         with self._overhead.timed("pyramid"):
@@ -240,7 +237,7 @@ class Trainer:
                 stage.level,
                 self.plan.levels,
                 self._pyramid,
-                with_coarse=self._supervision is Supervision.GT_LAPLACIAN,
+                with_coarse=self._supervision.needs_coarse,
                 device=self.device,
             )
         self._fill_caches(stage)
@@ -269,7 +266,7 @@ class Trainer:
         """
         self._memory.note(self._image_bytes)
         self._close_caches()
-        rates, extent, sparse = self.settings.learning_rates, self.scene.extent, self.settings.sparse_adam
+        rates, extent, sparse = self.settings.rates, self.scene.extent, self.settings.sparse_adam
 
         def model(level: int) -> TrainableField:
             if states is not None:
@@ -310,9 +307,8 @@ class Trainer:
 
         Those of held-out views are looked at now and then and outside the clock: a GPU has better use for its memory.
         """
-        where, precision = self.settings.cache, self.settings.cache_precision
-        if precision == AUTO:
-            precision = "float16" if self.device.type == "cuda" else "float32"
+        where = self.settings.images_on
+        precision = chosen_precision(self.settings.prediction_precision, self.device)
         if where == AUTO:
             targets = 0 if self._images is None else self._images.stored_bytes
             fits = place(stored_bytes(views, level, precision) + targets, self.device)
@@ -323,7 +319,7 @@ class Trainer:
         next_level = self.archive.manifest.next_level
         return DeviceMemoryError(
             f"the GPU has no memory left at level {next_level}; finished levels and the last checkpoint are kept: "
-            "continue with --resume on a larger one, or start again with --packed, --cache memory, a smaller "
+            "continue with --resume on a larger one, or start again with --packed, --images-on memory, a smaller "
             "--resolution or a smaller --cap-max"
         )
 

@@ -1,0 +1,265 @@
+"""Declare what a user can choose about a hierarchy, for `lapgs train` and `lapgs run` alike. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from typing import Any
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, RESIDUAL_SPLIT, Hierarchy, Stage
+from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
+from lapgs_plugin.options import option
+
+GRIDS = ("camera", "even")
+"""Pixel grids of a pyramid, see `pyramid`."""
+INHERIT_MODES = ("geometry", "xyz", "full")
+PLACES = ("gpu", "memory", "disk")
+"""Where images of a stage can wait, see `runs.image_store`."""
+PRECISIONS = ("float32", "float16", "uint8")
+AUTO = "auto"
+"""Left to the device and to the images' size."""
+
+COARSE_THRESHOLD = {Hierarchy.NESTED: 2.0, Hierarchy.LAPLACIAN: 1.0}
+"""Factor on densification thresholds for each time that images are halved. Coarse images have less detail than
+gradients, and nested levels carry every Gaussian of a coarse level to the end."""
+JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
+"""Share of a residual stage, its last, in which the finished fields are trained along: a frozen coarse level cannot
+correct errors that the finer level is unable to represent."""
+RESIDUAL_COLOR_RATE = 4.0
+"""Factor on the SH learning rates of residual stages, which start from zero colour and have fewer iterations."""
+
+PANEL = "Hierarchy"
+STORAGE = "Memory and speed"
+
+ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate")
+"""Fields that nested levels have no use for."""
+
+
+@dataclass(frozen=True)
+class HierarchySettings:
+    """Choose the levels of a run and how they are trained.
+
+    None stands for the hierarchy's own default.
+
+    Raises:
+        UserInputError: a value is none of what it can be, or is about residuals where levels are nested.
+    """
+
+    hierarchy: str = option(
+        DEFAULT_HIERARCHY.value,
+        "What finer levels are. laplacian: the paper's signed residuals, added to the upsampled coarser image. "
+        "nested: the coarser level's field, trained further at the finer size; it makes the whole image alone and ends "
+        "as one plain PLY.",
+        panel=PANEL,
+    )
+    levels: int = option(2, "Number of levels; 1 trains a plain single field, the baseline.", panel=PANEL)
+    split: str | None = option(
+        None,
+        "Share of the iterations of each stage, coarsest first, such as 1/3,2/3. Default: 1/2,1/2 nested, 1/3,2/3 with "
+        "residuals.",
+        panel=PANEL,
+    )
+    supervision: str = option(
+        RECONSTRUCTED,
+        "Loss of residual stages: reconstructed compares the composed image with the photo; online_residual and "
+        "gt_laplacian compare the residual alone (ablations of the paper).",
+        panel=PANEL,
+    )
+    inherit: str = option(
+        "geometry",
+        "What a residual field starts from: geometry (everything but colour), xyz (positions, as in the paper) or full "
+        "(all parameters and the optimizer's state). A ratio in (0, 1] keeps that share of the Gaussians: 0.5 or "
+        "xyz:0.5.",
+        panel=PANEL,
+    )
+    joint: float | None = option(
+        None,
+        "Share of each residual stage, its last, in which the finished coarser fields are optimized too; 0 freezes "
+        f"them as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
+        panel=PANEL,
+    )
+    residual_color_rate: float | None = option(
+        None,
+        f"Factor on the SH learning rates of residual stages. Default: {RESIDUAL_COLOR_RATE:g}; the paper's is 1.",
+        panel=PANEL,
+    )
+    coarse_threshold: float | None = option(
+        None,
+        "Factor on the gradient thresholds of densification for each time that images are halved: above 1 gives coarse "
+        f"levels fewer Gaussians. Default: {COARSE_THRESHOLD[Hierarchy.NESTED]:g} nested, "
+        f"{COARSE_THRESHOLD[Hierarchy.LAPLACIAN]:g} with residuals.",
+        panel=PANEL,
+    )
+    grid: str = option(
+        "camera",
+        "Pixel grid of the pyramid: camera (aligned with the cameras) or even (every second pixel, as OpenCV).",
+        panel=PANEL,
+    )
+    prune: float = option(
+        0.0,
+        "When a stage's densification ends, remove the least visible Gaussians, together this share of total "
+        "visibility; 0 removes none. 0.005 removes about a fifth of them.",
+        panel=PANEL,
+    )
+    images_on: str = option(
+        AUTO,
+        "Where level images and cached predictions are kept: gpu, memory, disk, or auto by their size.",
+        panel=STORAGE,
+        names=("--images-on", "--cache"),
+    )
+    prediction_precision: str = option(
+        AUTO,
+        "Precision of cached predictions before they are upsampled: float32, float16 or uint8. auto: float16 on a GPU, "
+        "else float32.",
+        panel=STORAGE,
+        names=("--prediction-precision", "--cache-precision"),
+    )
+    seed: int = option(0, "Seed of every random choice that lapgs makes.")
+
+    def __post_init__(self) -> None:
+        kind = self.kind
+        SUPERVISIONS[self.supervision]  # raises what is to be said of an unknown one
+        _require("--grid", self.grid, GRIDS)
+        _require("--images-on", self.images_on, (AUTO, *PLACES))
+        _require("--prediction-precision", self.prediction_precision, (AUTO, *PRECISIONS))
+        if self.levels < 1:
+            raise UserInputError(f"--levels {self.levels}: expected at least 1")
+        if not 0 <= self.seed < 2**32:
+            raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
+        if self.split is not None:
+            parse_split(self.split)
+        parse_inheritance(self.inherit)
+        if not 0.0 <= self.joint_share <= 1.0:
+            raise UserInputError(
+                f"--joint {self.joint_share}: expected a share of each residual stage from 0 to 1, such as 0.25"
+            )
+        if not 0.0 <= self.prune < 1.0:
+            raise UserInputError(
+                f"--prune {self.prune}: expected a share from 0, where nothing is pruned, to below 1, as 0.005"
+            )
+        for name, factor in (
+            ("--residual-color-rate", self.color_factor),
+            ("--coarse-threshold", self.coarse_factor),
+        ):
+            if not (factor > 0 and math.isfinite(factor)):
+                raise UserInputError(f"{name} {factor}: expected a positive factor")
+        if kind is Hierarchy.NESTED:
+            self._refuse_residual_settings()
+
+    def _refuse_residual_settings(self) -> None:
+        left_out: Mapping[str, object] = {name: getattr(type(self), name, None) for name in ABOUT_RESIDUALS}
+        for name in ABOUT_RESIDUALS:
+            if (value := getattr(self, name)) not in (left_out[name], None, 0.0 if name == "joint" else None):
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} {value}: is about residuals, and nested levels have none; leave it "
+                    f"out, or add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
+                )
+
+    @property
+    def kind(self) -> Hierarchy:
+        """What finer levels are."""
+        _require("--hierarchy", self.hierarchy, [each.value for each in Hierarchy])
+        return Hierarchy(self.hierarchy)
+
+    @property
+    def nested(self) -> bool:
+        """Whether each level continues training the coarser level's field."""
+        return self.kind is Hierarchy.NESTED
+
+    @property
+    def joint_share(self) -> float:
+        """Share of each residual stage, its last, that trains finished fields along, 0 to 1."""
+        return JOINT_SHARE[self.kind] if self.joint is None else self.joint
+
+    @property
+    def color_factor(self) -> float:
+        """Factor on the SH learning rates of residual stages."""
+        return RESIDUAL_COLOR_RATE if self.residual_color_rate is None else self.residual_color_rate
+
+    @property
+    def coarse_factor(self) -> float:
+        """Factor on densification thresholds for each halving."""
+        return COARSE_THRESHOLD[self.kind] if self.coarse_threshold is None else self.coarse_threshold
+
+    @property
+    def inherit_mode(self) -> str:
+        """What a level starts from, a mode of `inheritance.inherit`."""
+        return "full" if self.nested else parse_inheritance(self.inherit)[0]
+
+    @property
+    def inherit_ratio(self) -> float:
+        """Share of the coarser level's Gaussians that a level starts with."""
+        return parse_inheritance(self.inherit)[1]
+
+    @property
+    def shares(self) -> tuple[Fraction, ...] | None:
+        """Share of the iterations of each stage, coarsest first; None leaves them to `StagePlan`."""
+        if self.split is not None:
+            return parse_split(self.split)
+        two_levels = self.levels == len(RESIDUAL_SPLIT)
+        return RESIDUAL_SPLIT if two_levels and not self.nested else DEFAULT_SPLITS.get(self.levels)
+
+    def resolved(self) -> dict[str, Any]:
+        """Return all fields with nothing left to the hierarchy's defaults, for manifests: these may change."""
+        values = asdict(self)
+        values["split"] = None if self.shares is None else ",".join(map(str, self.shares))
+        values["joint"], values["coarse_threshold"] = self.joint_share, self.coarse_factor
+        values["residual_color_rate"] = None if self.nested else self.color_factor
+        return values
+
+    def joint_from(self, stage: Stage) -> int | None:
+        """Return the first iteration, from 1, of a stage's joint training; None when it has none.
+
+        There is none in the base's stage, and none where residuals are supervised alone: nothing is composed there.
+
+        >>> HierarchySettings(hierarchy="laplacian", joint=0.25).joint_from(Stage(0, (800, 533), 20_000, signed=True))
+        15001
+        """
+        if not stage.signed or not SUPERVISIONS[self.supervision].composes:
+            return None
+        first = stage.iterations - round(stage.iterations * self.joint_share) + 1
+        return first if first <= stage.iterations else None
+
+
+def _require(name: str, value: str, known: Collection[str]) -> None:
+    """Raise a UserInputError about a value that is not known."""
+    if value not in known:
+        raise UserInputError(f"{name} {value}: expected {' or '.join(known) if len(known) == 2 else ', '.join(known)}")
+
+
+def parse_split(text: str) -> tuple[Fraction, ...]:
+    """Return the shares that a text such as "1/3,2/3" or "0.25,0.75" names.
+
+    Raises:
+        UserInputError: a share is not a number.
+    """
+    try:
+        return tuple(Fraction(part.strip()) for part in text.split(","))
+    except (ValueError, ZeroDivisionError) as error:
+        raise UserInputError(f"--split {text!r}: expected fractions separated by commas, such as 1/3,2/3") from error
+
+
+def parse_inheritance(text: str) -> tuple[str, float]:
+    """Return mode and ratio of --inherit: MODE, RATIO or MODE:RATIO.
+
+    >>> parse_inheritance("xyz:0.5"), parse_inheritance("0.25")
+    (('xyz', 0.5), ('geometry', 0.25))
+
+    Raises:
+        UserInputError: it is none of these, or the ratio is outside (0, 1].
+    """
+    mode, _, ratio = text.partition(":")
+    if mode not in INHERIT_MODES:
+        mode, ratio = "geometry", text
+    try:
+        share = float(ratio or 1.0)
+    except ValueError as error:
+        raise UserInputError(
+            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
+        ) from error
+    if not 0.0 < share <= 1.0:
+        raise UserInputError(f"--inherit {text}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)")
+    return mode, share

@@ -1,0 +1,47 @@
+"""Declare how a scene's photos are read. Imports no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import option
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Choose which photos of a scene are read, at which size, and what is behind them.
+
+    Raises:
+        UserInputError: a background that is no colour.
+    """
+
+    resolution: str = option(
+        "full", "1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4."
+    )
+    images: str = option("images", "Image folder inside a COLMAP scene, such as images_4.")
+    eval: bool = option(False, "Hold out every eighth view for testing.")
+    background: str = option(
+        "black", "Behind the scene and behind transparent pixels: black, white or R,G,B from 0 to 1."
+    )
+
+    def __post_init__(self) -> None:
+        _ = self.background_color
+
+    @property
+    def background_color(self) -> tuple[float, float, float]:
+        """RGB in [0, 1]."""
+        text = self.background
+        if text in BACKGROUNDS:
+            return BACKGROUNDS[text]
+        try:
+            red, green, blue = (float(part) for part in text.split(","))
+        except ValueError as error:
+            raise UserInputError(
+                f"--background {text!r}: expected black, white or R,G,B such as 0.5,0.5,0.5"
+            ) from error
+        if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
+            raise UserInputError(f"--background {text!r}: expected three values from 0 to 1")
+        return red, green, blue
