@@ -82,7 +82,7 @@ def inherit(
     Raises:
         UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
     """
-    parse_inheritance(f"{mode}:{ratio}")  # raises what is to be said of them
+    parse_inheritance(mode if ratio == 1.0 else f"{mode}:{ratio}")  # raises what is to be said of them
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _draw(len(field), ratio, generator).to(field.means.device)

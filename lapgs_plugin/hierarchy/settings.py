@@ -16,6 +16,7 @@ from lapgs_plugin.options import option
 GRIDS = ("camera", "even")
 """Pixel grids of a pyramid, see `pyramid`."""
 INHERIT_MODES = ("geometry", "xyz", "full")
+DEFAULT_INHERITANCE = "geometry"
 PLACES = ("gpu", "memory", "disk")
 """Where images of a stage can wait, see `runs.image_store`."""
 PRECISIONS = ("float32", "float16", "uint8")
@@ -68,9 +69,9 @@ class HierarchySettings:
         "gt_laplacian compare the residual alone (ablations of the paper).",
         panel=PANEL,
     )
-    inherit: str = option(
-        "geometry",
-        "What a residual field starts from: geometry (everything but colour), xyz (positions, as in the paper) or full "
+    inherit: str | None = option(
+        None,
+        "What a residual field starts from: geometry (the default: everything but colour), xyz (positions, as in the paper) or full "
         "(all parameters and the optimizer's state). A ratio in (0, 1] keeps that share of the Gaussians: 0.5 or "
         "xyz:0.5.",
         panel=PANEL,
@@ -131,7 +132,7 @@ class HierarchySettings:
             raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
         if self.split is not None:
             parse_split(self.split)
-        parse_inheritance(self.inherit)
+        parse_inheritance(self.inherit or DEFAULT_INHERITANCE)
         if not 0.0 <= self.joint_share <= 1.0:
             raise UserInputError(
                 f"--joint {self.joint_share}: expected a share of each residual stage from 0 to 1, such as 0.25"
@@ -150,9 +151,9 @@ class HierarchySettings:
             self._refuse_residual_settings()
 
     def _refuse_residual_settings(self) -> None:
-        left_out: Mapping[str, object] = {name: getattr(type(self), name, None) for name in ABOUT_RESIDUALS}
+        idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0}
         for name in ABOUT_RESIDUALS:
-            if (value := getattr(self, name)) not in (left_out[name], None, 0.0 if name == "joint" else None):
+            if (value := getattr(self, name)) not in (None, idle.get(name)):
                 raise UserInputError(
                     f"--{name.replace('_', '-')} {value}: is about residuals, and nested levels have none; leave it "
                     f"out, or add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
@@ -187,12 +188,12 @@ class HierarchySettings:
     @property
     def inherit_mode(self) -> str:
         """What a level starts from, a mode of `inheritance.inherit`."""
-        return "full" if self.nested else parse_inheritance(self.inherit)[0]
+        return "full" if self.nested else parse_inheritance(self.inherit or DEFAULT_INHERITANCE)[0]
 
     @property
     def inherit_ratio(self) -> float:
         """Share of the coarser level's Gaussians that a level starts with."""
-        return parse_inheritance(self.inherit)[1]
+        return parse_inheritance(self.inherit or DEFAULT_INHERITANCE)[1]
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:
@@ -207,6 +208,7 @@ class HierarchySettings:
         values = asdict(self)
         values["split"] = None if self.shares is None else ",".join(map(str, self.shares))
         values["joint"], values["coarse_threshold"] = self.joint_share, self.coarse_factor
+        values["inherit"] = self.inherit or DEFAULT_INHERITANCE
         values["residual_color_rate"] = None if self.nested else self.color_factor
         return values
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Stage, nested_densify_until
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import option
 
@@ -47,7 +47,7 @@ class LearningRates:
     means_first: float = 1.6e-4
     means_last: float = 1.6e-6
     sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
-    residual_sh: float | None = None  # the same for residual fields; None: `residual_color_rate` times `sh`
+    residual_sh: float = 1e-2  # the same for residual fields: `TrainSettings.rates` sets it
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
@@ -160,9 +160,8 @@ class TrainSettings(HierarchySettings):
 
     @property
     def rates(self) -> LearningRates:
-        """Learning rates with nothing left to other settings."""
-        given = self.learning_rates
-        return given if given.residual_sh is not None else replace(given, residual_sh=given.sh * self.color_factor)
+        """Learning rates with that of residual colours, which is a factor on the others'."""
+        return replace(self.learning_rates, residual_sh=self.learning_rates.sh * self.color_factor)
 
     def for_manifest(self) -> dict[str, Any]:
         """Return the settings as keyword arguments of `Manifest`: those it names itself, and the rest as "settings"."""
@@ -204,6 +203,10 @@ def _of_this_version(given: dict[str, Any]) -> dict[str, Any]:
         values["split"] = ",".join(values["split"])
     elif values["split"] is None and "cache" in given and values["levels"] == 2:
         values["split"] = "1/2,1/2"  # what None meant then, of residuals too
+    if density.get("strategy") == "mcmc":
+        values["coarse_threshold"] = None  # it has no threshold, whatever the hierarchy's is
+    if values["hierarchy"] == Hierarchy.NESTED.value:
+        values["inherit"] = None  # manifests name a mode all the same
     values.setdefault("antialiased", bool(values.get("raster")))
     values.setdefault("residual_color_rate", None)
     return {**values, "densification": density, "learning_rates": rates}

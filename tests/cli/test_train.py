@@ -72,9 +72,9 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
         (("--strategy", "luck"), "expected default or mcmc"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),
-        (("--cache", "gpu", "--rasterizer", "cpu"), "--cache gpu: expected memory or disk"),
-        (("--cache", "tape"), "--cache tape: expected auto, gpu, memory, disk"),
-        (("--cache-precision", "int4"), "--cache-precision int4: expected auto, float32, float16, uint8"),
+        (("--cache", "gpu", "--rasterizer", "cpu"), "--images-on gpu: expected memory or disk"),
+        (("--cache", "tape"), "--images-on tape: expected auto, gpu, memory, disk"),
+        (("--cache-precision", "int4"), "--prediction-precision int4: expected auto, float32, float16, uint8"),
         (("--resolution", "8k"), "expected 1k, 2k, 4k"),
         (("--background", "2,0,0"), "from 0 to 1"),
         (("--resume",), "is not a run"),
@@ -123,7 +123,7 @@ def test_residuals_are_trained_where_they_are_asked_for(scene: Path, tmp_path: P
     assert done.returncode == 0, done.stderr
     manifest = RunArchive.open(tmp_path / "run").manifest
     assert [record.signed for record in manifest.records] == [False, True]
-    assert (manifest.inherit, manifest.settings["inherit_ratio"], manifest.settings["joint"]) == ("xyz", 0.5, 0.25)
+    assert (manifest.inherit, manifest.settings["joint"]) == ("xyz:0.5", 0.25)
 
 
 def test_runs_from_before_nesting_go_on_with_residuals(tmp_path: Path) -> None:

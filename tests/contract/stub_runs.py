@@ -26,7 +26,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runner.driver import HierarchyDriver
-from lapgs_plugin.runner.run_state import HierarchyOptions
+from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.watching import Watcher
 
@@ -171,7 +171,7 @@ def drive(
 ) -> None:
     driver = HierarchyDriver(
         adapter,
-        HierarchyOptions(**options),
+        RunSettings(**options),
         device="cpu",
         resume=resume,
         hooks=hooks,
@@ -194,7 +194,7 @@ def run_hierarchy(
     test_every: int | None = None,
     **options: Any,
 ) -> tuple[RunArchive, Result]:
-    """Train a stub as a hierarchy with `HierarchyOptions(**options)`."""
+    """Train a stub as a hierarchy with `RunSettings(**options)`."""
     results: list[Result] = []
     with captured(folder, results), loaded(stub, scene, folder, *more) as adapter:
         drive(

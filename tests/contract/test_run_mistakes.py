@@ -22,7 +22,7 @@ from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, T
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.runner.installed_rasterizer import explained
-from lapgs_plugin.runner.run_state import HierarchyOptions
+from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from tests.contract.stub_runs import (
     CHECKOUTS,
@@ -221,14 +221,14 @@ def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_pat
 
 def test_options_of_the_hierarchy_are_checked_before_anything_is_read() -> None:
     for options, message in (
-        ({"prediction_precision": "int4"}, "--prediction-precision int4: expected float32, float16, uint8"),
+        ({"prediction_precision": "int4"}, "--prediction-precision int4: expected auto, float32, float16, uint8"),
         ({"images_on": "tape"}, "--images-on tape: expected auto, gpu, memory, disk"),
         ({"residual_color_rate": 0.0}, "--residual-color-rate 0.0: expected a positive factor"),
         ({"prune": 1.0}, "--prune 1.0: expected a share from 0"),
         ({"split": "half"}, "--split 'half'"),
     ):
         with pytest.raises(UserInputError, match=message) as caught:
-            HierarchyOptions(**options)
+            RunSettings(**options)
         one_line(caught.value)
 
 
@@ -262,7 +262,7 @@ def test_one_level_takes_a_random_background(scene: Path, tmp_path: Path) -> Non
         ({"levels": 3}, "level 2 of 3 would be 16x12 pixels"),
         ({"split": "1/2,1/4,1/4"}, "--split has 3 shares, expected 2"),
         ({"split": "1/2,1/3"}, "sum to 1"),
-        ({"inherit_ratio": 0.0}, "above 0 and at most 1"),
+        ({"inherit": "0"}, "above 0 and at most 1"),
     ],
 )
 def test_a_hierarchy_that_does_not_fit_the_scene(

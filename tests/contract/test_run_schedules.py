@@ -12,7 +12,7 @@ import pytest
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan
-from lapgs_plugin.runner.run_state import HierarchyOptions
+from lapgs_plugin.runner.settings import RunSettings
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000
@@ -190,7 +190,7 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
 @pytest.mark.parametrize("name", NAMES)
 def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Path, tmp_path: Path) -> None:
     base, finest = StagePlan.create(
-        (800, 533), TOTAL, split=HierarchyOptions(hierarchy="nested").shares(), hierarchy=Hierarchy.NESTED
+        (800, 533), TOTAL, split=RunSettings(hierarchy="nested").shares, hierarchy=Hierarchy.NESTED
     )
     with loaded(STUBS[name], scene, tmp_path) as adapter:
         adapter.first_points(1_000)

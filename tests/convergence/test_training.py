@@ -34,10 +34,12 @@ SETTINGS = TrainSettings(
     hierarchy="laplacian",
     sh_degree=1,
     sh_every=10,
-    densification=Densification(start=3, until=45, every=5, reset_every=12, prune=0.02),
+    densification=Densification(start=3, until=45, every=5, reset_every=12),
+    prune=0.02,
+    split="1/2,1/2",
     joint=0.25,
 )
-SHORT = replace(SETTINGS, levels=3, iterations=24)
+SHORT = replace(SETTINGS, levels=3, iterations=24, split=None)
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +92,8 @@ def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path:
 
 def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Path) -> None:
     """The same one in every hierarchy."""
-    archive = train(tmp_path / "run", scene, replace(SETTINGS, levels=1))
-    assert plys(archive) == plys(train(tmp_path / "nested", scene, replace(nested(), levels=1)))
+    archive = train(tmp_path / "run", scene, replace(SETTINGS, levels=1, split=None))
+    assert plys(archive) == plys(train(tmp_path / "nested", scene, replace(nested(), levels=1, split=None)))
     (record,) = archive.manifest.records
     assert (record.level, record.signed, record.iterations) == (0, False, 60)
     assert record.num_gaussians == len(archive.field(0)) <= record.peak_gaussians
@@ -198,7 +200,14 @@ def test_finished_fields_trained_along_match_the_photos_better(levels: int, tmp_
     calm = Densification(start=20, until=100, every=20, reset_every=10_000)
     fits, fields = {}, {}
     for share in (0.0, 0.5):
-        settings = replace(SETTINGS, levels=levels, iterations=240, densification=calm, joint=share)
+        settings = replace(
+            SETTINGS,
+            levels=levels,
+            split="1/2,1/2" if levels == 2 else None,
+            iterations=240,
+            densification=calm,
+            joint=share,
+        )
         archive = train(tmp_path / str(share), scene, settings)
         renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
         fits[share], held_out = (
@@ -320,7 +329,7 @@ def test_predictions_are_kept_at_their_own_size(joint: float, tmp_path: Path) ->
     """And hooks see Up of them. Once finished fields are trained along, they are rendered and nothing is kept."""
     scene, folder = ring_scene(size=(97, 65)), tmp_path / "run"
     below = Below(folder)
-    settings = replace(SETTINGS, levels=3, cache="disk", joint=joint)
+    settings = replace(SETTINGS, levels=3, split=None, images_on="disk", joint=joint)
     archive = train(folder, scene, settings, user_hooks=[below])
     pixels = {1: 25 * 17, 0: 49 * 33}  # of the level below
     assert below.bytes == {level: len(scene.train) * 3 * 4 * pixels[level] for level in (1, 0)}
@@ -336,7 +345,7 @@ def test_predictions_are_kept_at_their_own_size(joint: float, tmp_path: Path) ->
 
 
 def test_predictions_read_ahead_from_the_disk_change_no_bit(scene: Scene, tmp_path: Path) -> None:
-    runs = [train(tmp_path / cache, scene, replace(SETTINGS, cache=cache)) for cache in ("memory", "disk")]
+    runs = [train(tmp_path / cache, scene, replace(SETTINGS, images_on=cache)) for cache in ("memory", "disk")]
     assert plys(runs[0]) == plys(runs[1])
 
 
@@ -345,11 +354,11 @@ def test_predictions_read_ahead_from_the_disk_change_no_bit(scene: Scene, tmp_pa
     [
         {"supervision": "online_residual"},
         {"supervision": "gt_laplacian"},
-        {"levels": 1},
-        {"inherit": "xyz", "inherit_ratio": 0.5},
+        {"levels": 1, "split": None},
+        {"inherit": "xyz:0.5"},
         {"grid": "even"},
-        {"cache": "disk", "cache_precision": "float16"},
-        {"cache_precision": "uint8"},
+        {"images_on": "disk", "prediction_precision": "float16"},
+        {"prediction_precision": "uint8"},
     ],
 )
 def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, object]) -> None:
@@ -359,13 +368,13 @@ def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, ob
     assert all(math.isfinite(loss) for loss in losses.values())
     assert archive.manifest.complete
     assert not archive.path("cache").exists()
-    assert TrainSettings.from_manifest(archive.manifest) == settings
+    assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
 
 
 def test_what_is_least_seen_goes_when_densification_ends(scene: Scene, tmp_path: Path) -> None:
     counts = {}
     for share in (0.0, 0.05):
-        settings = replace(SETTINGS, levels=1, densification=replace(SETTINGS.densification, prune=share))
+        settings = replace(SETTINGS, levels=1, split=None, prune=share)
         archive = train(tmp_path / str(share), scene, settings, test_every=1)
         counts[share] = {entry["iteration"]: entry["num_gaussians"] for entry in archive.history()}
     assert counts[0.05][44] == counts[0.0][44] == counts[0.0][60]
@@ -376,7 +385,7 @@ def test_what_is_least_seen_goes_when_densification_ends(scene: Scene, tmp_path:
 
 def test_an_inherited_share_starts_smaller(scene: Scene, tmp_path: Path) -> None:
     quiet = Densification(start=1000, until=1, every=1000, reset_every=1000)
-    settings = replace(SETTINGS, iterations=30, inherit_ratio=0.25, densification=quiet)
+    settings = replace(SETTINGS, iterations=30, inherit="0.25", densification=quiet)
     archive = train(tmp_path / "run", scene, settings)
     base, residual = archive.manifest.records
     assert residual.num_gaussians == round(0.25 * base.num_gaussians)

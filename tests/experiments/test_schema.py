@@ -50,7 +50,7 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         ("options = {", "option = {", ("variants.0.option", "did you mean options?")),
         ('rasterizer = "cpu"', 'rasteriser = "cpu"', ("backbones.cpu.rasteriser", "did you mean rasterizer?")),
         ("levels = 1", "levles = 1", ("levles", "lapgs train", "did you mean levels?")),
-        ("levels = 1", "residual_color_rate = 1", ("residual_color_rate", "lapgs train")),
+        ("levels = 1", "fused_adam = true", ("fused_adam", "lapgs train")),
         ("levels = 1", "seed = 1", ("sets seed", "the experiment sets itself")),
         ('title = "X"', 'title = "X"\niterations = "many"', ("iterations", "'many'", "integer")),
         ('title = "X"', 'title = "X"\niterations = 0', ("iterations", "greater than or equal to 1")),

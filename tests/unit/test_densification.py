@@ -34,7 +34,8 @@ def rendered(n: int, seed: int) -> RenderResult:
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
     settings = TrainSettings(
-        iterations=100, densification=Densification(start=2, until=60, every=10, reset_every=1000, absgrad=absgrad)
+        iterations=100,
+        densification=Densification(start=2, until=60, every=10, reset_every=1000, grow_grad2d=2e-4, absgrad=absgrad),
     )
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)

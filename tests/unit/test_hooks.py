@@ -15,7 +15,7 @@ from torch import Tensor
 from lapgs_plugin import hooks as hooks_module
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hierarchy.supervision import Supervision
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import (
     Composition,
     HookDispatcher,
@@ -116,7 +116,7 @@ def test_the_order_of_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
     register(monkeypatch, b=f"{__name__}:ByEntryPointB", a=f"{__name__}:ByEntryPointA")
     monkeypatch.setattr(hooks_module, "Composition", NoisyComposition)
     monkeypatch.setattr(hooks_module, "SupervisionLoss", NoisySupervision)
-    dispatcher = HookDispatcher.create(Supervision.RECONSTRUCTED, 0.2, [ByArgument(), LastArgument()])
+    dispatcher = HookDispatcher.create(SUPERVISIONS["reconstructed"], 0.2, [ByArgument(), LastArgument()])
     shape = (3, 24, 32)
     here = StageContext(RESIDUAL, 3, "a.jpg", torch.zeros(shape), torch.full(shape, 0.5))
 
@@ -174,8 +174,8 @@ def test_the_base_class_changes_nothing() -> None:
 
 
 def test_stock_hooks_compose_and_supervise_both_kinds_of_stage() -> None:
-    for supervision in Supervision:
-        dispatcher = HookDispatcher.create(supervision, 0.3)
+    for name in SUPERVISIONS:
+        dispatcher = HookDispatcher.create(SUPERVISIONS[name], 0.3)
         base, residual = context(BASE), context(RESIDUAL)
         rendered = torch.rand(3, 12, 16)
         assert torch.equal(dispatcher.compose(base, rendered), rendered)
@@ -190,7 +190,7 @@ def test_stock_hooks_compose_and_supervise_both_kinds_of_stage() -> None:
             "reconstructed": (image, residual.target),
             "online_residual": (rendered, residual.target - residual.accumulated),
             "gt_laplacian": (rendered, residual.target - residual.coarse_target),
-        }[supervision.value]
+        }[name]
         # The residual is taken from the composed image: one rounding of values up to 1.
         torch.testing.assert_close(
             dispatcher.loss(residual, image), photometric_loss_torch(*target, 0.3), rtol=1e-4, atol=1e-6
@@ -203,8 +203,8 @@ def test_terms_of_the_loss_add_up_with_their_gradients() -> None:
             return 3.0 * image.sum()
 
     here, image = context(), torch.rand(3, 24, 32, requires_grad=True)
-    plain = HookDispatcher([SupervisionLoss(Supervision.RECONSTRUCTED)]).loss(here, image)
-    both = HookDispatcher([SupervisionLoss(Supervision.RECONSTRUCTED), Weight()]).loss(here, image)
+    plain = HookDispatcher([SupervisionLoss(SUPERVISIONS["reconstructed"])]).loss(here, image)
+    both = HookDispatcher([SupervisionLoss(SUPERVISIONS["reconstructed"]), Weight()]).loss(here, image)
     torch.testing.assert_close(both, plain + 3.0 * image.sum())
     (gradient,) = torch.autograd.grad(both - plain, image)
     torch.testing.assert_close(gradient, torch.full_like(image, 3.0), atol=1e-5, rtol=0)

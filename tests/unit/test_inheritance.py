@@ -171,7 +171,7 @@ def test_ratios_outside_the_unit_interval_are_refused(ratio: float) -> None:
 
 
 def test_what_cannot_be_inherited() -> None:
-    with pytest.raises(UserInputError, match="--inherit everything: expected geometry, xyz, full"):
+    with pytest.raises(UserInputError, match="--inherit 'everything': expected geometry, xyz, full"):
         inherit(base_field(), "everything")
     with pytest.raises(UserInputError, match="no Gaussians left to inherit"):
         inherit(base_field(0))

@@ -18,9 +18,8 @@ from lapgs_plugin.hierarchy.plan import (
     Stage,
     StagePlan,
     level_size,
-    parse_hierarchy,
-    parse_split,
 )
+from lapgs_plugin.hierarchy.settings import HierarchySettings, parse_split
 
 
 @given(st.integers(16, 5000), st.integers(16, 5000), st.integers(0, 8))
@@ -57,10 +56,11 @@ def test_a_signed_level_where_none_belongs_is_refused(hierarchy: Hierarchy) -> N
         StagePlan(stages, hierarchy)
 
 
-def test_parse_hierarchy() -> None:
-    assert [parse_hierarchy(name) for name in ("laplacian", "nested")] == [Hierarchy.LAPLACIAN, Hierarchy.NESTED]
+def test_hierarchies_by_name() -> None:
+    kinds = [HierarchySettings(hierarchy=name).kind for name in ("laplacian", "nested")]
+    assert kinds == [Hierarchy.LAPLACIAN, Hierarchy.NESTED]
     with pytest.raises(UserInputError, match="--hierarchy gaussian: expected nested or laplacian"):
-        parse_hierarchy("gaussian")
+        HierarchySettings(hierarchy="gaussian")
 
 
 def test_stages_are_found_by_level() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision, supervised_pair
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch, ssim
 
@@ -98,19 +98,19 @@ def test_pairs_follow_the_papers_table() -> None:
     image, target, accumulated, coarse = torch.rand(4, 3, 6, 8, dtype=torch.float64)
     residual = image - accumulated
     for supervision, expected in [
-        (Supervision.RECONSTRUCTED, (image, target)),
-        (Supervision.ONLINE_RESIDUAL, (residual, target - accumulated)),
-        (Supervision.GT_LAPLACIAN, (residual, target - coarse)),
+        ("reconstructed", (image, target)),
+        ("online_residual", (residual, target - accumulated)),
+        ("gt_laplacian", (residual, target - coarse)),
     ]:
-        torch.testing.assert_close(supervised_pair(supervision, image, target, accumulated, coarse), expected)
-        assert supervised_pair(supervision, image, target) == (image, target)  # the base
+        torch.testing.assert_close(SUPERVISIONS[supervision].pair(image, target, accumulated, coarse), expected)
 
 
 def test_supervisions_by_name() -> None:
-    assert [s.value for s in Supervision] == ["reconstructed", "online_residual", "gt_laplacian"]
-    assert parse_supervision("gt_laplacian") is Supervision.GT_LAPLACIAN
+    assert list(SUPERVISIONS) == ["reconstructed", "online_residual", "gt_laplacian"]
+    assert [SUPERVISIONS[name].needs_coarse for name in SUPERVISIONS] == [False, False, True]
+    assert [SUPERVISIONS[name].composes for name in SUPERVISIONS] == [True, False, False]
     with pytest.raises(UserInputError, match="--supervision laplace: expected reconstructed, online_residual, gt_lap"):
-        parse_supervision("laplace")
+        SUPERVISIONS["laplace"]
 
 
 def test_a_gpu_takes_the_fused_ssim_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:

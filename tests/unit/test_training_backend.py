@@ -31,7 +31,7 @@ from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.trainer import Trainer, check_cache
+from lapgs_plugin.training.trainer import Trainer, check_storage
 from lapgs_plugin.training.views import LevelImages
 from tests.training_scene import blob_field, ring_scene
 
@@ -41,6 +41,7 @@ SETTINGS = TrainSettings(
     sh_degree=1,
     sh_every=10,
     densification=Densification(start=3, until=45, every=5, reset_every=12),
+    split="1/2,1/2",
 )
 
 
@@ -90,25 +91,25 @@ def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatc
 
 
 def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
-    settings = replace(SETTINGS, packed=True, raster={"antialiasing": True})
+    settings = replace(SETTINGS, packed=True, antialiased=True)
     with pytest.raises(UserInputError, match="--antialiased, --packed with --rasterizer cpu: only gsplat"):
         training_rasterizer("cpu", settings)
     with pytest.raises(UserInputError, match="gpu: expected memory or disk"):
-        check_cache(replace(SETTINGS, cache="gpu"), torch.device("cpu"))
-    check_cache(replace(SETTINGS, cache="gpu"), torch.device("cuda"))
+        check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cpu"))
+    check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cuda"))
 
 
 def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
     strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500, reset_every=None)
-    settings = replace(SETTINGS, densification=strategy, packed=True, raster={"antialiasing": True})
+    settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
-    assert TrainSettings.from_manifest(manifest) == settings
-    since = ("packed", "sparse_adam", "raster", "hierarchy")
+    assert TrainSettings.from_manifest(manifest).for_manifest() == settings.for_manifest()
+    since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy")
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
-    assert found == SETTINGS
+    assert found.for_manifest() == SETTINGS.for_manifest()
     assert (found.hierarchy, TrainSettings().hierarchy) == ("laplacian", "nested"), (
         "which is no default of what is read"
     )
@@ -157,7 +158,7 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
     """They do not cancel: at the same threshold more Gaussians are above it."""
     counts = []
     for absgrad in (False, True):
-        density = replace(SETTINGS.densification, absgrad=absgrad, reset_every=1000)
+        density = replace(SETTINGS.densification, absgrad=absgrad, grow_grad2d=2e-4, reset_every=1000)
         archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
         counts.append(archive.manifest.records[0].num_gaussians)
     assert counts[1] > counts[0]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan, parse_split
+from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
 from lapgs_plugin.training.views import view_index
 
@@ -19,8 +19,7 @@ from lapgs_plugin.training.views import view_index
 def schedules(**values: Any) -> list[StageSchedule]:
     """Of a base and its residuals."""
     settings = TrainSettings(hierarchy="laplacian", **values)
-    split = None if settings.split is None else parse_split(",".join(settings.split))
-    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, split, Hierarchy.LAPLACIAN)
+    plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, settings.shares, settings.kind)
     return [StageSchedule.create(settings, stage) for stage in plan]
 
 
@@ -35,7 +34,7 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
 
 
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
-    base, residual = schedules(levels=2, split=("1/3", "2/3"))
+    base, residual = schedules(levels=2, split="1/3,2/3")
     assert (base.densify_until, residual.densify_until) == (5000, 10_000)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
@@ -44,7 +43,7 @@ def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
 
 def test_given_constants_are_kept_in_short_runs() -> None:
     chosen = Densification(start=7, until=600, every=11, reset_every=13)
-    base, residual = schedules(iterations=900, split=("1/3", "2/3"), densification=chosen, sh_every=5)
+    base, residual = schedules(iterations=900, split="1/3,2/3", densification=chosen, sh_every=5)
     assert (base.densify_until, residual.densify_until) == (200, 400)
     for schedule in (base, residual):
         assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (7, 11, 13)
@@ -52,17 +51,17 @@ def test_given_constants_are_kept_in_short_runs() -> None:
 
 
 def test_late_in_a_stage_eight_views_make_a_step() -> None:
-    base, residual = schedules(iterations=30_000)
+    base, residual = schedules(iterations=30_000, split="1/2,1/2")
     for schedule in (base, residual):
         assert (schedule.gather_from, schedule.gather) == (11_251, 8)
         stepping = [i for i in range(1, 15_001) if schedule.steps(i)]
         assert stepping[:11_250] == list(range(1, 11_251))
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
-    assert schedules(iterations=3000)[1].gather == 8
-    assert schedules(iterations=2560)[1].gather == 8  # 40 steps of the last 320 iterations
-    assert schedules(iterations=2550)[1].gather == 1
-    assert schedules(iterations=2550, gather=4)[1].gather == 4
+    assert schedules(iterations=3000, split="1/2,1/2")[1].gather == 8
+    assert schedules(iterations=2560, split="1/2,1/2")[1].gather == 8  # 40 steps of the last 320 iterations
+    assert schedules(iterations=2550, split="1/2,1/2")[1].gather == 1
+    assert schedules(iterations=2550, split="1/2,1/2", gather=4)[1].gather == 4
     assert all(schedule.gather == 1 for schedule in schedules(gather=1))
 
 
@@ -72,7 +71,7 @@ def test_pruning_waits_for_the_end_of_densification() -> None:
         return [schedule.prunes_after for schedule in found]
 
     assert prunes() == [15_000]
-    assert prunes(levels=2) == [7500, 7500]
+    assert prunes(levels=2) == [5000, 10_000]
     assert prunes(until=25_001) == [25_001]
     assert prunes(until=30_000) == [None]
     assert prunes(until=500) == prunes(until=0) == [None]
@@ -121,23 +120,23 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
     ("values", "message"),
     [
         ({"sh_degree": 4}, "--sh-degree 4"),
-        ({"inherit_ratio": 0.0}, "above 0 and at most 1"),
-        ({"inherit_ratio": 1.5}, "above 0 and at most 1"),
-        ({"inherit_ratio": math.nan}, "above 0 and at most 1"),
-        ({"densification": Densification(prune=1.0)}, "--prune 1.0: expected a share from 0"),
-        ({"densification": Densification(prune=math.nan)}, "--prune nan"),
-        ({"densification": Densification(prune=0.01, strategy="mcmc")}, "--prune with --strategy mcmc"),
+        ({"inherit": "0.0"}, "above 0 and at most 1"),
+        ({"inherit": "xyz:1.5"}, "above 0 and at most 1"),
+        ({"inherit": "nan"}, "above 0 and at most 1"),
+        ({"prune": 1.0}, "--prune 1.0: expected a share from 0"),
+        ({"prune": math.nan}, "--prune nan"),
+        ({"prune": 0.01, "densification": Densification(strategy="mcmc")}, "--prune with --strategy mcmc"),
         (
             {"densification": Densification(reset_every=9, strategy="mcmc")},
             "--opacity-reset-every with --strategy mcmc",
         ),
         (
-            {"densification": Densification(absgrad=True, coarse_threshold=2.0, strategy="mcmc")},
+            {"coarse_threshold": 2.0, "densification": Densification(absgrad=True, strategy="mcmc")},
             "--absgrad, --coarse-threshold with --strategy mcmc",
         ),
         ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
         ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
-        ({"inherit": "most"}, "--inherit most: expected geometry"),
+        ({"inherit": "most"}, "--inherit 'most': expected geometry"),
         ({"seed": -1}, "--seed -1: expected 0 to 4294967295"),
         ({"seed": 2**32}, "--seed 4294967296"),
     ],
@@ -180,7 +179,7 @@ def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, u
     ],
 )
 def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
-    settings = TrainSettings(levels=3, hierarchy=hierarchy, densification=Densification(coarse_threshold=given))
+    settings = TrainSettings(levels=3, hierarchy=hierarchy, coarse_threshold=given)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
     found = [settings.densification_of(stage).grow_grad2d for stage in plan]
     assert found == pytest.approx([2e-4 * factor for factor in factors])
