@@ -71,7 +71,8 @@ class HierarchySettings:
     )
     inherit: str | None = option(
         None,
-        "What a residual field starts from: geometry (the default: everything but colour), xyz (positions, as in the paper) or full "
+        "What a residual field starts from: geometry (the default; everything but colour), xyz (positions, as in the "
+        "paper) or full "
         "(all parameters and the optimizer's state). A ratio in (0, 1] keeps that share of the Gaussians: 0.5 or "
         "xyz:0.5.",
         panel=PANEL,
