@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from lapgs_plugin import __version__
 from lapgs_plugin.cli import patch
@@ -24,9 +25,20 @@ from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.training import interrupt
+
+
+class Commands(TyperGroup):
+    """All commands; each ends on a signal as `training.interrupt` says."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with interrupt.command():
+            return super().invoke(ctx)
+
 
 app = typer.Typer(
     name="lapgs",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -74,4 +86,4 @@ def run() -> None:
         app()
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        sys.exit(interrupt.exit_code(error.exit_code))

@@ -228,8 +228,6 @@ def _follow(
     console: Console,
 ) -> None:
     """Run the jobs with a progress bar and a line for each that ends."""
-    import signal
-
     from rich.markup import escape
 
     from lapgs_plugin.experiments.store import DONE, FAILED
@@ -239,8 +237,6 @@ def _follow(
     finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
     if finished:
         console.print(f"{finished} of {len(run_ids)} runs are done already")
-    # A batch system ends a job with SIGTERM: the runs of its workers are given back, as after Ctrl-C.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     with item_progress("runs") as progress:
         task = progress.add_task("Running", total=len(run_ids), completed=finished)
 
@@ -256,8 +252,6 @@ def _follow(
             execute(store, run_ids, start, say)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; the same command goes on with the runs that are left") from None
-        finally:
-            signal.signal(signal.SIGTERM, before)
 
 
 def _summary(record: dict[str, Any]) -> str:

@@ -57,10 +57,7 @@ def view(
 
         show_log()
         with one_pool():
-            try:
-                _serve(page, run, baseline, scene, device, rasterizer)
-            except KeyboardInterrupt:
-                print("ended")
+            _serve(page, run, baseline, scene, device, rasterizer)
 
 
 def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, device: str, rasterizer: str) -> None:

@@ -18,6 +18,8 @@ import viser
 from PIL import Image
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.training.interrupt import signals_held
+from lapgs_plugin.viewer.guard import Guard, guarded_server
 from lapgs_plugin.viewer.preview import QUALITY, fitted
 
 PORTS_TRIED = 100
@@ -31,7 +33,7 @@ def free_port(host: str, port: int) -> int:
     """
     for candidate in range(port, min(port + PORTS_TRIED, 65536)):
         try:
-            with socket.create_server((host, candidate)):
+            with socket.create_server((host, candidate), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
                 return candidate
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -59,14 +61,19 @@ class Page:
 
     Raises:
         UserInputError: as `free_port`.
+        LapgsError: as `guarded_server`.
     """
 
     def __init__(self, host: str, port: int, label: str, preview: Image.Image | None = None) -> None:
         found = free_port(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its addresses; we say one line
+        with (
+            signals_held(),  # they are for the main thread alone
+            guarded_server(Guard(host)),
+            contextlib.redirect_stdout(io.StringIO()),  # viser prints a table of its addresses; we say one line
+        ):
             self.server = viser.ViserServer(host=host, port=found, label=label, verbose=False)
         self.port = int(self.server.get_port())
-        self._host = "localhost" if host in ("0.0.0.0", "127.0.0.1") else host
+        self._host = "localhost" if host in ("0.0.0.0", "127.0.0.1", "::") else f"[{host}]" if ":" in host else host
         # The button would offer the run to the internet by way of somebody else's server.
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._status: Any = self.server.gui.add_markdown(

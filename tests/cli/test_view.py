@@ -17,6 +17,7 @@ from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
+from tests.viewer.pages import statuses
 
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
@@ -29,13 +30,9 @@ lapgs_view = succeeding(app, columns=200)
 
 
 @pytest.fixture(autouse=True)
-def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C as soon as the viewer serves."""
-
-    def interrupt(self: Viewer, **_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Viewer, "serve", interrupt)
+def _ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end as soon as the viewer serves."""
+    monkeypatch.setattr(Viewer, "serve", lambda self, **_: None)
 
 
 def test_it_says_how_to_reach_it_and_takes_the_next_port(scene: Path, tmp_path: Path) -> None:
@@ -74,6 +71,18 @@ def test_a_missing_or_truncated_level_is_said_and_the_coarser_ones_are_shown(sce
     (run / "level_1" / "point_cloud.ply").unlink()
     with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
         lapgs_view(run)
+
+
+def test_a_foreign_page_may_not_look(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = []
+
+    def ask(self: Viewer, **_: object) -> None:
+        answers.extend(statuses(self._page.address))
+
+    monkeypatch.setattr(Viewer, "serve", ask)
+    lapgs_view(write_run(tmp_path / "run", scene))
+    lapgs_view(write_run(tmp_path / "other", scene), "--host", "0.0.0.0")
+    assert answers == [200, 403, 403] * 2
 
 
 def test_an_address_of_another_machine_is_refused(scene: Path, tmp_path: Path) -> None:

@@ -72,9 +72,9 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     yield found[0]
     process.send_signal(signal.SIGINT)
     rest, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, rest
+    assert process.returncode == 130, rest
     assert "Traceback" not in rest
-    assert rest.rstrip().endswith("ended")
+    assert rest.rstrip().endswith("stopped by Ctrl-C")
 
 
 def sharpen_residual(run: Path) -> None:

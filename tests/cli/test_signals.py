@@ -1,0 +1,203 @@
+"""Ctrl-C and SIGTERM at any moment of any command: one line, 130 or 143, nothing half written.
+
+Each case is a process of its own. What a signal meets depends on the machine's speed: the few cases say what holds
+whatever it meets, and the campaign draws its delays.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.files import TEMPORARY_PATTERN
+from lapgs_plugin.scenes.images import read_image
+from tests.cli.run_folder import write_run, write_scene
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
+
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+PATIENCE = 120.0
+
+READY = "installed"
+"""What a process prints as soon as its handlers are there; before, the interpreter starts and Ctrl-C is its own."""
+
+# As the script `lapgs`, besides that line. Whoever runs the tests may have Ctrl-C ignored in what they start.
+COMMAND = f"""
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import lapgs_plugin.training.interrupt as interrupt
+install = interrupt.install
+def install_and_say():
+    install()
+    print("{READY}", flush=True)
+interrupt.install = install_and_say
+from lapgs_plugin.cli import main
+main()
+"""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A process that got signals.
+
+    Attributes:
+        code: its exit code.
+        text: what it printed, both streams.
+        seconds: from its first signal to its end.
+    """
+
+    code: int
+    text: str
+    seconds: float
+
+    @property
+    def clean(self) -> bool:
+        """Whether it says in one line, besides its ordinary ones, that it was stopped."""
+        noise = re.search(r"Traceback|what\(\)|\*\*\*|KeyboardInterrupt|Interrupted|Fatal|Aborted", self.text)
+        return noise is None and len(re.findall(r"^lapgs: .*stopped.*", self.text, re.MULTILINE)) == 1
+
+
+def signalled(words: Sequence[object], signals: Sequence[tuple[float, signal.Signals]]) -> Ended:
+    """Start a command and send it each signal so many seconds after the one before, the first after its handlers."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == f"{READY}\n"
+    begin = time.monotonic()
+    for number, (delay, which) in enumerate(signals):
+        try:
+            process.wait(delay)
+        except subprocess.TimeoutExpired:
+            process.send_signal(which)
+            begin = begin if number else time.monotonic()
+    try:
+        text, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    return Ended(process.returncode, text, time.monotonic() - begin)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), size=(128, 96))
+
+
+@pytest.fixture(scope="module")
+def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "run", scene)
+
+
+def commands(scene: Path, run: Path, out: Path) -> dict[str, list[object]]:
+    """Commands by name, as words; all but those about one run write below `out` alone."""
+    return {
+        "sample": ["sample", out / "sample", "--views", 200],
+        "train": ["train", scene, "-o", out / "run", "--iterations", 4000],
+        "eval": ["eval", run],
+        "render": ["render", run, "--out", out / "pictures", "--trajectory", "orbit", "--frames", 3000],
+        "view": ["view", run],
+        "export": ["export", run, "--out", out / "export"],
+        "report": ["report", run],
+        "doctor": ["doctor"],
+    }
+
+
+def half_written(out: Path) -> list[str]:
+    """Files below a folder that cannot be read, and temporary ones."""
+    broken = [str(path) for path in out.rglob(TEMPORARY_PATTERN)]
+    for path in out.rglob("*"):
+        try:
+            if path.suffix == ".ply":
+                GaussianField.load_ply(path)
+            elif path.suffix == ".png":
+                read_image(path)
+            elif path.name == "manifest.json":
+                RunArchive.open(path.parent)
+        except Exception as error:
+            broken.append(f"{path}: {error}")
+    return broken
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+def test_a_signal_while_a_command_starts(which: signal.Signals, delay: float, scene: Path, tmp_path: Path) -> None:
+    ended = signalled(["train", scene, "-o", tmp_path / "run", "--iterations", 4000], [(delay, which)])
+    assert ended.code == CODES[which], ended.text
+    assert ended.clean, ended.text
+    assert half_written(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "which"),
+    [("sample", signal.SIGTERM), ("render", signal.SIGINT), ("view", signal.SIGTERM), ("view", signal.SIGINT)],
+)
+def test_a_signal_in_the_middle_of_a_command(
+    name: str, which: signal.Signals, scene: Path, run: Path, tmp_path: Path
+) -> None:
+    ended = signalled(commands(scene, run, tmp_path)[name], [(6.0, which)])
+    assert ended.code == CODES[which], ended.text
+    assert ended.clean, ended.text
+    assert half_written(tmp_path) == []
+
+
+@pytest.mark.parametrize("gap", [0.02, 0.2, 0.7])
+@pytest.mark.parametrize("delay", [0.1, 5.0])
+def test_a_second_ctrl_c_ends_as_the_first(delay: float, gap: float, scene: Path, run: Path, tmp_path: Path) -> None:
+    words = commands(scene, run, tmp_path)["train"]
+    ended = signalled(words, [(delay, signal.SIGINT), (gap, signal.SIGINT)])
+    assert ended.code == 130, ended.text
+    assert ended.clean, ended.text
+
+
+CAMPAIGN = 150
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [16, 17])
+def test_a_campaign_of_signals(seed: int, scene: Path, run: Path, tmp_path: Path) -> None:
+    """Hundreds of processes; prints how they ended (pytest -s)."""
+    draw = random.Random(seed)
+    outcomes: Counter[tuple[str, str, str]] = Counter()
+    failures: list[str] = []
+    for case in range(CAMPAIGN):
+        out = tmp_path / str(case)
+        out.mkdir()
+        words = commands(scene, run, out)
+        name = draw.choice(list(words))
+        which = draw.choice(list(CODES))
+        delay = draw.choice([draw.uniform(0.0, 0.3), draw.uniform(0.0, 3.0), draw.uniform(0.0, 12.0)])
+        again = [(draw.choice([0.02, 0.05, 0.1, 0.2, 0.6]), which)] if draw.random() < 0.3 else []
+        ended = signalled(words[name], [(delay, which), *again])
+        outcome = _outcome(ended, which, half_written(out) + half_written(run))
+        outcomes[name, which.name, outcome] += 1
+        print(f"{case} {name} {which.name} {delay:.2f} {again}: {outcome} in {ended.seconds:.1f} s", flush=True)
+        if outcome not in ("stopped", "finished"):
+            failures.append(f"{name} {which.name} {delay:.3f} {again}: {outcome}\n{ended.text[-3000:]}")
+    print(*(f"{count} {key}" for key, count in sorted(outcomes.items())), sep="\n")
+    assert not failures, "\n\n".join(failures)
+    assert sum(count for (*_, outcome), count in outcomes.items() if outcome == "stopped") > CAMPAIGN / 2
+
+
+def _outcome(ended: Ended, which: signal.Signals, broken: list[str]) -> str:
+    if broken:
+        return f"half written: {broken}"
+    if ended.code == 0 and "Traceback" not in ended.text:
+        return "finished"
+    if ended.code != CODES[which]:
+        return f"exit code {ended.code}"
+    return "stopped" if ended.clean else "not one line"

@@ -1,0 +1,229 @@
+"""Who may look at a page: a real browser's requests, foreign ones, and bytes that are no request at all."""
+
+from __future__ import annotations
+
+import http.client
+import re
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from urllib.parse import urlsplit
+
+import pytest
+
+viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from websockets.exceptions import InvalidStatus  # noqa: E402  # needs viser
+from websockets.sync.client import connect  # noqa: E402
+
+from lapgs_plugin.viewer.guard import MOST_LINES, Guard, guarded_server  # noqa: E402
+from lapgs_plugin.viewer.page import Page  # noqa: E402
+from tests.viewer.wire import wire_client  # noqa: E402
+from tests.waiting import wait_for  # noqa: E402
+
+OWN_NAME = socket.gethostname().lower()
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page("127.0.0.1", 8760, "run") as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def open_page() -> Iterator[Page]:
+    """Whoever can reach this machine may look."""
+    with Page("0.0.0.0", 8770, "run") as page:
+        yield page
+
+
+def get(page: Page, path: str = "/", **headers: str) -> tuple[int, str]:
+    """Status and text of a plain request; Host is the page's own unless given."""
+    with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
+        connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
+        for name, value in {"Host": f"localhost:{page.port}", **headers}.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        response = connection.getresponse()
+        return response.status, response.read().decode()
+
+
+def shake_hands(page: Page, host: str, origin: str | None) -> int:
+    """Status of a web socket's handshake by the client of websockets."""
+    with socket.create_connection(("127.0.0.1", page.port)) as stream:
+        try:
+            protocol = f"viser-v{viser.__version__}"
+            with connect(f"ws://{host}", sock=stream, origin=origin, subprotocols=[protocol]) as client:  # type: ignore[arg-type, list-item]
+                assert len(client.recv(timeout=20)) > 0, "a page's first messages"
+                return 101
+        except InvalidStatus as refused:
+            return refused.response.status_code
+
+
+# What a browser sends: the Host that it was told, and for its web sockets an Origin of the same name.
+GOOD_HOSTS = ["localhost:PORT", "127.0.0.1:PORT", "[::1]:PORT", "LOCALHOST:PORT", "localhost:9123", "127.0.0.1:9123"]
+FOREIGN_HOSTS = [
+    "evil.example:PORT",
+    "evil.example",
+    "localhost.evil.example:PORT",
+    "192.0.2.7:PORT",
+    "[2001:db8::7]:80",
+]
+FOREIGN_ORIGINS = [
+    *("http://evil.example", "https://evil.example:PORT", "null", "http://localhost", "http://localhost:9123"),
+    *("http://localhost:PORT.evil.example", "http://127.0.0.1:PORT", "ftp://localhost:PORT", "file://"),
+]
+
+
+@pytest.mark.parametrize("host", GOOD_HOSTS)
+def test_a_browser_of_this_machine_or_of_a_tunnel_is_answered(page: Page, host: str) -> None:
+    host = host.replace("PORT", str(page.port))
+    status, text = get(page, Host=host)
+    assert status == 200
+    assert "<html" in text
+    assert get(page, Host=host, Origin=f"http://{host}")[0] == 200
+    assert shake_hands(page, host, f"http://{host}") == 101
+    assert shake_hands(page, host, None) == 101  # a program
+
+
+@pytest.mark.parametrize("host", FOREIGN_HOSTS)
+def test_a_page_whose_name_was_made_to_lead_here_is_refused(page: Page, host: str) -> None:
+    host = host.replace("PORT", str(page.port))
+    status, text = get(page, Host=host)
+    assert status == 403
+    assert host in text
+    assert get(page, Host=host, Origin=f"http://{host}")[0] == 403
+    assert shake_hands(page, host, f"http://{host}") == 403
+    assert shake_hands(page, host, None) == 403
+
+
+@pytest.mark.parametrize("origin", FOREIGN_ORIGINS)
+def test_a_foreign_page_is_refused(page: Page, origin: str) -> None:
+    origin = origin.replace("PORT", str(page.port))
+    assert get(page, Origin=origin)[0] == 403
+    assert shake_hands(page, f"localhost:{page.port}", origin) == 403
+
+
+def test_on_all_addresses_any_address_is_a_name_and_no_foreign_name_is(open_page: Page) -> None:
+    for host in (f"192.0.2.7:{open_page.port}", f"[2001:db8::7]:{open_page.port}", f"{OWN_NAME}:{open_page.port}"):
+        assert get(open_page, Host=host)[0] == 200, host
+        assert shake_hands(open_page, host, f"http://{host}") == 101
+        assert shake_hands(open_page, host, "http://evil.example") == 403
+    assert get(open_page, Host=f"evil.example:{open_page.port}")[0] == 403
+
+
+def test_a_name_that_was_asked_for_is_known_with_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: found)
+    monkeypatch.setattr(socket, "getfqdn", lambda: "gpu.lab.example")
+    guard = Guard("Viewer.Example")
+    wait_for(lambda: guard._knows("gpu.lab.example"))
+    known = ("viewer.example", "192.0.2.7", "localhost", "[::1]", OWN_NAME)
+    assert all(guard._knows(name) for name in known)
+    assert not any(guard._knows(name) for name in ("example", "192.0.2.8", "evil.example"))
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("/" + "a" * 7000, 414),
+        ("/" + "a" * 300, 400),  # longer than a file system's names
+        ("/%00", 404),
+        ("/../../etc/passwd", 404),
+        ("/%2e%2e/%2e%2e/etc/passwd", 404),
+        ("/nothing", 404),
+    ],
+)
+def test_paths_that_lead_nowhere(page: Page, path: str, expected: int, caplog: pytest.LogCaptureFixture) -> None:
+    assert get(page, path)[0] == expected
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("host", ["", "localhost:PORT, evil", "a@localhost:PORT", "localhost:PORT/x", "[localhost]"])
+def test_a_host_that_is_none_is_a_mistake(page: Page, host: str) -> None:
+    assert get(page, Host=host.replace("PORT", str(page.port)))[0] in (400, 403)
+
+
+GARBAGE = [
+    b"\x00\xff\xfe" * 1000,
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",  # the beginning of TLS
+    b"POST / HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    b"GET / HTTP/1.0\r\n\r\n",
+    b"GET / HTTP/1.1\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nAccept-Encoding: a\r\nAccept-Encoding: b\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: local",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: x\r\n\r\n",
+    b"GET " + b"/a" * 20000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: \xff\xfe\r\nOrigin: \xff\r\n\r\n",
+    b"",
+]
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_bytes_that_are_no_request_leave_the_page_up_and_no_traceback(
+    page: Page, reset: bool, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for garbage in GARBAGE:
+        with socket.create_connection(("127.0.0.1", page.port), timeout=20) as stream:
+            stream.sendall(garbage)
+            if reset:
+                stream.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                continue
+            stream.shutdown(socket.SHUT_WR)
+            answer = b""
+            while part := stream.recv(65536):
+                answer += part
+        assert answer[:12] in (b"", b"HTTP/1.1 400", b"HTTP/1.1 403", b"HTTP/1.1 426"), garbage
+    assert get(page)[0] == 200
+    assert shake_hands(page, f"localhost:{page.port}", None) == 101
+    assert not any(record.exc_info for record in caplog.records)
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err
+
+
+def test_a_client_that_sends_no_messages_is_one_line(page: Page, caplog: pytest.LogCaptureFixture) -> None:
+    for garbage in (b"\xff\xfe", "text", b""):
+        with wire_client(page.address) as client:
+            client.connection.send(garbage)
+            wait_for(lambda: "a browser was disconnected" in caplog.text)
+        assert [record.exc_info for record in caplog.records] == [None]
+        assert "\n" not in caplog.records[0].getMessage()
+        caplog.clear()
+    assert get(page)[0] == 200
+
+
+def test_what_is_refused_is_a_line_each_and_not_without_end(caplog: pytest.LogCaptureFixture) -> None:
+    with Page("127.0.0.1", 8790, "run") as page:
+        for name in ("\x9bevil", "evil", "evil", *(f"evil{number}" for number in range(20))):
+            assert get(page, Origin=f"http://{name}.example")[0] == 403
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == len(set(lines)) == MOST_LINES
+    assert lines[1].startswith("the viewer refused a browser: a page of 'http://evil.example' may not")
+    assert re.fullmatch(r"[\x20-\x7e]*", "".join(lines))
+
+
+def test_a_server_that_was_not_guarded_is_an_error() -> None:
+    with pytest.raises(Exception, match="cannot be guarded"), guarded_server(Guard("127.0.0.1")):
+        pass
+
+
+def test_pages_that_would_show_ours_inside_are_told_not_to(page: Page) -> None:
+    with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
+        connection.request("GET", "/")
+        assert connection.getresponse().headers["Content-Security-Policy"] == "frame-ancestors 'self'"
+
+
+def test_the_address_of_ipv6_is_one_that_can_be_opened() -> None:
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            pass
+    except OSError:
+        pytest.skip("no IPv6 here")
+    with Page("::1", 8780, "run") as page:
+        assert urlsplit(page.address).hostname == "::1"
+        with closing(http.client.HTTPConnection("::1", page.port, timeout=20)) as connection:
+            connection.request("GET", "/")
+            assert connection.getresponse().status == 200
