@@ -88,8 +88,9 @@ def prepare_scene(
 ) -> PrepareResult:
     """Find features, match them, recover cameras and points, and write undistorted photos with a PINHOLE model.
 
-    An interrupted call goes on where it stopped when it is repeated with the same photos and settings. Runs on COLMAP's
-    GPU code where pycolmap has it, else on the CPU.
+    An interrupted call goes on where it stopped when it is repeated with the same photos and settings. Photos with fewer
+    than 25,000 features in all give the same scene each time on the same machine; with more, COLMAP's threads decide
+    about rounding and about the photos it starts from. Runs on COLMAP's GPU code where pycolmap has it, else on the CPU.
 
     Args:
         photos: folder of JPEG, PNG, TIFF, BMP or WebP files, also in folders below it. At least 2.

@@ -9,7 +9,9 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -25,6 +27,7 @@ from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes import prepare as prepare_module
+from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.prepare import PrepareResult, prepare_scene
 from lapgs_plugin.scenes.sample.raycast import render
@@ -207,6 +210,19 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     result = prepare_scene(photos, out, progress=False)
     assert result.seconds["Finding features"] < 0.5 * prepared[1].seconds["Finding features"]
     assert _hashes(out) == _hashes(prepared[0])
+
+
+@pytest.mark.parametrize(("features", "threads"), [(24_999, 1), (25_000, -1)])
+def test_few_features_are_mapped_by_one_thread(
+    features: int, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More race for the photos to start from: eight threads made three scenes of the same matches in twelve runs."""
+    database = SimpleNamespace(num_keypoints=lambda: features)
+    used = []
+    monkeypatch.setattr(pycolmap.Database, "open", lambda path: nullcontext(database))
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **callbacks: used.append(args[3].num_threads))
+    colmap_worker._map({"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed")})
+    assert used == [threads]
 
 
 def test_photos_that_do_not_fit_are_named(few: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
