@@ -212,6 +212,40 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     assert _hashes(out) == _hashes(prepared[0])
 
 
+@pytest.mark.parametrize("done", range(4))
+def test_an_interruption_while_scenes_change_places_is_made_good(
+    done: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, work = tmp_path / "scene", tmp_path / "scene" / ".prepare"
+    rename, left = Path.rename, done
+
+    def until_killed(path: Path, target: Path) -> Path:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    def write(place: Path, text: str) -> None:
+        for name in ("images", "sparse"):
+            (place / name).mkdir(parents=True, exist_ok=True)
+            (place / name / "file").write_text(text)
+
+    write(out, "old")
+    write(work / "scene", "new")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", until_killed)
+        with pytest.raises(KeyboardInterrupt):
+            prepare_module._move_into_place(work, out)
+    texts = {name: (out / name / "file").read_text() for name in ("images", "sparse") if (out / name).exists()}
+    assert "sparse" not in texts or len(set(texts.values())) == 1, "a model with images of another"
+    shutil.rmtree(work / "scene")
+    write(work / "scene", "new")
+    prepare_module._move_into_place(work, out)
+    assert [(out / name / "file").read_text() for name in ("images", "sparse")] == ["new", "new"]
+    assert not work.exists()
+
+
 @pytest.mark.parametrize(("features", "threads"), [(24_999, 1), (25_000, -1)])
 def test_few_features_are_mapped_by_one_thread(
     features: int, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

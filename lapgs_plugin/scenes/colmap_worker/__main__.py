@@ -72,9 +72,9 @@ def _map(job: dict[str, Any]) -> None:
     with pycolmap.Database.open(job["database"]) as database:
         residuals = 2 * database.num_keypoints()  # at most
     if residuals < options.ba_min_num_residuals_for_cpu_multi_threading:
-        # COLMAP's threads race for the pair that it starts from, and another pair gives another scene. Bundle adjustment
-        # takes one thread for so few features anyway, so one costs nothing. For more it takes several, whose sums have
-        # no fixed order: the same photos then give scenes that differ a little.
+        # COLMAP's threads race for the pair that it starts from, and another pair gives another scene. For so few
+        # features bundle adjustment takes one thread anyway, so one for all costs nothing. For more it takes several,
+        # whose sums have no fixed order: the same photos then give scenes that differ a little.
         options.num_threads = 1
     with Path(job["placed"]).open("wb", buffering=0) as placed:
 
