@@ -1,7 +1,7 @@
 """Run tests as on other processors: `make portability`, or `python -m tests.portability` with pytest's arguments.
 
-PyTorch and Numba are told to compute as for another processor. Two ways to compute the same then differ as they do there,
-and a comparison whose tolerance was found on one machine shows whether it holds.
+PyTorch and Numba are told to compute as for another processor. Two ways to compute the same then differ as they do
+there, and a comparison whose tolerance was found on one machine shows whether it holds.
 """
 
 from __future__ import annotations
