@@ -7,7 +7,7 @@ DEMO := runs/demo
 SMOKE := runs/smoke
 DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
-.PHONY: demo test smoke check clean
+.PHONY: demo test smoke portability check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
@@ -28,6 +28,11 @@ test: check
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)
 	$(BIN)/lapgs bench benchmarks/smoke.toml --out $(SMOKE)
+
+# Whether tests that compare two computations hold on other processors: raster, unit and contract tests, with PyTorch and
+# Numba told to compute as for narrower ones. Takes several times as long as `make test` and is no part of it.
+portability: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.portability -n 2 --dist loadfile tests/raster tests/unit tests/contract
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .

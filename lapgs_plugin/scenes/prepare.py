@@ -88,8 +88,10 @@ def prepare_scene(
 ) -> PrepareResult:
     """Find features, match them, recover cameras and points, and write undistorted photos with a PINHOLE model.
 
-    An interrupted call goes on where it stopped when it is repeated with the same photos and settings. Runs on COLMAP's
-    GPU code where pycolmap has it, else on the CPU.
+    An interrupted call continues where it stopped when it is repeated with the same photos and settings. On the same
+    machine, photos with fewer than 25,000 features in all give the same scene each time. With more, the timing of
+    COLMAP's threads decides which photos it starts from, and in which order it sums. Runs on COLMAP's GPU code where
+    pycolmap has it, else on the CPU.
 
     Args:
         photos: folder of JPEG, PNG, TIFF, BMP or WebP files, also in folders below it. At least 2.
@@ -375,7 +377,8 @@ def _move_observations(image: pycolmap.Image, lens: _Lens) -> None:
 def _move_into_place(work: Path, out: Path) -> None:
     """The model goes last: without one, the folder is no scene yet."""
     replaced = work / "replaced"
-    replaced.mkdir(exist_ok=True)
+    shutil.rmtree(replaced, ignore_errors=True)  # of a call that was interrupted here; the new scene is complete
+    replaced.mkdir()
     for name in ("sparse", "images"):
         if (out / name).exists():
             (out / name).rename(replaced / name)

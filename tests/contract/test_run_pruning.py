@@ -56,8 +56,14 @@ def test_what_is_least_seen_goes(
         plain = GaussianField(before.means, before.quaternions, before.log_scales, before.opacity_logits, grey)
         cameras = [level_camera(view.camera, level) for view in views]
         images = (rasterizer(plain, camera, background=torch.zeros(3)).image for camera in cameras)
-        # Relative, of a sum in another order; worst seen 9.2e-6.
-        torch.testing.assert_close(pixels, blended_pixels(images, grey), rtol=3e-5, atol=1e-6)
+        expected = blended_pixels(images, grey)
+        # The same sums in another order: relative, worst seen 9.2e-6. Not so for Gaussians in pixels where rounding,
+        # and so the processor, decides about alpha = 1/255, the last one, or which of two is in front. (The bounds of
+        # `threshold_mask` leave 4 % of the pixels of 7000 Gaussians.) Worst seen with cameras and parameters moved by
+        # one to five roundings, 16 to 60 times for each field: 2.6 % of the Gaussians, together 2.6e-4 of the sum.
+        decided = torch.isclose(pixels, expected, rtol=3e-5, atol=1e-6)
+        assert decided.float().mean() > 0.95
+        assert (pixels - expected).abs().sum() < 1e-3 * expected.sum()
     entries = [entry for entry in archive.history() if "num_gaussians" in entry]
     counts = {(entry["level"], entry["iteration"]): entry["num_gaussians"] for entry in entries}
     for level, first in ((1, 20), (0, 40)):

@@ -251,7 +251,9 @@ PACKAGE = Path(__file__).parents[2] / "lapgs_plugin"
 
 def run_python(code: str, path: Path) -> str:
     """What a fresh process, with `path` first among the places to import from, writes to stderr."""
-    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment = dict(os.environ)
+    if path != PACKAGE.parent:  # a copy is compiled anew, whatever an earlier one at the same place left
+        environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
         cwd=path,

@@ -9,7 +9,9 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -25,6 +27,7 @@ from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes import prepare as prepare_module
+from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.prepare import PrepareResult, prepare_scene
 from lapgs_plugin.scenes.sample.raycast import render
@@ -207,6 +210,53 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     result = prepare_scene(photos, out, progress=False)
     assert result.seconds["Finding features"] < 0.5 * prepared[1].seconds["Finding features"]
     assert _hashes(out) == _hashes(prepared[0])
+
+
+@pytest.mark.parametrize("done", range(4))
+def test_an_interruption_while_scenes_change_places_is_made_good(
+    done: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, work = tmp_path / "scene", tmp_path / "scene" / ".prepare"
+    rename, left = Path.rename, done
+
+    def until_killed(path: Path, target: Path) -> Path:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    def write(place: Path, text: str) -> None:
+        for name in ("images", "sparse"):
+            (place / name).mkdir(parents=True, exist_ok=True)
+            (place / name / "file").write_text(text)
+
+    write(out, "old")
+    write(work / "scene", "new")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", until_killed)
+        with pytest.raises(KeyboardInterrupt):
+            prepare_module._move_into_place(work, out)
+    texts = {name: (out / name / "file").read_text() for name in ("images", "sparse") if (out / name).exists()}
+    assert "sparse" not in texts or len(set(texts.values())) == 1, "a model with images of another"
+    shutil.rmtree(work / "scene")
+    write(work / "scene", "new")
+    prepare_module._move_into_place(work, out)
+    assert [(out / name / "file").read_text() for name in ("images", "sparse")] == ["new", "new"]
+    assert not work.exists()
+
+
+@pytest.mark.parametrize(("features", "threads"), [(24_999, 1), (25_000, -1)])
+def test_few_features_are_mapped_by_one_thread(
+    features: int, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More race for the photos to start from: eight threads made three scenes of the same matches in twelve runs."""
+    database = SimpleNamespace(num_keypoints=lambda: features)
+    used = []
+    monkeypatch.setattr(pycolmap.Database, "open", lambda path: nullcontext(database))
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **callbacks: used.append(args[3].num_threads))
+    colmap_worker._map({"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed")})
+    assert used == [threads]
 
 
 def test_photos_that_do_not_fit_are_named(few: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -69,6 +69,13 @@ def _map(job: dict[str, Any]) -> None:
     """Keys: database, photos, models (an empty folder), placed (a file that grows by a byte for each photo)."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.mapper.random_seed = options.triangulation.random_seed = SEED
+    with pycolmap.Database.open(job["database"]) as database:
+        residuals = 2 * database.num_keypoints()  # at most
+    if residuals < options.ba_min_num_residuals_for_cpu_multi_threading:
+        # COLMAP's threads race for the pair that it starts from, and another pair gives another scene. For so few
+        # features bundle adjustment takes one thread anyway, so one for all costs nothing. For more it takes several,
+        # whose sums have no fixed order: the same photos then give scenes that differ a little.
+        options.num_threads = 1
     with Path(job["placed"]).open("wb", buffering=0) as placed:
 
         def place(count: int) -> None:
