@@ -134,10 +134,10 @@ class AnnouncingViews(list[Any]):
 
     Args:
         views: in the scene's order.
-        announce: told of the view that will be drawn next.
+        prefetch: told of the view that will be drawn next.
     """
 
-    def __init__(self, views: Iterable[Any], announce: Callable[[Any], None]) -> None:
+    def __init__(self, views: Iterable[Any], prefetch: Callable[[Any], None]) -> None:
         super().__init__(views)
         self._announce = announce
 

@@ -91,7 +91,7 @@ def run(
     from lapgs_plugin.checkouts.script import loaded_script, require_script
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_rasterizer import explained
-    from lapgs_plugin.runner.recording import Witness
+    from lapgs_plugin.runner.recording import BareRunRecorder
 
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
@@ -118,7 +118,7 @@ def run(
     try:
         with on_device, loaded_script(script, words) as loaded:
             if off and record:
-                Witness(kind(loaded), chosen).run()
+                BareRunRecorder(kind(loaded), chosen).run()
                 return
             if off:
                 loaded.run_main()

@@ -12,7 +12,7 @@ from torch import Tensor
 logger = logging.getLogger(__name__)
 
 
-def is_right(otherwise: str, difference: Callable[[], float], limit: float) -> bool:
+def matches_reference(otherwise: str, difference: Callable[[], float], limit: float) -> bool:
     """Whether kernels compile here, and give what the slower way gives.
 
     Args:

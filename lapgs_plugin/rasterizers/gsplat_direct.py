@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.ops.self_check import is_right, largest
+from lapgs_plugin.ops.self_check import largest, matches_reference
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
 
 logger = logging.getLogger(__name__)
@@ -243,7 +243,7 @@ def works() -> bool:
     if not gsplat.__version__.startswith(KNOWN_RELEASES):
         logger.info("gsplat %s: rendering by its own `rasterization`, which takes more launches", gsplat.__version__)
         return False
-    return is_right(
+    return matches_reference(
         "rendering by `gsplat.rasterization`", lambda: _largest_difference(torch.device("cuda")), LARGEST_DIFFERENCE
     )
 

@@ -10,7 +10,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 
 
 @dataclass
-class Residence:
+class FieldOffload:
     """Brings fields to the device that renders them.
 
     Attributes:

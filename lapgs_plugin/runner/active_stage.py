@@ -32,7 +32,7 @@ from lapgs_plugin.runner.stage_images import StageImages
 from lapgs_plugin.runs.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.runs.overhead import Overhead
 from lapgs_plugin.runs.peak_memory import PeakMemory
-from lapgs_plugin.runs.upsampled_images import RaisedImages
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 logger = logging.getLogger(__name__)
 
@@ -366,7 +366,7 @@ class ActiveStage:
         return Finished(field, predictions, carried, moments)
 
     @torch.no_grad()
-    def _predict(self, gaussians: Any) -> RaisedImages:
+    def _predict(self, gaussians: Any) -> UpsampledImages:
         """The composed image of every view, for the next level."""
         predictions = self._images.new_predictions()
         for camera in self._images.cameras:
@@ -462,7 +462,7 @@ class ActiveStage:
         if not self._images.wait_elsewhere:
             return views
         keys = {id(view): key for key, view in self._views.items()}
-        return AnnouncingViews(views, lambda view: self._rendering.announce(keys[id(view)]))
+        return AnnouncingViews(views, lambda view: self._rendering.prefetch(keys[id(view)]))
 
     def _synchronize(self) -> None:
         if self._device.type == "cuda":

@@ -20,7 +20,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ADAM_EPS
-from lapgs_plugin.ops.upsample import add_raised, raised
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.run_state import RunContext
 from lapgs_plugin.runner.shim import StageRendering
@@ -85,9 +85,9 @@ class JointLevels:
         self._pyramid = Pyramid(context.options.grid)
         self._cameras = {images.key(camera): camera for camera in images.cameras}
         views = {id(camera.world_view_transform): key for key, camera in self._cameras.items()}
-        self._fields = [self._thawed(one, views, path) for one in finished]
+        self._fields = [self._unfrozen(one, views, path) for one in finished]
 
-    def _thawed(self, finished: FinishedStage, views: dict[int, str], path: ColorPath) -> _FinishedField:
+    def _unfrozen(self, finished: FinishedStage, views: dict[int, str], path: ColorPath) -> _FinishedField:
         adapter, device, call = self._context.adapter, self._context.device, finished.call
         gaussians = adapter.model_of(call, self._archive.field(finished.stage.level).to(device))
         rendering = StageRendering(signed=finished.stage.signed, path=path, views=views, capture=True)
@@ -116,7 +116,7 @@ class JointLevels:
             following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=on_gpu)
             leading.register_step_post_hook(_Follow(following))
 
-    def announce(self, key: str) -> None:
+    def prefetch(self, key: str) -> None:
         """Nothing has to be brought from anywhere."""
 
     def get(self, key: str) -> Tensor:
@@ -126,10 +126,10 @@ class JointLevels:
         for one in self._fields:
             width, height = self._images.size(camera, one.of.stage.level)
             image = self._render(one, key, (width, height))
-            composed = image if composed is None else add_raised(self._pyramid, composed, image)
+            composed = image if composed is None else upsample_add(self._pyramid, composed, image)
         assert composed is not None
         width, height = self._images.size(camera, self._fields[-1].of.stage.level - 1)
-        return raised(self._pyramid, composed, (height, width))
+        return upsample(self._pyramid, composed, (height, width))
 
     def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
         """(3, h, w) of one field alone."""

@@ -31,7 +31,7 @@ TIMELINE_ENTRIES = 200
 """About how many moments of a run are noted with their number of Gaussians."""
 
 
-class Witness:
+class BareRunRecorder:
     """Runs a script's main block and notes what it took.
 
     Args:

@@ -16,7 +16,7 @@ from lapgs_plugin.runner.hooking import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.shim import RasterizerShim, StageRendering
-from lapgs_plugin.runs.upsampled_images import RaisedImages
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watching import Watcher
 
 
@@ -97,6 +97,6 @@ class Finished:
     """
 
     field: GaussianField
-    predictions: RaisedImages | None
+    predictions: UpsampledImages | None
     carried: Mapping[str, Any]
     moments: Mapping[str, dict[str, Tensor]]

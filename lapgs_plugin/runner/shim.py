@@ -24,7 +24,7 @@ GREY = 0.5
 class Predictions(Protocol):
     """What lies below every view, by key: kept images, raised, or finished levels that render it."""
 
-    def announce(self, key: str, /) -> None:
+    def prefetch(self, key: str, /) -> None:
         """Told of a view that will be asked for soon."""
 
     def get(self, key: str, /) -> Tensor:
@@ -63,13 +63,13 @@ class StageRendering:
     def key(self, settings: Any) -> str | None:
         return self.views.get(id(settings.viewmatrix))
 
-    def announce(self, key: str) -> None:
+    def prefetch(self, key: str) -> None:
         """Bring a view's images while it is being rendered."""
         if self.targets is not None:
-            self.targets.announce(key)
+            self.targets.prefetch(key)
         below = self.accumulated if key in self.composed else self._below_target
         if below is not None:
-            below.announce(key)
+            below.prefetch(key)
 
     def target(self, key: str) -> Tensor:
         """(3, h, w) what `compose` is compared with: I^l, or what is missing of it."""
@@ -115,7 +115,7 @@ class RasterizerShim:
             if stage is None:
                 return settings
             if (key := stage.key(settings)) is not None:
-                stage.announce(key)
+                stage.prefetch(key)
             if not stage.signed:
                 return settings
             degree = settings.sh_degree

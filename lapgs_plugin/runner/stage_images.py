@@ -15,7 +15,7 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.runner.run_state import LoadedScene
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.image_store import PRECISIONS, ImageStore, chosen_precision, place
-from lapgs_plugin.runs.upsampled_images import RaisedImages
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 
 class StageImages:
@@ -39,7 +39,7 @@ class StageImages:
         options: RunSettings,
         device: torch.device,
         folder: Path,
-        accumulated: RaisedImages | None,
+        accumulated: UpsampledImages | None,
     ) -> None:
         self._album, self._stage, self._options = album, stage, options
         self._device, self._folder = device, folder
@@ -85,7 +85,7 @@ class StageImages:
                 height, width = images[level].shape[1:]
                 self.coarse.put(key, images[level + 1], (height, width))
 
-    def new_predictions(self) -> RaisedImages:
+    def new_predictions(self) -> UpsampledImages:
         """Room for I_hat^l of every view, from which the next stage will have Up(I_hat^l)."""
         precision = chosen_precision(self._options.prediction_precision, self._device)
         return self._raised(precision, self._stage.level, "predictions")
@@ -120,10 +120,10 @@ class StageImages:
         """Photos of 8 bits are themselves only at full size: averages need more."""
         return "uint8" if level == 0 and self._album.exact else "float16"
 
-    def _raised(self, precision: str, level: int, name: str) -> RaisedImages:
+    def _raised(self, precision: str, level: int, name: str) -> UpsampledImages:
         """Room for images of a level that the next finer one will look at as Up of them, beside its targets."""
         targets = self._bytes(self._target_precision(level - 1), level - 1)
-        return RaisedImages(self._store(precision, level, name, beside=targets), self._pyramid)
+        return UpsampledImages(self._store(precision, level, name, beside=targets), self._pyramid)
 
     def _bytes(self, precision: str, level: int) -> int:
         """Of an image of every view at a level."""

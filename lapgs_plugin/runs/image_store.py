@@ -160,7 +160,7 @@ class ImageStore:
             wait([coming])
         self._images[name] = self._keep(name, encoded, low, divisor)
 
-    def announce(self, name: str) -> None:
+    def prefetch(self, name: str) -> None:
         """Start bringing an image to the device, in the background, where it lies until it is fetched.
 
         At most `AHEAD` images do; `get` has to bring an older one again.
@@ -195,7 +195,7 @@ class ImageStore:
         if self._at_hand(image):
             assert image.stored is not None
             return _decode(image.stored, image)
-        self.announce(name)
+        self.prefetch(name)
         arrival = self._coming.pop(name).result()
         if arrival.event is not None:
             stream = torch.cuda.current_stream(self._device)
@@ -223,12 +223,12 @@ class ImageStore:
     @property
     def bytes_on_device(self) -> int:
         """Bytes on the GPU: images kept there and those announced."""
-        return self._bytes_kept("gpu") + (0 if self._stream is None else self._bytes_announced())
+        return self._bytes_kept("gpu") + (0 if self._stream is None else self._bytes_prefetched())
 
     @property
     def bytes_in_memory(self) -> int:
         """Bytes in the computer's memory: images kept there, and on a CPU those announced."""
-        return self._bytes_kept("memory") + (self._bytes_announced() if self._stream is None else 0)
+        return self._bytes_kept("memory") + (self._bytes_prefetched() if self._stream is None else 0)
 
     @property
     def bytes_on_disk(self) -> int:
@@ -259,7 +259,7 @@ class ImageStore:
     def _bytes_kept(self, where: str) -> int:
         return sum(self._num_bytes(image) for image in self._images.values()) if where == self._where else 0
 
-    def _bytes_announced(self) -> int:
+    def _bytes_prefetched(self) -> int:
         return sum(self._num_bytes(self._images[name]) for name in self._coming)
 
     def _num_bytes(self, image: _Image) -> int:

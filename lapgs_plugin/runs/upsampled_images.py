@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
-from lapgs_plugin.ops.upsample import raised
+from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.runs.image_store import ImageStore
 
 
-class RaisedImages:
+class UpsampledImages:
     """Up of images by name.
 
     Attributes:
@@ -41,14 +41,14 @@ class RaisedImages:
         self.store.put(name, image)
         self._sizes[name] = size
 
-    def announce(self, name: str) -> None:
-        """Start bringing what a view's image is made of to the device; see `ImageStore.announce`."""
-        self.store.announce(name)
+    def prefetch(self, name: str) -> None:
+        """Start bringing what a view's image is made of to the device; see `ImageStore.prefetch`."""
+        self.store.prefetch(name)
 
     @torch.no_grad()
     def get(self, name: str) -> Tensor:
         """(c, h, w) Up of an image on the device, float32, made anew by every call; see `ImageStore.get`."""
-        return raised(self.pyramid, self.store.get(name), self._sizes[name])
+        return upsample(self.pyramid, self.store.get(name), self._sizes[name])
 
     def close(self) -> None:
         """Forget everything and remove the files."""

@@ -24,14 +24,14 @@ from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.ops.upsample import raised
+from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.runs.archive import CACHE, LevelRecord, RunArchive
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
 from lapgs_plugin.runs.overhead import Overhead
 from lapgs_plugin.runs.peak_memory import PeakMemory
-from lapgs_plugin.runs.upsampled_images import RaisedImages
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
@@ -91,9 +91,9 @@ def warm_up(
         statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
     if residuals:
-        raised(Pyramid(), coarse, (16, 16))
+        upsample(Pyramid(), coarse, (16, 16))
     if joint:
-        below = raised(Pyramid(), coarse.requires_grad_(), (16, 16))
+        below = upsample(Pyramid(), coarse.requires_grad_(), (16, 16))
         below.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
@@ -135,8 +135,8 @@ class Trainer:
         check_storage(self.settings, self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
-        self._train_cache: RaisedImages | None = None
-        self._test_cache: RaisedImages | None = None
+        self._train_cache: UpsampledImages | None = None
+        self._test_cache: UpsampledImages | None = None
         self._memory = PeakMemory(self.device)
         self._last_tick = (0.0, 0)
         self._last_checkpoint = time.monotonic()
@@ -220,7 +220,7 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
-    def _heir_wants_moments(self, stage: Stage) -> bool:
+    def _next_stage_inherits_moments(self, stage: Stage) -> bool:
         """Whether the stage after this one goes on with Adam's state."""
         return stage.level > 0 and self.settings.inherit_mode == "full"
 
@@ -255,11 +255,11 @@ class Trainer:
             model=model,
             densifier=density_control(schedule, self.settings.densification_of(stage), self.scene.extent),
             joint_from=self.settings.joint_from(stage),
-            thaw=self._thaw,
+            unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
         )
 
-    def _thaw(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
+    def _unfreeze(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
         """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived.
 
         What was kept of their predictions is let go of: from here on these are rendered.
@@ -291,10 +291,10 @@ class Trainer:
         with self._overhead.timed("evaluation"):
             self._test_cache = self._predictions(stage, self.scene.test, TEST)
 
-    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> RaisedImages:
+    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
         """Up(I_hat^(l+1)) of each view, for the stage of level l."""
         coarser = stage.level + 1
-        cache = RaisedImages(self._empty_cache(coarser, views, name), self._pyramid)
+        cache = UpsampledImages(self._empty_cache(coarser, views, name), self._pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
@@ -411,7 +411,7 @@ class Trainer:
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
         )
-        moments = run.model.optimizer_moments() if self._heir_wants_moments(run.stage) else None
+        moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 

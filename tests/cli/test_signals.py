@@ -19,9 +19,9 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import TEMPORARY_PATTERN
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.run_folder import write_run, write_scene
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.cli.run import CONTEXT, run
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_scene

@@ -21,7 +21,7 @@ from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
-from lapgs_plugin.rendering.field_offload import Residence
+from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.gsplat_on_cpu import gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
@@ -79,7 +79,7 @@ def hierarchy(counts: Sequence[int], degrees: Sequence[int] = (1, 1, 1, 1)) -> d
 
 def at_once(fields: Mapping[int, GaussianField], rasterizer: OnCpu | None = None) -> HierarchyRenderer:
     return HierarchyRenderer(
-        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=Residence(CPU)
+        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=FieldOffload(CPU)
     )
 
 
@@ -167,7 +167,7 @@ def test_what_stays_field_by_field() -> None:
         replace(renderer, at_once=0),
         replace(renderer, at_once=53 * 37 - 1),
         replace(renderer, residence=None),
-        replace(renderer, residence=Residence(CPU, keep=False)),
+        replace(renderer, residence=FieldOffload(CPU, keep=False)),
     ):
         asked.clear()
         assert_same(other.render(CAMERA), expected.render(CAMERA))

@@ -283,7 +283,7 @@ def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, m
     monkeypatch.setattr(training_views, "_wants_store", lambda device: True)
     stored = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
     for view in eight_bit:
-        stored.announce(view.name)
+        stored.prefetch(view.name)
         (target, coarse), (expected, expected_coarse) = stored.get(view.name), held.get(view.name)
         assert (expected_coarse is None) == (coarse is None) == (level == 1)
         if level == 0:

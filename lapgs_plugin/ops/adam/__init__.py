@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.ops.self_check import is_right, largest
+from lapgs_plugin.ops.self_check import largest, matches_reference
 
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""
@@ -35,7 +35,7 @@ class GpuFieldAdam(torch.optim.Optimizer):
 @torch.no_grad()
 def step_together(optimizers: Sequence[GpuFieldAdam]) -> None:
     """One step of the five tensors of a field; without a gradient one moves by its momentum alone."""
-    from lapgs_plugin.ops.adam.in_triton import Moving, step_five
+    from lapgs_plugin.ops.adam.in_triton import AdamSlot, step_five
 
     tensors = []
     for optimizer in optimizers:
@@ -44,7 +44,7 @@ def step_together(optimizers: Sequence[GpuFieldAdam]) -> None:
         state: dict[str, Any] = optimizer.state[param]
         gradient = torch.zeros_like(param) if param.grad is None else param.grad.contiguous()
         moments = state["exp_avg"], state["exp_avg_sq"], state["step"]
-        tensors.append(Moving(param, gradient, *moments, rate, rate * group["rest_scale"]))
+        tensors.append(AdamSlot(param, gradient, *moments, rate, rate * group["rest_scale"]))
     torch._foreach_add_([one.step for one in tensors], 1)
     if len(tensors[0].values) > 0:
         step_five(tensors)
@@ -53,7 +53,7 @@ def step_together(optimizers: Sequence[GpuFieldAdam]) -> None:
 @lru_cache(maxsize=1)
 def adam_in_triton() -> bool:
     """Whether our kernel takes the steps that PyTorch's Adam takes."""
-    return is_right("Adam in a launch a tensor", lambda: largest_difference(torch.device("cuda")), 1e-5)
+    return matches_reference("Adam in a launch a tensor", lambda: largest_difference(torch.device("cuda")), 1e-5)
 
 
 def largest_difference(device: torch.device) -> float:

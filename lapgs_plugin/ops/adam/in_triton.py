@@ -21,7 +21,7 @@ BETA1, BETA2, EPS = tl.constexpr(0.9), tl.constexpr(0.999), tl.constexpr(ADAM_EP
 LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(0.9)), tl.constexpr(math.log(0.999))
 
 
-class Moving(NamedTuple):
+class AdamSlot(NamedTuple):
     """A tensor under optimization; all float32 and contiguous on one CUDA device.
 
     Attributes:
@@ -86,7 +86,7 @@ def _kernel(
     _move(values4, gradients4, means4, squares4, step4, rate4, rest4, n, columns4, block)
 
 
-def step_five(tensors: Sequence[Moving]) -> None:
+def step_five(tensors: Sequence[AdamSlot]) -> None:
     """One step of the five tensors of a field, of n rows each, whose `step` has been counted up already."""
     n = len(tensors[0].values)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
-from lapgs_plugin.ops.self_check import is_right, largest
+from lapgs_plugin.ops.self_check import largest, matches_reference
 
 LARGEST_DIFFERENCE = 1e-4
 """From PyTorch's operations, of values of about 1, that still counts as rounding."""
 
 
-def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
     """Up(coarse) + fine, as `pyramid.up` gives it but for rounding.
 
     Args:
@@ -30,22 +30,22 @@ def add_raised(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
         fine: (c, h, w) or (b, c, h, w), of the same type and on the same device.
     """
     if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
-        return raised(pyramid, coarse, (fine.shape[-2], fine.shape[-1])) + fine
+        return upsample(pyramid, coarse, (fine.shape[-2], fine.shape[-1])) + fine
     if _in_numba(fine):
         return _added_on_cpu(pyramid, coarse, fine)
     if _in_triton(fine):
-        from lapgs_plugin.ops.upsample.in_triton import add_raised_triton
+        from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
         with torch.cuda.device(fine.device):  # Triton launches on the current one
-            return add_raised_triton(pyramid, coarse, fine)
+            return upsample_add_triton(pyramid, coarse, fine)
     return pyramid.up(coarse, (fine.shape[-2], fine.shape[-1])) + fine
 
 
-def raised(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """`pyramid.up(coarse, size)` but for rounding, with its gradient.
 
     Args:
-        coarse: as `add_raised` takes it.
+        coarse: as `upsample_add` takes it.
         size: (h, w), height first.
 
     Raises:
@@ -53,13 +53,13 @@ def raised(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """
     require_half(coarse, size)
     if _in_numba(coarse) and not (torch.is_grad_enabled() and coarse.requires_grad):
-        return _raised_on_cpu(pyramid, coarse, size)
+        return _upsample_on_cpu(pyramid, coarse, size)
     if not _in_triton(coarse):
         return pyramid.up(coarse, size)
-    from lapgs_plugin.ops.upsample.in_triton import raised_triton
+    from lapgs_plugin.ops.upsample.in_triton import upsample_triton
 
     with torch.cuda.device(coarse.device):
-        return raised_triton(pyramid, coarse, size)
+        return upsample_triton(pyramid, coarse, size)
 
 
 def _in_numba(image: Tensor) -> bool:
@@ -71,18 +71,18 @@ def _in_triton(image: Tensor) -> bool:
 
 
 def _added_on_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    from lapgs_plugin.ops.upsample.in_numba import add_raised_cpu
+    from lapgs_plugin.ops.upsample.in_numba import upsample_add_cpu
 
     rows, columns = (_numpy_taps(pyramid.grid, side, fine.dtype) for side in fine.shape[-2:])
-    result = add_raised_cpu(_planes(coarse), _planes(fine), rows.first, rows.weights, columns.across)
+    result = upsample_add_cpu(_planes(coarse), _planes(fine), rows.first, rows.weights, columns.across)
     return torch.from_numpy(result).view(fine.shape)
 
 
-def _raised_on_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    from lapgs_plugin.ops.upsample.in_numba import raised_cpu
+def _upsample_on_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
 
     rows, columns = (_numpy_taps(pyramid.grid, side, coarse.dtype) for side in size)
-    result = raised_cpu(_planes(coarse), size, rows.first, rows.weights, columns.across)
+    result = upsample_cpu(_planes(coarse), size, rows.first, rows.weights, columns.across)
     return torch.from_numpy(result).view(*coarse.shape[:-2], *size)
 
 
@@ -111,7 +111,7 @@ def _numpy_taps(grid: str, size: int, dtype: torch.dtype) -> _NumpyTaps:
 @lru_cache(maxsize=1)
 def _triton_works() -> bool:
     """Whether there is Triton, which comes with PyTorch for CUDA on Linux, and can compile what is right."""
-    return is_right(
+    return matches_reference(
         "Up in many small operations instead of one kernel",
         lambda: _difference_in_triton(Pyramid(), torch.device("cuda")),
         LARGEST_DIFFERENCE,
@@ -120,7 +120,7 @@ def _triton_works() -> bool:
 
 def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
     """Of values and gradient from what PyTorch's operations make of them, relative to values of about 1."""
-    from lapgs_plugin.ops.upsample.in_triton import add_raised_triton, raised_triton
+    from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton, upsample_triton
 
     # Pixel by pixel, as gsplat's images lie: what is compiled here is what will be used.
     coarse, fine = (
@@ -128,7 +128,7 @@ def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
         for side in (5, 10)
     )
     weighed = []
-    for up in (pyramid.up, lambda image, size: raised_triton(pyramid, image, size)):
+    for up in (pyramid.up, lambda image, size: upsample_triton(pyramid, image, size)):
         leaf = coarse.clone().requires_grad_()
         image = up(leaf, (10, 10))
         (gradient,) = torch.autograd.grad((image * fine).sum(), leaf)
@@ -137,6 +137,6 @@ def _difference_in_triton(pyramid: Pyramid, device: torch.device) -> float:
     pairs = (
         (in_triton, image),
         (gradient_in_triton, gradient),
-        (add_raised_triton(pyramid, coarse, fine), image + fine),
+        (upsample_add_triton(pyramid, coarse, fine), image + fine),
     )
     return largest((one - other).abs() for one, other in pairs)

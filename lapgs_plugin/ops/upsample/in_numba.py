@@ -55,7 +55,7 @@ def across_weights(first: Integers, weights: Floats) -> Floats:
 
 
 @inline
-def _raise_row(
+def _upsample_row(
     coarse: Floats, start: int, length: int, weights: Floats, pitch: int, row: Floats, out: Floats, place: int
 ) -> None:
     """`length` coarse samples from `start` on at the fine width; `row` has room for them and their neighbours."""
@@ -98,7 +98,7 @@ def _kernel(
         start, stop = first_row[top], first_row[bottom - 1] + taps
         for y in range(start, stop):
             place = (plane * coarse_height + y) * coarse_width
-            _raise_row(below, place, coarse_width, across, pitch, row, raised, (y - start) * wide)
+            _upsample_row(below, place, coarse_width, across, pitch, row, raised, (y - start) * wide)
         for y in range(top, bottom):
             place, first = (plane * height + y) * width, (first_row[y] - start) * wide
             for x in range(0, whole, WIDTH):
@@ -115,7 +115,7 @@ def _kernel(
     keep_alive(padded)
 
 
-def add_raised_cpu(
+def upsample_add_cpu(
     coarse: Floats, fine: Floats, first_row: Integers, row_weights: Floats, column_weights: Floats
 ) -> Floats:
     """Up(coarse) + fine, the same bits for any number of threads.
@@ -134,10 +134,10 @@ def add_raised_cpu(
     return out
 
 
-def raised_cpu(
+def upsample_cpu(
     coarse: Floats, size: tuple[int, int], first_row: Integers, row_weights: Floats, column_weights: Floats
 ) -> Floats:
-    """Up(coarse) to (n, *size); the other arguments as `add_raised_cpu` takes them."""
+    """Up(coarse) to (n, *size); the other arguments as `upsample_add_cpu` takes them."""
     out = empty(len(coarse) * size[0] * size[1], coarse.dtype).reshape(len(coarse), *size)
     parallel(_kernel, coarse, out, False, first_row, row_weights, column_weights, out)
     return out

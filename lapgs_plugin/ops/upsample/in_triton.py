@@ -67,21 +67,21 @@ class _Taps(NamedTuple):
     weights: Tensor
 
 
-def add_raised_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    """See `raising.add_raised`; float32 on a CUDA device, (c, h, w) or (b, c, h, w) in whatever order of memory."""
+def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+    """See `raising.upsample_add`; float32 on a CUDA device, (c, h, w) or (b, c, h, w) in whatever order of memory."""
     rows, columns = (_up(pyramid.grid, side, fine.device) for side in fine.shape[-2:])
     out = torch.empty_like(fine)
     _filter(coarse, rows, columns, out, fine)
     return out
 
 
-def raised_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """`Pyramid.up` with its gradient; `coarse` as `add_raised_triton` takes it."""
-    raised: Tensor = _Raised.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    """`Pyramid.up` with its gradient; `coarse` as `upsample_add_triton` takes it."""
+    raised: Tensor = _Upsampled.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return raised
 
 
-class _Raised(torch.autograd.Function):
+class _Upsampled(torch.autograd.Function):
     """(coarse, grid, size) -> Up(coarse). Its gradient is Up's transpose, one side after the other."""
 
     @staticmethod
