@@ -126,7 +126,7 @@ def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tens
     return view
 
 
-class AnnouncingViews(list[Any]):
+class PrefetchingViews(list[Any]):
     """Views from which a training loop draws: `stack = views.copy()`, then `stack.pop(randint(0, len(stack) - 1))`.
 
     With every draw the next one is announced. It is known: the loop will ask Python's generator, whose state can be
@@ -139,16 +139,16 @@ class AnnouncingViews(list[Any]):
 
     def __init__(self, views: Iterable[Any], prefetch: Callable[[Any], None]) -> None:
         super().__init__(views)
-        self._announce = announce
+        self._prefetch = prefetch
 
-    def copy(self) -> AnnouncingViews:
-        return AnnouncingViews(self, self._announce)
+    def copy(self) -> PrefetchingViews:
+        return PrefetchingViews(self, self._prefetch)
 
     def pop(self, index: SupportsIndex = -1, /) -> Any:
         drawn = super().pop(index)
         if self:
             _PEEK.setstate(random.getstate())
-            self._announce(self[_PEEK.randint(0, len(self) - 1)])
+            self._prefetch(self[_PEEK.randint(0, len(self) - 1)])
         return drawn
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.checkouts.level_views import AnnouncingViews
+from lapgs_plugin.checkouts.level_views import PrefetchingViews
 from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -124,7 +124,7 @@ class ActiveStage:
             self._loaded.scene,
             gaussians=gaussians,
             model_path=self._call.dataset.model_path,
-            train_cameras={1.0: self._announcing([self._view(camera) for camera in self._images.train])},
+            train_cameras={1.0: self._prefetching([self._view(camera) for camera in self._images.train])},
             test_cameras={1.0: [self._view(camera) for camera in self._images.test]},
         )
         with self.overhead.timed("inheritance"):
@@ -457,12 +457,12 @@ class ActiveStage:
             )
         return self._views[key]
 
-    def _announcing(self, views: list[Any]) -> list[Any]:
+    def _prefetching(self, views: list[Any]) -> list[Any]:
         """Views that bring their images to the GPU before they are drawn, unless those lie there."""
         if not self._images.wait_elsewhere:
             return views
         keys = {id(view): key for key, view in self._views.items()}
-        return AnnouncingViews(views, lambda view: self._rendering.prefetch(keys[id(view)]))
+        return PrefetchingViews(views, lambda view: self._rendering.prefetch(keys[id(view)]))
 
     def _synchronize(self) -> None:
         if self._device.type == "cuda":

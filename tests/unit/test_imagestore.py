@@ -120,7 +120,7 @@ def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, wh
 
 
 @on_every_device
-def test_announcing_changes_nothing_but_when_it_is_brought(tmp_path: Path, device: str, where: str) -> None:
+def test_prefetching_changes_nothing_but_when_it_is_brought(tmp_path: Path, device: str, where: str) -> None:
     images = {f"{i}": torch.rand(3, 6 + i, 5) for i in range(4 * AHEAD)}
     with store(tmp_path, where, "float32", device) as kept:
         for name, image in images.items():

@@ -184,7 +184,7 @@ def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")
     torch.testing.assert_close(upsample_add(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
     gradients = []
-    for up in (raised, Pyramid.up):
+    for up in (upsample, Pyramid.up):
         leaf = coarse.clone().requires_grad_()
         (up(Pyramid(), leaf, (shape[-2], shape[-1])) * fine).sum().backward()
         assert leaf.grad is not None
