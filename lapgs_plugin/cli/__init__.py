@@ -5,7 +5,7 @@ from __future__ import annotations
 
 def main() -> None:
     """Entry point of the console script."""
-    from lapgs_plugin.training.interrupt import install
+    from lapgs_plugin.interrupt import install
 
     install()  # before anything that takes time to import
     import os

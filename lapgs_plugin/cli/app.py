@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lapgs_plugin import __version__
+from lapgs_plugin import __version__, interrupt
 from lapgs_plugin.cli import patch
 from lapgs_plugin.cli.bench import bench_app
 from lapgs_plugin.cli.conformance import conformance
@@ -25,7 +25,6 @@ from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.training import interrupt
 
 
 class Commands(TyperGroup):

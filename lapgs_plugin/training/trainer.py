@@ -23,6 +23,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
@@ -35,7 +36,6 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
-from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick

@@ -18,7 +18,7 @@ import viser
 from PIL import Image
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.training.interrupt import signals_held
+from lapgs_plugin.interrupt import signals_held
 from lapgs_plugin.viewer.guard import Guard, guarded_server
 from lapgs_plugin.viewer.preview import QUALITY, fitted
 

@@ -37,7 +37,7 @@ READY = "installed"
 COMMAND = f"""
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import lapgs_plugin.training.interrupt as interrupt
+import lapgs_plugin.interrupt as interrupt
 install = interrupt.install
 def install_and_say():
     install()
