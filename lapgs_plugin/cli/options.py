@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lapgs_plugin.plan import Hierarchy, parse_hierarchy, require_no_residuals
+
+if TYPE_CHECKING:
+    from lapgs_plugin.adapters.run_state import HierarchyOptions
+    from lapgs_plugin.archive import SceneReference
+    from lapgs_plugin.training.settings import TrainSettings
 
 HIERARCHY = "Hierarchy"
 """Title of the options about levels."""
@@ -41,6 +46,16 @@ PRUNE_HELP = (
     "up in the view that shows most of it, and the least go that make up this share of the sum. 0.005 takes about a "
     "fifth of them."
 )
+
+
+class Rehearsal:
+    """Told what a command would train with, as the object of its context; the command then ends and trains nothing."""
+
+    def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
+        """Of `lapgs train`: the settings, the scene and how it is read, and the value of --rasterizer."""
+
+    def run(self, options: HierarchyOptions, arguments: Sequence[str]) -> None:
+        """Of `lapgs run`: the hierarchy and the script's own arguments."""
 
 
 def check_residual_options(hierarchy: str, given: Mapping[str, object]) -> None:

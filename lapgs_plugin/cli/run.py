@@ -14,6 +14,7 @@ from lapgs_plugin.cli.options import (
     PRUNE_HELP,
     GridOption,
     InheritOption,
+    Rehearsal,
     SupervisionOption,
     check_residual_options,
     given_options,
@@ -181,9 +182,6 @@ def run(
     from lapgs_plugin.adapters.witness import Witness
     from lapgs_plugin.inheritance import parse_inheritance
 
-    logging.basicConfig(format="lapgs: %(message)s")
-    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
-    logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(
@@ -221,6 +219,12 @@ def run(
     checkout, words = require_script(script).parent, arguments or []
     watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
     kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
+    if isinstance(context.obj, Rehearsal):
+        context.obj.run(options, words)
+        return
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
+    logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
     try:
         with on_device, loaded_script(script, words) as loaded:

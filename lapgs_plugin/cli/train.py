@@ -16,6 +16,7 @@ from lapgs_plugin.cli.options import (
     PRUNE_HELP,
     GridOption,
     InheritOption,
+    Rehearsal,
     SupervisionOption,
     check_residual_options,
     given_options,
@@ -263,6 +264,9 @@ def train(
         raster={ANTIALIASING: True} if antialiased else {},
     )
     reference = SceneReference(str(scene.absolute()), resolution, hold_out, _color(background), images=images, kind="")
+    if isinstance(context.obj, Rehearsal):
+        context.obj.train(settings, reference, rasterizer)
+        return
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if rasterizer == AUTO else set())
@@ -404,7 +408,7 @@ def _create(
     RunArchive.require_room(out, overwrite)
     check_cache(settings, training_rasterizer(rasterizer, settings).device)
     loaded = _load(reference)
-    make_plan(loaded, settings)
+    make_plan(loaded.smallest_size, settings)
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
         rasterizer=rasterizer,

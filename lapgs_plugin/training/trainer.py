@@ -48,15 +48,15 @@ LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
 
 
-def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
-    """The stages of a run on this scene.
+def make_plan(size: tuple[int, int], settings: TrainSettings) -> StagePlan:
+    """The stages of a run on images of this size (width, height), which is `Scene.smallest_size`.
 
     Raises:
         UserInputError: levels, split and image size do not go together.
     """
     split = None if settings.split is None else parse_split(",".join(settings.split))
     hierarchy = parse_hierarchy(settings.hierarchy)
-    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split, hierarchy)
+    return StagePlan.create(size, settings.iterations, settings.levels, split, hierarchy)
 
 
 def check_cache(settings: TrainSettings, device: torch.device) -> None:
@@ -132,7 +132,7 @@ class Trainer:
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
-        self.plan = make_plan(self.scene, self.settings)
+        self.plan = make_plan(self.scene.smallest_size, self.settings)
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = parse_supervision(self.settings.supervision)
         check_cache(self.settings, self.device)
