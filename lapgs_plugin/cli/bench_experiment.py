@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from lapgs_plugin.experiments.expansion import PlannedRun
-    from lapgs_plugin.experiments.launchers import Launcher
+    from lapgs_plugin.experiments.launchers import Launcher, WorkOrder
     from lapgs_plugin.experiments.runner import Folder
     from lapgs_plugin.experiments.schema import Experiment
     from lapgs_plugin.experiments.store import Job, Outcome, ResultStore
@@ -28,6 +30,10 @@ SET_BY_EXPERIMENTS = {
     *("script", "arguments", "off", "record", "view", "view_port"),
 }
 """Parameters of `lapgs train` and `lapgs run` that an experiment says in its own way."""
+
+
+LONGEST_NAME = 255
+"""Bytes of a file's name that file systems take."""
 
 
 class RunsFailedError(LapgsError):
@@ -73,7 +79,9 @@ def bench_experiment(
     ] = "local",
     workers: Annotated[
         int | None,
-        typer.Option(min=1, rich_help_panel=ENGINE, help="Runs at once. Default: one a GPU, or one without GPUs."),
+        typer.Option(
+            min=1, max=1024, rich_help_panel=ENGINE, help="Runs at once. Default: one a GPU, or one without GPUs."
+        ),
     ] = None,
     gpus: Annotated[
         str | None,
@@ -117,35 +125,50 @@ def bench_experiment(
     """
     from rich.console import Console
 
+    from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.aggregate import check_table
     from lapgs_plugin.experiments.commands import Places
     from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+    from lapgs_plugin.experiments.launchers import check_order, launch
+    from lapgs_plugin.experiments.mistakes import Mistakes
     from lapgs_plugin.experiments.runner import Folder, execute, make_samples, prepare
     from lapgs_plugin.experiments.schema import load_experiment
     from lapgs_plugin.experiments.store import ResultStore
 
     console = Console(stderr=True)
+    mistakes = Mistakes(experiment)
     loaded = load_experiment(experiment, _option_names())
-    check_table(loaded)
+    with mistakes.at("table"):
+        check_table(loaded)
     selection = Selection(scene, backbone, variant, _seeds(seeds), iterations)
     planned, scenes = plan_runs(loaded, selection), scenes_of(loaded, selection)
     folder = Folder(Path("runs", "bench", loaded.name) if out is None else out)
-    if not tables_only:
+    if tables_only:
+        mistakes.refuse()
+    else:
+        order = _order(workers, gpus, _pairs(launcher_option, "--launcher-option"), folder)
+        if not dry_run:
+            check_order(launcher, order)
+            _require_place(folder.path)
         if evaluate:
-            _require_measuring()
+            _require_measuring(lpips_weights or ())
         places = Places(
-            {name: Path(value).expanduser() for name, value in _pairs(path, "--path").items()}, experiment.parent
+            {name: _folder(name, value) for name, value in _pairs(path, "--path").items()}, experiment.parent
         )
         weights = [word for file in lpips_weights or () for word in ("--lpips-weights", str(file.absolute()))]
-        jobs = prepare(planned, scenes, places, folder, weights if evaluate else None)
+        measuring = weights if evaluate else None
+        jobs, found = prepare(planned, scenes, places, folder, measuring, loaded, selection, mistakes)
+        here = launcher == "local" and not dry_run
+        check_runs(loaded, selection, planned, jobs, found, mistakes, here=here)
+        mistakes.refuse()
         if dry_run:
             _print_commands(jobs)
             return
-        start = _starter(launcher, workers, gpus, _pairs(launcher_option, "--launcher-option"), folder, jobs)
         make_samples(scenes, folder)
         store = ResultStore.create(folder.store)
         store.plan(jobs)
-        _follow(execute, store, jobs, start, console)
+        order = replace(order, run_ids=[job.run_id for job in jobs])
+        _follow(execute, store, jobs, lambda: launch(launcher, order), console)
     _write(loaded, planned, ResultStore(folder.store), folder, console)
 
 
@@ -165,9 +188,12 @@ def _seeds(text: str | None) -> list[int] | None:
     if text is None:
         return None
     try:
-        return [int(part) for part in text.split(",")]
+        numbers = [int(part) for part in text.split(",")]
     except ValueError as error:
         raise UserInputError(f"--seeds {text}: expected whole numbers separated by commas, such as 0,1,2") from error
+    if len(set(numbers)) < len(numbers):
+        raise UserInputError(f"--seeds {text}: expected different numbers, as each run counts once")
+    return numbers
 
 
 def _pairs(texts: Sequence[str] | None, option: str) -> dict[str, str]:
@@ -180,10 +206,42 @@ def _pairs(texts: Sequence[str] | None, option: str) -> dict[str, str]:
     return found
 
 
-def _require_measuring() -> None:
-    """`lapgs eval` reads scenes, for which not every machine has the packages."""
+def _folder(name: str, text: str) -> Path:
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise UserInputError(f"--path {name}={text}: no such user; expected a folder") from error
+
+
+def _require_place(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written, before anything is.
+
+    Raises:
+        UserInputError: it is a file or below one, or it may not be written.
+    """
+    existing = str(folder.absolute())
+    # Not Path.exists, which raises where a name is too long for the file system.
+    while not os.path.lexists(existing):
+        if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
+            raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
+        existing = os.path.dirname(existing)  # noqa: PTH120
+    if not os.path.isdir(existing):  # noqa: PTH112
+        raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise UserInputError(f"--out {folder}: {existing} may not be written; choose another folder")
+
+
+def _require_measuring(weights: Sequence[Path]) -> None:
+    """Refuse what `lapgs eval` would: not every machine has the packages to read scenes, and weights are files.
+
+    Raises:
+        UserInputError: a package is missing, or a file of weights.
+    """
     from importlib.util import find_spec
 
+    for file in weights:
+        if not os.path.isfile(file):  # noqa: PTH113  # Path.is_file raises where a name is too long
+            raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
     missing = [name for name in ("OpenImageIO", "pycolmap") if find_spec(name) is None]
     if missing:
         raise UserInputError(
@@ -201,23 +259,18 @@ def _print_commands(jobs: Sequence[Job]) -> None:
             print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
-def _starter(
-    launcher: str, workers: int | None, gpus: str | None, options: dict[str, str], folder: Folder, jobs: Sequence[Job]
-) -> Callable[[], Launcher]:
-    """Starts workers for these runs."""
-    from lapgs_plugin.experiments.launchers import LAUNCHERS, WorkOrder, launch
+def _order(workers: int | None, gpus: str | None, options: dict[str, str], folder: Folder) -> WorkOrder:
+    """What workers are started for; the runs come later."""
+    from lapgs_plugin.experiments.launchers import WorkOrder
 
-    if launcher not in LAUNCHERS:
-        raise UserInputError(f"--launcher {launcher}: expected {', '.join(LAUNCHERS)}")
-    order = WorkOrder(
+    return WorkOrder(
         store=folder.store.absolute(),
-        run_ids=[job.run_id for job in jobs],
+        run_ids=(),
         workers=workers,
         gpus=None if gpus is None else gpus.split(","),
         logs=folder.logs("workers").absolute(),
         options={name: int(value) if value.isdecimal() else value for name, value in options.items()},
     )
-    return lambda: launch(launcher, order)
 
 
 def _follow(

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from lapgs_plugin.evaluation.bench_raster import BenchCase, CaseResult
 
+LONGEST_NAME = 230
+"""Bytes of a file's name that leave room for its temporary one."""
 DTYPES = ("float32", "float64")
 
 
@@ -25,7 +27,7 @@ def raster(
         ),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=1, help="Turns at each size; slow contenders get fewer at large ones.")
+        int, typer.Option(min=1, max=1000, help="Turns at each size; slow contenders get fewer at large ones.")
     ] = 5,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write everything measured to this file.")
@@ -48,7 +50,14 @@ def raster(
 
     if dtype not in DTYPES:
         raise UserInputError(f"--dtype {dtype}: expected {' or '.join(DTYPES)}")
-    if json_file is not None and not os.access(json_file.parent, os.W_OK):
+    # Not Path.is_dir, which raises where a name is too long for the file system.
+    folder = "." if json_file is None else os.fspath(json_file.parent)
+    if json_file is not None and (
+        not os.path.isdir(folder)  # noqa: PTH112
+        or not os.access(folder, os.W_OK)
+        or os.path.isdir(json_file)  # noqa: PTH112
+        or len(os.fsencode(json_file.name)) > LONGEST_NAME
+    ):
         raise UserInputError(f"--json {json_file}: expected a file in a folder that exists and may be written")
 
     import torch

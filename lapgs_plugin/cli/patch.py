@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,25 +40,27 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     """Say which edits are in, which can be put in, and what stands in the way."""
     from lapgs_plugin.patching import plan_apply, read_only, status, uncommitted
 
-    for target, sets in _targets(checkout, set_name, opt_in=True):
-        typer.echo(f"{target.folder}: {target.recipe.title}")
-        for found in status(target):
-            if found.set not in sets:
-                continue
-            typer.echo(f"  {found.set:14} {found.state.value}")
-            for problem in found.problems:
-                typer.echo(f"    {problem}")
-            if not found.problems:
-                for path in read_only(plan_apply(target, [found.set])):
-                    typer.echo(f"    read-only: {path}")
-        for path in uncommitted(_files(target)):
-            typer.echo(f"  has changes that are not committed: {path}")
+    chosen = _targets(checkout, set_name, opt_in=True)
+    with _alone(chosen):
+        for target, sets in chosen:
+            typer.echo(f"{target.folder}: {target.recipe.title}")
+            for found in status(target):
+                if found.set not in sets:
+                    continue
+                typer.echo(f"  {found.set:14} {found.state.value}")
+                for problem in found.problems:
+                    typer.echo(f"    {problem}")
+                if not found.problems:
+                    for path in read_only(plan_apply(target, [found.set])):
+                        typer.echo(f"    read-only: {path}")
+            for path in uncommitted(_files(target)):
+                typer.echo(f"  has changes that are not committed: {path}")
 
 
 @app.command("diff")
 def diff(checkout: Checkout, set_name: SetName = "all") -> None:
     """Print what `apply` would change, as a unified diff, and change nothing."""
-    changes = [change for _, change in _planned(checkout, set_name)]
+    changes = [change for _, change in _planned(_targets(checkout, set_name, opt_in=False))]
     if not changes:
         typer.echo(f"{checkout}: nothing to apply, these edits are in: {set_name}", err=True)
     for change in changes:
@@ -70,19 +73,21 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
     from lapgs_plugin.errors import PatchError
     from lapgs_plugin.patching import uncommitted, write_all
 
-    planned = _planned(checkout, set_name)
-    if not planned:
-        typer.echo(f"{checkout}: nothing to do, these edits are in: {set_name}")
-        return
-    changes = [change for _, change in planned]
-    _refuse_read_only(changes)
-    dirty = [] if allow_dirty else uncommitted(change.path for change in changes)
-    if dirty:
-        raise PatchError(
-            f"changes that are not committed in {_listed(dirty)}; commit them first, or pass --allow-dirty "
-            "(`lapgs patch revert` takes out only the patch either way); nothing was changed"
-        )
-    write_all(changes)
+    chosen = _targets(checkout, set_name, opt_in=False)
+    with _alone(chosen):
+        planned = _planned(chosen)
+        if not planned:
+            typer.echo(f"{checkout}: nothing to do, these edits are in: {set_name}")
+            return
+        changes = [change for _, change in planned]
+        _refuse_read_only(changes)
+        dirty = [] if allow_dirty else uncommitted(change.path for change in changes)
+        if dirty:
+            raise PatchError(
+                f"changes that are not committed in {_listed(dirty)}; commit them first, or pass --allow-dirty "
+                "(`lapgs patch revert` takes out only the patch either way); nothing was changed"
+            )
+        write_all(changes)
     _report("patched", planned)
 
 
@@ -91,18 +96,27 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     """Take the edits out again; what you changed elsewhere in the same files stays."""
     from lapgs_plugin.patching import plan_revert, write_all
 
-    planned = [
-        (target, change)
-        for target, sets in _targets(checkout, set_name, opt_in=True)
-        for change in plan_revert(target, sets)
-    ]
-    if not planned:
-        typer.echo(f"{checkout}: nothing to take out, none of these edits is in: {set_name}")
-        return
-    changes = [change for _, change in planned]
-    _refuse_read_only(changes)
-    write_all(changes)
+    chosen = _targets(checkout, set_name, opt_in=True)
+    with _alone(chosen):
+        planned = [(target, change) for target, sets in chosen for change in plan_revert(target, sets)]
+        if not planned:
+            typer.echo(f"{checkout}: nothing to take out, none of these edits is in: {set_name}")
+            return
+        changes = [change for _, change in planned]
+        _refuse_read_only(changes)
+        write_all(changes)
     _report("reverted", planned)
+
+
+@contextmanager
+def _alone(chosen: Sequence[tuple[Target, Collection[str]]]) -> Iterator[None]:
+    """Keep other `lapgs patch` processes away while this one works, and tidy up after one that was killed."""
+    from lapgs_plugin.patching import alone
+
+    with alone(target for target, _ in chosen) as stuck:
+        for path in stuck:
+            typer.echo(f"left by a `lapgs patch` that was killed, and cannot be removed: {path}", err=True)
+        yield
 
 
 def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Target, tuple[str, ...]]]:
@@ -129,14 +143,10 @@ def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Targe
     return chosen
 
 
-def _planned(checkout: Path, set_name: str) -> list[tuple[Target, FileChange]]:
+def _planned(chosen: Sequence[tuple[Target, Collection[str]]]) -> list[tuple[Target, FileChange]]:
     from lapgs_plugin.patching import plan_apply
 
-    return [
-        (target, change)
-        for target, sets in _targets(checkout, set_name, opt_in=False)
-        for change in plan_apply(target, sets)
-    ]
+    return [(target, change) for target, sets in chosen for change in plan_apply(target, sets)]
 
 
 def _files(target: Target) -> list[Path]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.settings import RunSettings
@@ -93,9 +94,6 @@ def run(
     from lapgs_plugin.runner.installed_rasterizer import explained
     from lapgs_plugin.runner.recording import BareRunRecorder
 
-    logging.basicConfig(format="lapgs: %(message)s")
-    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
-    logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(
@@ -114,6 +112,12 @@ def run(
     checkout, words = require_script(script).parent, arguments or []
     watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
     kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
+    if isinstance(context.obj, Rehearsal):
+        context.obj.run(settings, words)
+        return
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
+    logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
     try:
         with on_device, loaded_script(script, words) as loaded:

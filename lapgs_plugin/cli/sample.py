@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from lapgs_plugin.errors import UserInputError
 
 
 def sample(
@@ -26,18 +23,11 @@ def sample(
     Hard edges, fine print, wires and a chain-link fence, with exact camera poses and noisy sparse points, in COLMAP's
     layout. The finest detail is as small as a pixel at 480x320: every level of a hierarchy has something to show.
     """
-    from lapgs_plugin.scenes.sample import make_sample_scene
+    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size
 
-    width, height = _parse_size(size)
+    width, height = parse_size(size)
     make_sample_scene(
         out, width=width, height=height, views=views, points=points, seed=seed, overwrite=overwrite, progress=True
     )
     typer.echo(f"{out}: {views} images of {width}x{height}, {points} points")
     typer.echo(f"next: lapgs train {out} -o RUN")
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", text.strip())
-    if match is None:
-        raise UserInputError(f"--size {text!r}: expected WIDTHxHEIGHT in pixels, such as 480x320")
-    return int(match[1]), int(match[2])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
@@ -68,6 +69,9 @@ def train(
     reference = SceneReference(
         str(scene.absolute()), photos.resolution, photos.eval, photos.background_color, images=photos.images, kind=""
     )
+    if isinstance(context.obj, Rehearsal):
+        context.obj.train(settings, reference, control.rasterizer)
+        return
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
@@ -161,7 +165,7 @@ def _create(
     RunArchive.require_room(out, overwrite)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = _load(reference)
-    make_plan(loaded, settings)
+    make_plan(loaded.smallest_size, settings)
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
         rasterizer=rasterizer,

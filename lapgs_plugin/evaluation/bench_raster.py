@@ -51,6 +51,10 @@ GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
 """Slow contenders take part in this many Gaussians' worth of turns, at least one."""
 
 
+MAX_SIDE, MAX_GAUSSIANS = 8192, 10_000_000
+"""Of a case: a typing error is not to fill a machine's memory."""
+
+
 @dataclass(frozen=True)
 class BenchCase:
     """A scene to time.
@@ -97,10 +101,14 @@ def parse_cases(text: str | None) -> tuple[BenchCase, ...]:
 
 
 def _parse_case(entry: str) -> BenchCase:
-    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)(?:/([1-9]\d*))?", entry)
+    match = re.fullmatch(r"([1-9][0-9]{0,9})x([1-9][0-9]{0,9})(?:/([1-9][0-9]{0,18}))?", entry)
     known = {(case.width, case.height): case for case in CASES}
     if match is not None:
         width, height = int(match[1]), int(match[2])
+        if max(width, height) > MAX_SIDE or int(match[3] or 1) > MAX_GAUSSIANS:
+            raise UserInputError(
+                f"--sizes {entry!r}: expected at most {MAX_SIDE}x{MAX_SIDE} pixels and {MAX_GAUSSIANS} Gaussians"
+            )
         case = known.get((width, height))
         if match[3] is not None and (case is None or case.gaussians != int(match[3])):
             return BenchCase(width, height, int(match[3]))

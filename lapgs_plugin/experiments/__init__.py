@@ -3,6 +3,7 @@
     schema.py       what an experiment file may say
     standard.py     the standard data sets, backbones' published options, the paper's printed figures (all in data/)
     expansion.py    a file -> runs: scenes x backbones x variants x seeds, variants taking turns
+    mistakes.py     what is wrong with an experiment, told at once; cli/bench_check.py finds it by rehearsing every run
     commands.py     a run -> the commands that train and measure it
     store.py        who runs what, and what came out: SQLite, safe against dying and competing workers
     worker.py       takes runs from the store until none is left; leash.py ends a run whose worker died

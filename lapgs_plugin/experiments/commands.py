@@ -13,7 +13,7 @@ from typing import Any
 from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
-from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, BACKBONE_PREFIX, parse_resolution
+from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
 SCRIPT = "train.py"
@@ -66,7 +66,7 @@ class Places:
         names = [scene.name, *([scene.dataset] if scene.dataset else [])]
         folder = self._existing(f"scene {scene.name}", folder, names)
         transforms = any(folder.glob("transforms*.json"))
-        if not transforms and not (folder / scene.images).is_dir():
+        if not transforms and not _is_folder(folder / scene.images):
             raise UserInputError(
                 f"scene {scene.name}: {folder} has no image folder {scene.images}; expected a COLMAP or Blender-style "
                 f'scene; give another folder with --path {scene.name}=FOLDER or set images = "..." in the experiment'
@@ -95,9 +95,13 @@ class Places:
         ways = " or ".join(f"--path {name}=FOLDER ({_variable(name)})" for name in names)
         if folder is None:
             raise UserInputError(f"{what}: nothing says where it is; give {ways}")
-        if not folder.is_dir():
+        if not _is_folder(folder):
             raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
         return folder.absolute()
+
+
+def _is_folder(path: Path) -> bool:
+    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises where a name is too long for the file system
 
 
 def _variable(name: str) -> str:
@@ -214,9 +218,9 @@ def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
         UserInputError: it has none.
     """
     text = spec.resolution
-    if text.startswith(BACKBONE_PREFIX):
-        return text.removeprefix(BACKBONE_PREFIX)
     rule = parse_resolution(text)
+    if rule.backbone is not None:
+        return str(rule.backbone)
     if rule.width is None:
         divisor = 1 / rule.fraction
         if divisor not in BACKBONE_DIVISORS:
@@ -235,6 +239,9 @@ def _first_width(images: Path) -> int:
 
     for path in sorted(images.rglob("*")):
         if path.is_file() and path.suffix.lower() in Image.registered_extensions():
-            with Image.open(path) as image:
-                return image.width
+            try:
+                with Image.open(path) as image:
+                    return image.width
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+                raise UserInputError(f"{path}: cannot be read as an image ({error}); expected a photo") from error
     raise UserInputError(f"{images} holds no image; expected the photos of a scene")

@@ -6,21 +6,21 @@ worker that dies anywhere is made up for by another one, or by the next `lapgs b
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.experiments.worker import Slot, work
-
-LAUNCHERS = ("local", "slurm", "ray")
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,19 @@ class WorkOrder:
 class Launcher(ABC):
     """Workers of one engine, started when it is made."""
 
+    @staticmethod
+    @abstractmethod
+    def check(options: Mapping[str, Any]) -> None:
+        """Refuse options of the engine that it does not have, or an engine that is not there.
+
+        Raises:
+            UserInputError, MissingExtraError: see `check_order`.
+        """
+
+    @abstractmethod
+    def __init__(self, order: WorkOrder) -> None:
+        """Start the workers that are ordered."""
+
     @abstractmethod
     def running(self) -> bool:
         """Whether a worker is running or waits to be started."""
@@ -64,31 +77,42 @@ def launch(name: str, order: WorkOrder) -> Launcher:
     """Start workers.
 
     Args:
-        name: one of `LAUNCHERS`.
+        name: "local", "slurm" or "ray".
         order: for what.
 
     Raises:
         UserInputError: the name or one of the options is not known.
         MissingExtraError: the engine is not installed.
     """
-    kinds: dict[str, Callable[[WorkOrder], Launcher]] = {
-        "local": LocalLauncher,
-        "slurm": SlurmLauncher,
-        "ray": RayLauncher,
-    }
-    if name not in kinds:
-        raise UserInputError(f"--launcher {name}: expected {', '.join(LAUNCHERS)}")
+    check_order(name, order)
+    return _KINDS[name](order)
+
+
+def check_order(name: str, order: WorkOrder) -> None:
+    """Refuse what `launch` would, before anything is written.
+
+    Raises:
+        UserInputError: the name or one of the options is not known.
+        MissingExtraError: the engine is not installed.
+    """
+    if name not in _KINDS:
+        raise UserInputError(f"--launcher {name}: expected {', '.join(_KINDS)}")
     if order.gpus is not None and name != "local":
-        raise UserInputError(f"--gpus: {name} deals out GPUs itself; leave it out")
-    return kinds[name](order)
+        raise UserInputError(f"--gpus {','.join(order.gpus)}: {name} deals out GPUs itself; leave it out")
+    if order.gpus is not None and not all(gpu.strip() for gpu in order.gpus):
+        raise UserInputError(f"--gpus {','.join(order.gpus)!r}: expected names separated by commas, such as 0,1")
+    _KINDS[name].check(order.options)
 
 
 class LocalLauncher(Launcher):
     """Threads of this process: one a GPU, or one alone without GPUs. Cores are shared out evenly."""
 
+    @staticmethod
+    def check(options: Mapping[str, Any]) -> None:
+        if options:
+            raise UserInputError(f"--launcher-option {next(iter(options))}: the local launcher has none")
+
     def __init__(self, order: WorkOrder) -> None:
-        if order.options:
-            raise UserInputError(f"--launcher-option {next(iter(order.options))}: the local launcher has none")
         self._stop = threading.Event()
         self._errors: list[str] = []
         self._threads = [
@@ -121,17 +145,20 @@ class SlurmLauncher(Launcher):
     The option cluster=local runs the same jobs on this machine, for trying it out.
     """
 
-    def __init__(self, order: WorkOrder) -> None:
-        try:
-            import submitit
-        except ImportError as error:
+    @staticmethod
+    def check(options: Mapping[str, Any]) -> None:
+        if find_spec("submitit") is None:
             raise MissingExtraError(
                 "--launcher slurm needs submitit, which is not installed; pip install 'lapgs_plugin[slurm]'"
-            ) from error
+            )
+        if options.get("cluster", "slurm") == "slurm" and shutil.which("sbatch") is None:
+            raise UserInputError("--launcher slurm: there is no sbatch on this machine; start it on a login node")
+
+    def __init__(self, order: WorkOrder) -> None:
+        import submitit
+
         options = dict(order.options)
         cluster = options.pop("cluster", "slurm")
-        if cluster == "slurm" and shutil.which("sbatch") is None:
-            raise UserInputError("--launcher slurm: there is no sbatch on this machine; start it on a login node")
         try:
             executor = submitit.AutoExecutor(folder=order.logs, cluster=cluster)
             executor.update_parameters(**{"timeout_min": 24 * 60, "name": "lapgs-bench", **options})
@@ -158,16 +185,26 @@ class RayLauncher(Launcher):
     Options: address, num_gpus and num_cpus of a worker. Ray starts a task whose process died again.
     """
 
-    def __init__(self, order: WorkOrder) -> None:
-        try:
-            import ray
-        except ImportError as error:
-            raise MissingExtraError(
-                "--launcher ray needs Ray, which is not installed; pip install 'lapgs_plugin[ray]'"
-            ) from error
-        options = dict(order.options)
+    @staticmethod
+    def check(options: Mapping[str, Any]) -> None:
+        if find_spec("ray") is None:
+            raise MissingExtraError("--launcher ray needs Ray, which is not installed; pip install 'lapgs_plugin[ray]'")
         if unknown := sorted(options.keys() - {"address", "num_gpus", "num_cpus"}):
             raise UserInputError(f"--launcher-option {unknown[0]}: Ray takes address, num_gpus and num_cpus")
+        for name, least in (("num_gpus", 0.0), ("num_cpus", 0.001)):
+            try:
+                number = float(options.get(name, 1))
+            except ValueError:
+                number = math.nan
+            if not least <= number < math.inf:
+                raise UserInputError(
+                    f"--launcher-option {name}={options[name]}: expected a number of a worker, at least {least:g}"
+                )
+
+    def __init__(self, order: WorkOrder) -> None:
+        import ray
+
+        options = dict(order.options)
         self._ray = ray
         self._started = not ray.is_initialized()
         if self._started:
@@ -197,6 +234,9 @@ class RayLauncher(Launcher):
             except Exception as error:
                 lines.append(f"a worker: {str(error).strip().splitlines()[-1]}")
         return lines
+
+
+_KINDS: dict[str, type[Launcher]] = {"local": LocalLauncher, "slurm": SlurmLauncher, "ray": RayLauncher}
 
 
 def _slots(order: WorkOrder) -> list[Slot]:

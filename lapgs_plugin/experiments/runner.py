@@ -9,12 +9,16 @@ from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.commands import Places, run_steps
-from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
+from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec, Selection
 from lapgs_plugin.experiments.launchers import Launcher
+from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
+from lapgs_plugin.experiments.schema import Experiment
 from lapgs_plugin.experiments.store import DONE, FAILED, PATIENCE, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
+MISSING = Path("SCENE")
+"""Stands for a scene that is missing in commands that are only checked."""
 LOOK_EVERY = 0.5
 """Seconds between two looks at the store."""
 
@@ -39,8 +43,11 @@ def prepare(
     places: Places,
     folder: Folder,
     evaluate: Sequence[str] | None,
-) -> list[Job]:
-    """The jobs of all runs that are different, in their order, after checking that their files are there.
+    experiment: Experiment,
+    selection: Selection,
+    mistakes: Mistakes,
+) -> tuple[list[Job], dict[str, tuple[SceneSpec, Path]]]:
+    """Make the jobs of all runs that are different, in their order.
 
     Args:
         planned: the runs.
@@ -48,34 +55,61 @@ def prepare(
         places: where scenes and checkouts lie.
         folder: of the experiment.
         evaluate: options of `lapgs eval`; None leaves it out.
+        experiment, selection: that the runs come from.
+        mistakes: gets scenes and checkouts that are missing, and what a checkout's script cannot be told.
+
+    Returns:
+        The jobs, without those whose checkout, or whose scene for a checkout, is missing; and by name the scenes that
+        are there, each with its folder.
+    """
+    where: dict[str, tuple[SceneSpec, Path]] = {}
+    for scene in scenes:
+        with mistakes.at(scene_key(experiment, scene.name)):
+            _check_sample(scene)
+            where[scene.name] = (scene, _sample(scene, folder) if scene.sample else places.scene(scene))
+    checkouts: dict[str, Path] = {}
+    for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
+        with mistakes.at(f"backbones.{key}.checkout"):
+            checkouts[name] = places.checkout(name)
+    jobs: dict[str, Job] = {}
+    for each in planned:
+        spec = each.spec
+        if spec.checkout is not None and (spec.scene not in where or spec.checkout not in checkouts):
+            continue
+        with mistakes.at(keys_of(experiment, selection, each)["resolution"]):
+            own = folder.path.absolute() / RUNS / spec.run_id
+            checkout = checkouts[spec.checkout] if spec.checkout else None
+            scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
+            steps = run_steps(spec, scene_folder, checkout, own, evaluate)
+            log = str(folder.logs(f"{spec.run_id}.log").absolute())
+            jobs.setdefault(spec.run_id, Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None))
+    return list(jobs.values()), where
+
+
+def _check_sample(scene: SceneSpec) -> None:
+    """Refuse what no sample scene can be made of.
 
     Raises:
-        UserInputError: a scene or a checkout is missing.
+        UserInputError: its size, views or points.
     """
-    where = {scene.name: _sample(scene, folder) if scene.sample else places.scene(scene) for scene in scenes}
-    names = dict.fromkeys(each.spec.checkout for each in planned if each.spec.checkout is not None)
-    checkouts = {name: places.checkout(name) for name in names}
-    jobs: dict[str, Job] = {}
-    for spec in (each.spec for each in planned):
-        own = folder.path.absolute() / RUNS / spec.run_id
-        checkout = checkouts[spec.checkout] if spec.checkout else None
-        steps = run_steps(spec, where[spec.scene], checkout, own, evaluate)
-        log = str(folder.logs(f"{spec.run_id}.log").absolute())
-        jobs.setdefault(spec.run_id, Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None))
-    return list(jobs.values())
+    if scene.sample is None:
+        return
+    from lapgs_plugin.scenes.sample import check_sample_scene, parse_size
+
+    width, height = parse_size(scene.sample.size)
+    check_sample_scene(width, height, scene.sample.views, scene.sample.points)
 
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
     """Make the sample scenes that are not there yet; one process at a time.
 
     Raises:
-        UserInputError: a size is none.
         RunFolderError: another process holds the folder and does not come to an end.
     """
     missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample(scene, folder).is_dir()]
     if not missing:
         return
-    from lapgs_plugin.scenes.sample import make_sample_scene  # needs what reads scenes
+    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs what reads scenes
 
     place = folder.path.absolute() / SCENES
     with one_line_errors(place):
@@ -85,13 +119,11 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
         for scene, sample in missing:
             if _sample(scene, folder).is_dir():  # another process made it meanwhile
                 continue
-            width, _, height = sample.size.partition("x")
-            if not (width.isdecimal() and height.isdecimal()):
-                raise UserInputError(f"scene {scene.name}: size {sample.size!r}, expected WIDTHxHEIGHT")
+            width, height = parse_size(sample.size)
             make_sample_scene(
                 _sample(scene, folder),
-                width=int(width),
-                height=int(height),
+                width=width,
+                height=height,
                 views=sample.views,
                 points=sample.points,
                 progress=True,

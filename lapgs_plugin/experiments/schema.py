@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 import re
 import sys
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -20,6 +20,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without dashes in front and with underscores inside."""
@@ -180,30 +181,39 @@ class Experiment(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> Experiment:
-        if (twice := _twice([variant.name for variant in self.variants])) is not None:
-            raise ValueError(f"two variants are called {twice!r}")
-        if (twice := _twice([name for entry in self.scenes for name in entry.names])) is not None:
-            raise ValueError(f"scene {twice!r} is there twice; a variant may have a resolution of its own instead")
-        for variant in self.variants:
-            unknown = {*variant.backbones, *(variant.paper if isinstance(variant.paper, dict) else ())}
-            for name in sorted(unknown - self.backbones.keys()):
-                raise ValueError(
-                    f"variant {variant.name!r} names backbone {name!r}, expected {', '.join(self.backbones)}"
-                )
-            self._check_effect(variant)
+        if problems := [*self._repetitions(), *self._unknown_backbones(), *self._without_effect()]:
+            raise ValueError("\n".join(problems))
         return self
 
-    def _check_effect(self, variant: Variant) -> None:
-        """Refuse what would change nothing."""
-        checkouts = [self.backbones[name].checkout is not None for name in variant.backbones or self.backbones]
-        if variant.method == "bare" and "levels" in variant.options:
-            raise ValueError(f"variant {variant.name!r} is bare, which is one level; leave levels out")
-        if variant.method == "bare" and variant.options and all(checkouts):
-            raise ValueError(
-                f"variant {variant.name!r} is bare: options of `lapgs run` mean nothing; set the script's arguments"
-            )
-        if variant.arguments and not any(checkouts):
-            raise ValueError(f"variant {variant.name!r} has arguments, but no script of a checkout to give them to")
+    def _repetitions(self) -> Iterator[str]:
+        if (twice := _twice([variant.name for variant in self.variants])) is not None:
+            yield f"variants: two variants are called {twice!r:.80}; expected different names"
+        if (twice := _twice([name for entry in self.scenes for name in entry.names])) is not None:
+            yield f"scenes: scene {twice!r} is there twice; a variant may have a resolution of its own instead"
+        if (seed := _twice(self.seeds)) is not None:
+            yield f"seeds: {seed} is there twice, which would count its runs twice; expected different seeds"
+
+    def _unknown_backbones(self) -> Iterator[str]:
+        for number, variant in enumerate(self.variants):
+            unknown = {*variant.backbones, *(variant.paper if isinstance(variant.paper, dict) else ())}
+            for name in sorted(unknown - self.backbones.keys()):
+                yield (
+                    f"variants.{number}: variant {variant.name!r} names backbone {name!r}, expected "
+                    f"{', '.join(self.backbones)}"
+                )
+
+    def _without_effect(self) -> Iterator[str]:
+        """What would change nothing."""
+        for number, variant in enumerate(self.variants):
+            names = [name for name in variant.backbones or self.backbones if name in self.backbones]
+            checkouts = [self.backbones[name].checkout is not None for name in names]
+            where = f"variants.{number}: variant {variant.name!r}"
+            if variant.method == "bare" and "levels" in variant.options:
+                yield f"{where} is bare, which is one level; leave levels out"
+            if variant.method == "bare" and variant.options and all(checkouts):
+                yield f"{where} is bare: options of `lapgs run` mean nothing; set the script's arguments"
+            if variant.arguments and not any(checkouts):
+                yield f"{where} has arguments, but no script of a checkout to give them to"
 
 
 PARTS: Mapping[str, type[BaseModel]] = {
@@ -214,6 +224,10 @@ PARTS: Mapping[str, type[BaseModel]] = {
     "sample": SampleScene,
 }
 """The model behind each key that holds tables."""
+LONGEST_LINE = 1000
+"""Characters of one mistake."""
+ALTERNATIVES = ("bool", "int", "float", "str", "dict[str,str]")
+"""What pydantic calls the types of a value that may be one of several."""
 
 
 def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experiment:
@@ -224,8 +238,8 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         option_names: by command, "train" and "run", the options that an experiment may set.
 
     Raises:
-        UserInputError: it is not readable, not TOML, or says something that no experiment may say; names the key, and
-            for an unknown one the nearest that is known.
+        UserInputError: it is not readable, not TOML, or says something that no experiment may say: a line for each
+            mistake, which names the key, and for an unknown one the nearest that is known.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -236,13 +250,16 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:
-        raise UserInputError(f"{path}: {_first_problem(error)}") from None
-    _check_options(path, experiment, option_names)
+        problems = _problems(error)
+    else:
+        problems = _option_problems(experiment, option_names)
+    if problems:
+        raise UserInputError("\n".join(one_line(f"{path}: {problem}") for problem in problems))
     return experiment
 
 
-def _twice(names: list[str]) -> str | None:
-    """The first name that is there more than once."""
+def _twice(names: Sequence[T]) -> T | None:
+    """The first that is there more than once."""
     return next((name for name in names if names.count(name) > 1), None)
 
 
@@ -252,52 +269,83 @@ def nearest(name: str, known: Set[str]) -> str:
     return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(sorted(known))}"
 
 
-def _first_problem(error: ValidationError) -> str:
-    """One of pydantic's complaints as one line: an unknown key before one that is missing, which it may be."""
-    problems = error.errors(include_url=False)
-    problem = next((each for each in problems if each["type"] == "extra_forbidden"), problems[0])
-    place = [str(part) for part in problem["loc"]]
-    where = ".".join(place)
-    if problem["type"] == "extra_forbidden":
-        holders = [part for part in place[:-1] if part in PARTS]
-        model = PARTS[holders[-1]] if holders else Experiment
-        return f"unknown key {where}; {nearest(place[-1], model.model_fields.keys())}"
-    if problem["type"] == "missing":
-        return f"{where} is missing; give it"
-    message = re.sub(r"^Value error, ", "", str(problem["msg"]))
-    received = problem["input"]
-    shown = "" if isinstance(received, (dict, BaseModel)) else f", received {received!r}"
-    return f"{where}: {message}{shown}" if where else message
+def one_line(text: str) -> str:
+    """The text on one line that is not endless, with what a terminal would obey spelled out."""
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
 
 
-def _check_options(path: Path, experiment: Experiment, option_names: Mapping[str, Set[str]]) -> None:
-    """Every option is one of the command that it will be given to."""
+def _problems(error: ValidationError) -> list[str]:
+    """Pydantic's complaints, a line each; unknown keys first, and no missing key beside one that is misspelt."""
+    found: dict[tuple[str, ...], list[Any]] = {}
+    for problem in error.errors(include_url=False):
+        # Of a value that may be one of several types there is a complaint for each type, under the type's name.
+        place = tuple(str(part) for part in problem["loc"] if part not in ALTERNATIVES)
+        found.setdefault(place, []).append(problem)
+    unknown = {place: _unknown_key(place) for place, each in found.items() if each[0]["type"] == "extra_forbidden"}
+    lines = list(unknown.values())
+    for place, problems in found.items():
+        missing = problems[0]["type"] == "missing"
+        if place in unknown or (missing and any(place[:-1] == other[:-1] for other in unknown)):
+            continue
+        lines += [f"{'.'.join(place)} is missing; give it"] if missing else _wrong_value(".".join(place), problems)
+    return lines
 
-    def check(where: str, options: Mapping[str, Any], command: str) -> None:
-        for name in options:
-            if name not in option_names[command]:
-                raise UserInputError(
-                    f"{path}: {where} sets {name}, which `lapgs {command}` does not have or the experiment sets "
-                    f"itself; {nearest(name, option_names[command])}"
-                )
+
+def _unknown_key(place: tuple[str, ...]) -> str:
+    holders = [part for part in place[:-1] if part in PARTS]
+    model = PARTS[holders[-1]] if holders else Experiment
+    return f"unknown key {'.'.join(place)}; {nearest(place[-1], model.model_fields.keys())}"
+
+
+def _wrong_value(where: str, problems: list[Any]) -> list[str]:
+    """What is said of one value, or of what tables say together: there several mistakes may be in one complaint."""
+    received = problems[0]["input"]
+    of_tables = problems[0]["type"] == "value_error" and isinstance(received, (dict, BaseModel))
+    shown = "" if of_tables else f" = {received!r:.80}"
+    message = " or ".join(dict.fromkeys(re.sub(r"^Value error, ", "", str(each["msg"])) for each in problems))
+    return [f"{where}{shown}: {line}" if where else line for line in message.split("\n")]
+
+
+def _option_problems(experiment: Experiment, option_names: Mapping[str, Set[str]]) -> list[str]:
+    """What is wrong with options: every one has to be of the command that it will be given to."""
+    found: dict[str, str] = {}  # by place: what several commands do not have is said once
+    residual: dict[str, None] = {}
+
+    def check(where: str, options: Mapping[str, Any], command: str) -> bool:
+        unknown = [name for name in options if name not in option_names[command]]
+        for name in unknown:
+            place = f"{where}.options.{name}"
+            found.setdefault(
+                place,
+                f"{place} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
+                f"experiment sets itself; {nearest(name, option_names[command])}",
+            )
+        return not unknown
 
     for key, backbone in experiment.backbones.items():
-        check(f"backbones.{key}.options", backbone.options, backbone.command)
-        for variant in experiment.variants:
-            if not variant.backbones or key in variant.backbones:
-                check(f"variant {variant.name!r}", variant.options, backbone.command)
-                if variant.method != "bare" or backbone.checkout is None:
-                    options = {**backbone.options, **variant.options}
-                    _check_residuals(f"{path}: variant {variant.name!r} on backbone {key!r}", options)
+        known = check(f"backbones.{key}", backbone.options, backbone.command)
+        for number, variant in enumerate(experiment.variants):
+            if variant.backbones and key not in variant.backbones:
+                continue
+            if (
+                check(f"variants.{number}", variant.options, backbone.command)
+                and known
+                and (variant.method != "bare" or backbone.checkout is None)
+            ):
+                options = {**backbone.options, **variant.options}
+                where = f"variants.{number}: variant {variant.name!r} on backbone {key!r}"
+                residual.update(dict.fromkeys(_residual_problems(where, options)))
+    return list(found.values()) or list(residual)
 
 
-def _check_residuals(where: str, options: Mapping[str, Any]) -> None:
-    """Refuse what the command would refuse, before the first run starts."""
+def _residual_problems(where: str, options: Mapping[str, Any]) -> list[str]:
+    """What the command would refuse of options about residuals."""
     if options.get("hierarchy", DEFAULT_HIERARCHY.value) != Hierarchy.NESTED.value:
-        return
-    for name, idle in RESIDUAL_OPTIONS.items():
-        if options.get(name, idle) != idle:
-            raise UserInputError(
-                f"{where} sets {name}, which is about residuals, and nested levels have none; leave it out, or add "
-                f'hierarchy = "{Hierarchy.LAPLACIAN.value}" to train residuals'
-            )
+        return []
+    return [
+        f"{where} sets {name} = {options[name]!r:.80}, which is about residuals, and nested levels have none; leave it "
+        f'out, or add hierarchy = "{Hierarchy.LAPLACIAN.value}" to train residuals'
+        for name, idle in RESIDUAL_OPTIONS.items()
+        if options.get(name, idle) != idle
+    ]

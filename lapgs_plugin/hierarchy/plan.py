@@ -112,12 +112,7 @@ class StagePlan:
                     "exactly the coarsest level is unsigned (the base), all others are residuals; of nested levels all "
                     "are unsigned"
                 )
-            if stage.level > 0 and min(stage.image_size) < MIN_LEVEL_SIDE:
-                width, height = stage.image_size
-                raise UserInputError(
-                    f"level {stage.level} of {len(levels)} would be {width}x{height} pixels, expected at least "
-                    f"{MIN_LEVEL_SIDE} on each side; use fewer --levels or a larger --resolution"
-                )
+            _require_side(stage.level, len(levels), stage.image_size)
 
     @property
     def levels(self) -> int:
@@ -155,6 +150,8 @@ class StagePlan:
         """
         if levels < 1:
             raise UserInputError(f"--levels {levels}: expected at least 1")
+        # First, as what follows takes time and memory for every level.
+        _require_side(levels - 1, levels, level_size(image_size, min(levels - 1, max(image_size).bit_length())))
         if iterations < levels:
             raise UserInputError(f"--iterations {iterations}: expected at least one for each of the {levels} levels")
         if split is None:
@@ -177,6 +174,15 @@ class StagePlan:
                 for level, count in zip(range(levels - 1, -1, -1), counts, strict=True)
             ),
             hierarchy,
+        )
+
+
+def _require_side(level: int, levels: int, size: tuple[int, int]) -> None:
+    """Raise a UserInputError about a level that is too small to train."""
+    if level > 0 and min(size) < MIN_LEVEL_SIDE:
+        raise UserInputError(
+            f"level {level} of {levels} would be {size[0]}x{size[1]} pixels, expected at least {MIN_LEVEL_SIDE} on "
+            "each side; use fewer --levels or a larger --resolution"
         )
 
 

@@ -19,7 +19,7 @@ from lapgs_plugin.patching.engine import (
     plan_revert,
     status,
 )
-from lapgs_plugin.patching.files import read_only, uncommitted, write_all
+from lapgs_plugin.patching.files import alone, read_only, uncommitted, write_all
 from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "SetStatus",
     "State",
     "Target",
+    "alone",
     "find_targets",
     "load_recipes",
     "plan_apply",

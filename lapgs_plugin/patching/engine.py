@@ -6,6 +6,7 @@ what is there, so it is idempotent and also renews the edits of an older version
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -13,8 +14,8 @@ from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.patching.blocks import find_blocks, insertion, replacement, stray_marker, without_blocks
-from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
-from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize
+from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes, read_source
+from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
 
 ALL_SETS = "all"
 """Stands for every set: of those to take out for all, of those to put in for all that are not opt-in."""
@@ -44,6 +45,7 @@ class State(Enum):
 
     APPLIED = "applied"
     NOT_APPLIED = "not applied"
+    NOT_NEEDED = "not needed: the sources have it already"
     INCOMPLETE = "incomplete or of another version: apply again"
     IMPOSSIBLE = "cannot be applied"
 
@@ -67,7 +69,7 @@ def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tup
     Raises:
         PatchError: `checkout` is not a folder or holds no extension that is known.
     """
-    if not checkout.is_dir():
+    if not os.path.isdir(checkout):  # noqa: PTH112  # Path.is_dir raises where a name is too long for the file system
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
     recipes = load_recipes() if recipes is None else recipes
     folders = [checkout, *sorted(_subfolders(checkout))]
@@ -114,7 +116,8 @@ def status(target: Target) -> tuple[SetStatus, ...]:
         if problems:
             state = State.IMPOSSIBLE
         elif name not in present:
-            state = State.NOT_APPLIED
+            puts = any(_blocks(change.after, name) for change in changes)
+            state = State.NOT_APPLIED if puts else State.NOT_NEEDED
         else:
             current = all(_blocks(change.before, name) == _blocks(change.after, name) for change in changes)
             state = State.APPLIED if current else State.INCOMPLETE
@@ -139,7 +142,7 @@ def _subfolders(checkout: Path) -> Iterable[Path]:
 def _read(target: Target) -> dict[str, str]:
     """The sources that the recipe looks at, by file; files that do not exist are left out."""
     paths = {file: target.folder / file for file in target.recipe.files}
-    return {file: path.read_bytes().decode("latin-1") for file, path in paths.items() if path.is_file()}
+    return {file: read_source(path) for file, path in paths.items() if path.is_file()}
 
 
 def _present_sets(sources: Iterable[str]) -> frozenset[str]:
@@ -208,6 +211,8 @@ def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tupl
             problems.append(f"{problem}: {check.because}")
     pieces: list[tuple[int, int, str]] = []  # start, end, text in place of source[start:end]
     for edit in edits:
+        if any(unconditional(tokens, directive) for directive in edit.unless):
+            continue
         place, problem = _locate(source, tokens, edit.anchor, 1)
         if place is None or problem is not None:
             problems.append(f"{problem} (edit {edit.label})")

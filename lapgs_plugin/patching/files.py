@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import shutil
 import stat
 import subprocess
+import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.patching.engine import FileChange, pristine
+from lapgs_plugin.patching.engine import FileChange, Target, pristine
+
+_SUFFIX = ".lapgs"
+_RANDOM = r"[a-z0-9_]{8}"
+"""What `tempfile.mkstemp` puts between prefix and suffix."""
+PATIENCE = 30.0
+"""Seconds to wait for another process that writes to the same folders, which takes it far less than one."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF, errno.EINVAL)
+"""What a file system without locks on folders answers."""
 
 
 def read_only(changes: Iterable[FileChange]) -> list[Path]:
@@ -27,6 +40,33 @@ def uncommitted(paths: Iterable[Path]) -> list[Path]:
     all files where there is no git, are left out: there is nothing to compare them with.
     """
     return [path for path in paths if _differs_from_head(path)]
+
+
+@contextmanager
+def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
+    """Keep other `lapgs patch` processes from these extensions, and remove what a killed one left.
+
+    A temporary file is somebody's as long as its process holds the lock of its folder; that lock ends with the process,
+    however it ends. Where folders cannot be locked (Windows, some network file systems) nothing is removed.
+
+    Returns:
+        The temporary files that could not be removed, in order.
+
+    Raises:
+        PatchError: another process holds one of the folders for longer than `PATIENCE`.
+    """
+    files = {path.resolve() for target in targets for path in _present(target)}
+    folders = sorted({path.parent for path in files})
+    with ExitStack() as locks:
+        # In the same order everywhere, so that no two processes wait for each other.
+        locked = [folder for folder in folders if locks.enter_context(_folder_lock(folder))]
+        stuck = []
+        for path in sorted(each for file in files if file.parent in locked for each in _temporaries(file)):
+            try:
+                path.unlink(missing_ok=True)
+            except OSError:  # a read-only folder: said by the caller, as the rest of the command may still work
+                stuck.append(path)
+        yield stuck
 
 
 def write_all(changes: Sequence[FileChange]) -> None:
@@ -62,10 +102,58 @@ def _writable(path: Path) -> bool:
     return os.access(path, os.W_OK) and bool(path.stat().st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH))
 
 
+def _present(target: Target) -> list[Path]:
+    return [path for path in (target.folder / file for file in target.recipe.files) if path.is_file()]
+
+
+def _temporaries(file: Path) -> list[Path]:
+    """The files beside `file` that `_beside` made."""
+    name = re.compile(re.escape(f".{file.name}.") + _RANDOM + re.escape(_SUFFIX))
+    return [
+        each for each in file.parent.iterdir() if name.fullmatch(each.name) and each.is_file() and not each.is_symlink()
+    ]
+
+
+@contextmanager
+def _folder_lock(folder: Path) -> Iterator[bool]:
+    """Hold the operating system's lock of a folder, which leaves no file behind; False where there is no such lock."""
+    if sys.platform == "win32":
+        yield False
+        return
+    import fcntl
+
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise PatchError(f"{folder}: cannot be read: {error.strerror}; expected a folder this user may read") from error
+    end = time.monotonic() + PATIENCE
+    try:
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise PatchError(
+                        f"{folder}: another `lapgs patch` works on it; wait for it or stop it; nothing was changed"
+                    ) from None
+                time.sleep(0.05)
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                locked = False
+                break
+            else:
+                locked = True
+                break
+        yield locked
+    finally:
+        os.close(descriptor)
+
+
 def _beside(path: Path, data: bytes) -> Path:
     """A new file in the same folder with this content and the permissions of `path`."""
     target = path.resolve()
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".lapgs")
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=_SUFFIX)
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:

@@ -45,6 +45,7 @@ class Edit:
     Attributes:
         set: the set of edits that it belongs to, such as "signed-color".
         name: unique in its set.
+        unless: directives; where one of them stands in the file, outside of any condition, the edit is not needed.
     """
 
     set: str
@@ -52,6 +53,7 @@ class Edit:
     anchor: Anchor
     put: str
     replaces: bool
+    unless: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -138,11 +140,23 @@ def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
     return tuple(_recipe(name, tables) for name in tables)
 
 
+def read_source(path: Path) -> str:
+    """The text of a source file, one character a byte.
+
+    Raises:
+        PatchError: it cannot be read.
+    """
+    try:
+        return path.read_bytes().decode("latin-1")
+    except OSError as error:
+        raise PatchError(f"{path}: cannot be read: {error.strerror}; expected a file this user may read") from error
+
+
 def _stands(anchor: Anchor, folder: Path) -> bool:
     path = folder / anchor.file
     if not path.is_file():
         return False
-    tokens = tokenize(path.read_bytes().decode("latin-1")) if anchor.find else []
+    tokens = tokenize(read_source(path)) if anchor.find else []
     return not anchor.find or bool(occurrences(tokens, anchor.find, range(len(tokens))))
 
 
@@ -193,14 +207,17 @@ def _place(item: dict[str, str]) -> Anchor:
 
 def _edit(item: dict[str, Any]) -> Edit:
     anchor = _anchor(item["file"], item["find"], item.get("function"))
-    kinds = item.keys() - {"set", "name", "file", "find", "function"}
+    kinds = item.keys() - {"set", "name", "file", "find", "function", "unless"}
     if kinds not in ({"before"}, {"replace"}):
         raise ValueError(f"edit {item['name']!r}: expected either `before` or `replace`, got {sorted(kinds)}")
     (kind,) = kinds
     put = item[kind].strip("\n")
     if not put.isascii():
         raise ValueError(f"edit {item['name']!r}: expected ASCII, the same in every encoding a source may have")
-    return Edit(item["set"], item["name"], anchor, put, replaces=kind == "replace")
+    unless = item.get("unless", [])
+    if not (isinstance(unless, list) and all(isinstance(text, str) and text.startswith("#") for text in unless)):
+        raise ValueError(f"edit {item['name']!r}: unless = {unless!r}, expected a list of directives that start with #")
+    return Edit(item["set"], item["name"], anchor, put, kind == "replace", tuple(unless))
 
 
 def _anchor(file: str, find: str, function: str | None) -> Anchor:

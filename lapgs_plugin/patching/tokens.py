@@ -24,6 +24,7 @@ _LEXER = re.compile(
     re.VERBOSE | re.DOTALL | re.ASCII,
 )
 _AFTER_PARAMETERS = frozenset({"const", "noexcept", "override", "final"})
+_CONDITIONS = frozenset({"if", "ifdef", "ifndef"})
 _CLOSING = {"(": ")", "{": "}"}
 
 
@@ -64,6 +65,18 @@ def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[rang
     candidates = (i for i in range(span.start, span.stop - len(wanted) + 1) if texts[i] == wanted[0])
     places = (range(i, i + len(wanted)) for i in candidates if texts[i : i + len(wanted)] == wanted)
     return [place for place in places if directives or not any(tokens[i].in_directive for i in place)]
+
+
+def unconditional(tokens: Sequence[Token], directive: str) -> bool:
+    """Whether a directive stands somewhere outside of every #if: then it holds for whoever compiles the file."""
+    depth = 0
+    places = {place.start for place in occurrences(tokens, directive, range(len(tokens)))}
+    for i, token in enumerate(tokens):
+        if i in places and depth == 0:
+            return True
+        if token.text == "#" and token.in_directive and i + 1 < len(tokens):
+            depth += (tokens[i + 1].text in _CONDITIONS) - (tokens[i + 1].text == "endif")
+    return False
 
 
 def definitions(tokens: Sequence[Token], name: str) -> list[range]:

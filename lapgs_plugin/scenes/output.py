@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
     Raises:
         UserInputError: `out` is a file, holds a scene and `overwrite` is False, or holds anything else.
     """
-    if not out.exists():
+    if not os.path.lexists(out):  # not Path.exists, which raises where a name is too long for the file system
         return
     if not out.is_dir():
         raise UserInputError(f"{out}: a file, expected a folder or a new name")

@@ -51,13 +51,13 @@ LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
 
 
-def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
-    """The stages of a run on this scene.
+def make_plan(size: tuple[int, int], settings: TrainSettings) -> StagePlan:
+    """Return the stages of a run on images of this size (width, height), which is `Scene.smallest_size`.
 
     Raises:
         UserInputError: levels, split and image size do not go together.
     """
-    return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, settings.shares, settings.kind)
+    return StagePlan.create(size, settings.iterations, settings.levels, settings.shares, settings.kind)
 
 
 def check_storage(settings: TrainSettings, device: torch.device) -> None:
@@ -129,7 +129,7 @@ class Trainer:
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
-        self.plan = make_plan(self.scene, self.settings)
+        self.plan = make_plan(self.scene.smallest_size, self.settings)
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)

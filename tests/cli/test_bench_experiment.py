@@ -34,8 +34,8 @@ rasterizer = "cpu"
 name = "one field"
 method = "bare"
 [[variants]]
-name = "too many levels"
-options = { levels = 9 }
+name = "two levels"
+options = { levels = 2, sh_degree = 1 }
 [table]
 columns = ["train_seconds", "psnr"]
 """
@@ -56,10 +56,19 @@ def bench(experiment: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experiment: Path) -> None:
+    torn = experiment.parent / "torn"
+    make_sample_scene(torn, width=48, height=32, views=8, points=100, progress=False)
+    whole = (torn / "images" / "0003.png").read_bytes()
+    (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # its header is whole: found by the run alone
+    head, rest = EXPERIMENT.split("[backbones.cpu]")
+    text = f'{head}[[scenes]]\nname = "torn"\npath = "torn"\n[backbones.cpu]{rest}'
+    experiment.write_text(
+        text.replace('[[variants]]\nname = "two levels"\noptions = { levels = 2, sh_degree = 1 }\n', "")
+    )
     first = bench(experiment, "--no-eval")
     assert first.returncode == 1
     assert "1 of 2 runs failed" in first.stderr
-    assert "levels" in first.stderr, "the end of the log says why"
+    assert "0003.png" in first.stderr, "the end of the log says why"
     assert "Traceback" not in first.stderr
     out = experiment.parent / "out"
     with (out / "results.csv").open(newline="") as stream:
@@ -73,19 +82,19 @@ def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experime
     outcomes = ResultStore(out / "results.sqlite").outcomes()
     assert [outcome.state for outcome in outcomes] == [DONE, FAILED]
 
-    experiment.write_text(EXPERIMENT.replace("levels = 9", "levels = 2"))
+    (torn / "images" / "0003.png").write_bytes(whole)
     second = bench(experiment, "--no-eval")
     assert second.returncode == 0, second.stderr
     assert "1 of 2 runs are done already" in second.stderr
     assert Path(row["folder"], "manifest.json").stat().st_mtime_ns == written
     with (out / "results.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [each["variant"] for each in rows] == ["one field", "too many levels"]
+    assert [each["scene"] for each in rows] == ["mine", "torn"]
 
 
 def test_killed_in_the_middle_two_others_go_on_and_share_the_work(experiment: Path) -> None:
     sample = 'sample = { size = "48x32", views = 8, points = 100 }'
-    text = EXPERIMENT.replace('path = "scene"', sample).replace("levels = 9", "levels = 2")
+    text = EXPERIMENT.replace('path = "scene"', sample)
     experiment.write_text(text.replace("iterations = 20", "iterations = 400"))
     out = experiment.parent / "out"
     command = [*LAPGS, str(experiment), "--out", "out", "--no-eval"]
@@ -138,7 +147,7 @@ def test_mistakes_on_the_command_line(
 
 
 def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path) -> None:
-    text = EXPERIMENT.replace('rasterizer = "cpu"', 'checkout = "fastgs"').replace("levels = 9", "levels = 2")
+    text = EXPERIMENT.replace('rasterizer = "cpu"', 'checkout = "fastgs"').replace(", sh_degree = 1", "")
     experiment.write_text(text)
     os.environ.pop("LAPGS_FASTGS", None)
     error = invoke(experiment, "--out", experiment.parent / "out")

@@ -513,6 +513,110 @@ def test_without_git_nothing_is_uncommitted(target: Target, monkeypatch: pytest.
     assert uncommitted(files) == []
 
 
+KILLED_AT = """
+import os, pathlib, signal, sys
+from lapgs_plugin.patching import alone, find_targets, plan_apply, plan_revert, write_all
+
+WRITES = {"open", "os.chmod", "os.rename", "os.remove"}
+planners = {"apply": plan_apply, "revert": plan_revert}
+
+
+def write(checkout, command):
+    targets = find_targets(checkout)
+    with alone(targets):
+        write_all([change for target in targets for change in planners[command](target, ["all"])])
+
+
+def child(checkout, command, at):
+    count, inside = 0, str(checkout)
+
+    def die_at(event, arguments):
+        nonlocal count
+        reads = event == "open" and arguments[2] & os.O_ACCMODE == os.O_RDONLY
+        if event in WRITES and not reads and isinstance(arguments[0], str) and arguments[0].startswith(inside):
+            tick()
+
+    def tick():
+        nonlocal count
+        count += 1
+        if count == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    fsync = os.fsync
+    os.fsync = lambda descriptor: (tick(), fsync(descriptor), tick())
+    sys.addaudithook(die_at)
+    write(checkout, command)
+    os._exit(0)
+
+
+for command in planners:
+    at = 1
+    while True:
+        checkout = pathlib.Path(sys.argv[1], f"{command}-{at}")
+        os.system(f"cp -r '{sys.argv[2]}' '{checkout}'")
+        if command == "revert":
+            write(checkout, "apply")
+        process = os.fork()
+        if process == 0:
+            child(checkout, command, at)
+        if os.waitpid(process, 0)[1] == 0:
+            break
+        at += 1
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
+def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: Path, tmp_path: Path) -> None:
+    checkout = rasterizer.parents[1]
+    (rasterizer / "cuda_rasterizer/.forward.cu.notes.lapgs").write_text("mine")  # no temporary of ours
+    before = read_tree(checkout)
+    write_all(plan_apply(find_targets(checkout)[0], [ALL_SETS]))
+    after = read_tree(checkout)
+    lapgs_patch("revert", checkout)
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    subprocess.run([sys.executable, "-c", KILLED_AT, str(copies), str(checkout)], check=True)
+    found = sorted(copies.iterdir())
+    # Opening, both sides of the sync, the mode and the renaming of four files, and one run to the end, both ways.
+    assert len(found) >= 2 * (4 * 5 + 1)
+    left = 0
+    for number, copy in enumerate(found):
+        tree = read_tree(copy)
+        temporaries = tree.keys() - before.keys()
+        assert all(re.fullmatch(r"\..*\.[a-z0-9_]{8}\.lapgs", Path(name).name) for name in temporaries)
+        assert all(tree[name] in (before[name], after[name]) for name in before)
+        left += bool(temporaries)
+        lapgs_patch(("status", "apply", "revert")[number % 3], copy)
+        assert read_tree(copy).keys() == before.keys()
+        lapgs_patch("apply", copy)
+        assert read_tree(copy) == after
+        lapgs_patch("revert", copy)
+        assert read_tree(copy) == before
+    assert left > len(found) // 2, "most of these deaths leave something"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders have no locks there")
+def test_temporary_files_of_a_process_that_lives_stay(rasterizer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = rasterizer / "cuda_rasterizer"
+    theirs = folder / ".forward.cu.abcd_123.lapgs"
+    theirs.write_text("half")
+    before = read_tree(rasterizer)
+    program = "import fcntl, os, sys; fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), 2); print('has it', flush=True); "
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{program}sys.stdin.read()", str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"has it\n"
+        monkeypatch.setattr("lapgs_plugin.patching.files.PATIENCE", 0.0)
+        for command in ("status", "apply", "revert"):
+            with pytest.raises(PatchError, match="cuda_rasterizer: another `lapgs patch` works on it; wait"):
+                lapgs_patch(command, rasterizer)
+        assert read_tree(rasterizer) == before
+        other.kill()
+    lapgs_patch("status", rasterizer)
+    assert not theirs.exists()
+
+
 # --- the recipes that come with the plugin, on a rasterizer of our own writing ----------------------------------------
 
 RASTERIZER = {
@@ -681,6 +785,61 @@ def test_a_rasterizer_where_something_else_reads_the_degree_is_refused(rasterize
         plan_apply(find_targets(rasterizer)[0], ["signed-color"])
 
 
+@pytest.mark.parametrize(
+    ("has", "needed"),
+    [
+        ("#include <cstdint>\n", False),
+        ("  #  include  <stdint.h> // theirs\n", False),
+        ("#if 1\n#endif\n#include <cstdint>\n", False),
+        ("// #include <cstdint>\n", True),
+        ("#ifdef _WIN32\n#include <cstdint>\n#endif\n", True),
+        ("#if A\n#if B\n#endif\n#include <cstdint>\n#endif\n", True),
+    ],
+)
+def test_a_header_that_the_source_has_is_not_included_again(rasterizer: Path, has: str, needed: bool) -> None:
+    path = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
+    path.write_text(has + path.read_text())
+    before = read_tree(rasterizer)
+    (target,) = find_targets(rasterizer)
+    states = {found.set: found.state for found in status(target)}
+    assert states["build-cuda13"] is (State.NOT_APPLIED if needed else State.NOT_NEEDED)
+    after = apply(target, ALL_SETS)
+    name = "cuda_rasterizer/rasterizer_impl.h"
+    assert after[name].count(b">>> lapgs") == needed
+    assert (after[name] == before[name]) is not needed
+    assert apply(target, ALL_SETS) == after
+    assert revert(target, ALL_SETS) == before
+
+
+@pytest.mark.parametrize("recipe", ["simple-knn", "taming-rasterizer", "fastgs", "taming"])
+def test_float_limits_are_included_once(tmp_path: Path, recipe: str) -> None:
+    (edit,) = (each for each in {r.name: r for r in load_recipes()}[recipe].edits if each.name == "cfloat")
+    only = Recipe("only", "only", (Anchor(edit.anchor.file, ""),), (), "", (edit,), ())
+    path = tmp_path / edit.anchor.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for own, times in (("", 1), ("#include <cfloat>\n", 1), ("#include <float.h>\n", 0)):
+        path.write_text(own + edit.anchor.find + "\n")
+        before = path.read_bytes()
+        for _ in range(2):
+            write_all(plan_apply(Target(only, tmp_path), [ALL_SETS]))
+            assert path.read_text().count("#include <cfloat>") == times
+        write_all(plan_revert(Target(only, tmp_path), [ALL_SETS]))
+        assert path.read_bytes() == before
+
+
+def test_a_header_included_twice_by_an_earlier_version_is_taken_out(rasterizer: Path) -> None:
+    path = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
+    path.write_text("#include <cstdint>\n" + path.read_text())
+    before = read_tree(rasterizer)
+    (target,) = find_targets(rasterizer)
+    edits = tuple(replace(edit, unless=()) for edit in target.recipe.edits)
+    older = replace(target, recipe=replace(target.recipe, edits=edits))
+    write_all(plan_apply(older, ["build-cuda13"]))
+    assert path.read_text().count("#include <cstdint>") == 2
+    assert {found.set: found.state for found in status(target)}["build-cuda13"] is State.INCOMPLETE
+    assert apply(target, "build-cuda13") == before
+
+
 @pytest.mark.parametrize("depth", [0, 1, 2])
 def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, depth: int) -> None:
     checkout = [rasterizer, *rasterizer.parents][depth]
@@ -707,6 +866,11 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
             'name = "new"\ntitle = "New"\npresent = []\n'
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',
             "either `before` or `replace`",
+        ),
+        (
+            'name = "new"\ntitle = "New"\npresent = []\n'
+            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = "#include <f>"',
+            "expected a list of directives that start with #",
         ),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
@@ -817,7 +981,13 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             (target,) = find_targets(copy)
             assert target.recipe.name == upstream.recipe.name
             after = apply(target, *target.recipe.sets)
-            assert {found.state for found in status(target)} == {State.APPLIED}
-            assert sum(data.count(b">>> lapgs") for data in after.values()) == len(target.recipe.edits)
+            assert {found.state for found in status(target)} <= {State.APPLIED, State.NOT_NEEDED}
+            blocks = sum(data.count(b">>> lapgs") for data in after.values())
+            spared = [
+                edit
+                for edit in target.recipe.edits
+                if any(each.encode() in before[edit.anchor.file] for each in edit.unless)
+            ]
+            assert blocks == len(target.recipe.edits) - len(spared)
             assert apply(target, *target.recipe.sets) == after
             assert revert(target, ALL_SETS) == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
@@ -24,7 +25,10 @@ from lapgs_plugin.scenes.sample.raycast import render
 from lapgs_plugin.scenes.sample.world import World, build_world
 
 MIN_SIDE = 16
+MAX_SIDE = 8192
 MAX_VIEWS = 9999  # names have four digits, so that their order is that of the views
+MAX_POINTS = 1_000_000
+"""Rendering and sampling hold arrays of all pixels of an image and of all points."""
 
 
 def make_sample_scene(
@@ -45,10 +49,10 @@ def make_sample_scene(
 
     Args:
         out: the scene folder; new, empty, or with `overwrite` one that holds a scene. It appears when it is complete.
-        width, height: image size in pixels, at least 16.
+        width, height: image size in pixels, 16 to 8192.
         views: number of images, 2 to 9999.
-        points: number of sparse points, at least 1. Each lies on a surface that at least two views see, off by noise of
-            6 mm a coordinate; their tracks hold the exact image positions.
+        points: number of sparse points, 1 to 1,000,000. Each lies on a surface that at least two views see, off by
+            noise of 6 mm a coordinate; their tracks hold the exact image positions.
         seed: chooses colours, patterns and cameras.
         overwrite: replace the scene that `out` holds.
         progress: show a bar on stderr.
@@ -57,15 +61,38 @@ def make_sample_scene(
         UserInputError: an argument is out of range or `out` must not be written to.
         LapgsError: the disk is full or the folder cannot be written.
     """
-    _check("--size", f"{width}x{height}", min(width, height) >= MIN_SIDE, f"at least {MIN_SIDE}x{MIN_SIDE}")
-    _check("--views", views, 2 <= views <= MAX_VIEWS, f"2 to {MAX_VIEWS}")
-    _check("--points", points, points >= 1, "at least 1")
-    _check("--seed", seed, seed >= 0, "0 or more")
+    check_sample_scene(width, height, views, points, seed)
     with fresh_scene(out, overwrite) as folder:
         world = build_world(seed)
         cameras = [orbit_camera(index, (width, height), seed) for index in range(views)]
         _write_images(folder / "images", world, cameras, progress)
         _write_model(folder / "sparse" / "0", cameras, sample_points(world, cameras, points, seed))
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height from "480x320".
+
+    Raises:
+        UserInputError: the text is of another form.
+    """
+    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", text.strip())
+    if match is None:
+        raise UserInputError(f"--size {text!r}: expected WIDTHxHEIGHT in pixels, such as 480x320")
+    return int(match[1]), int(match[2])
+
+
+def check_sample_scene(width: int, height: int, views: int, points: int, seed: int = 0) -> None:
+    """Refuse what `make_sample_scene` cannot make.
+
+    Raises:
+        UserInputError: an argument is out of range.
+    """
+    _check("--size", f"{width}x{height}", min(width, height) >= MIN_SIDE, f"at least {MIN_SIDE}x{MIN_SIDE}")
+    _check("--size", f"{width}x{height}", max(width, height) <= MAX_SIDE, f"at most {MAX_SIDE}x{MAX_SIDE}")
+    _check("--views", views, 2 <= views <= MAX_VIEWS, f"2 to {MAX_VIEWS}")
+    _check("--points", points, points >= 1, "at least 1")
+    _check("--points", points, points <= MAX_POINTS, f"at most {MAX_POINTS}")
+    _check("--seed", seed, seed >= 0, "0 or more")
 
 
 def _check(option: str, value: object, valid: bool, expected: str) -> None:

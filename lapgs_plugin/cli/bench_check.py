@@ -1,0 +1,237 @@
+"""Checks every run of an experiment before the first one starts, by the commands that the runs would be.
+
+A run's command line goes through the command's own options, and its settings are made; then the command ends
+(`rehearsal.Rehearsal`). So an experiment refuses whatever a command refuses, in the same words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import typer
+
+from lapgs_plugin.cli.rehearsal import Rehearsal
+from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
+from lapgs_plugin.experiments.commands import LAPGS
+from lapgs_plugin.experiments.expansion import SceneSpec, Selection
+from lapgs_plugin.experiments.mistakes import Mistakes, keys_of
+from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.hierarchy.plan import StagePlan
+from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution
+
+if TYPE_CHECKING:
+    from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec
+    from lapgs_plugin.experiments.store import Job
+    from lapgs_plugin.runner.settings import RunSettings
+    from lapgs_plugin.runs.archive import SceneReference
+    from lapgs_plugin.training.settings import TrainSettings
+
+_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
+"""click's UsageError, wherever this version of typer has click."""
+READS_SCENES = ("OpenImageIO", "pycolmap")
+"""Packages without which no scene can be read."""
+ANY_SIZE = (1 << 20, 1 << 20)
+"""Stands for a size that is not known: no image is larger, so a plan that does not fit it fits none."""
+LONGEST_RUN = 230
+"""Characters of a run's name: with what attempts and logs add, a file's name holds 255."""
+OWN_ARGUMENTS = ("-m", "--model_path", "-s", "--source_path")
+"""Of a checkout's script: where a run is written and what it is trained on, which the experiment says itself."""
+
+Sizes = Callable[[str], tuple[int, int] | None]
+"""A scene's smallest image at a resolution, None where that is not known."""
+
+
+def check_runs(
+    experiment: Experiment,
+    selection: Selection,
+    planned: Sequence[PlannedRun],
+    jobs: Sequence[Job],
+    scenes: Mapping[str, tuple[SceneSpec, Path]],
+    mistakes: Mistakes,
+    *,
+    here: bool,
+) -> None:
+    """Note what is wrong with any of these runs.
+
+    Args:
+        experiment, selection: that the runs come from.
+        planned: the runs.
+        jobs: their commands.
+        scenes: by name; those that exist, or will be made, with their folders.
+        mistakes: gets what is found.
+        here: whether this is the machine that the runs are for, so that what it lacks is a mistake.
+    """
+    by_id = {job.run_id: job for job in jobs}
+    sizes = _sizes_of(scenes)
+    for run in planned:
+        spec, keys = run.spec, keys_of(experiment, selection, run)
+        try:
+            HierarchySettings(seed=spec.seed)
+            parse_resolution(spec.resolution)
+            _check_name(spec)
+            _check_arguments(spec)
+            _check_kinds(spec)
+            if (job := by_id.get(spec.run_id)) is not None:
+                _rehearse(job, _Check(spec, sizes.get(spec.scene), here))
+        except MissingExtraError as error:
+            if here:
+                _note(mistakes, keys, str(error))
+        except SceneError as error:
+            mistakes.add(keys["scene"], str(error))
+        except LapgsError as error:
+            _note(mistakes, keys, str(error))
+        except _USAGE_ERROR as error:
+            _note(mistakes, keys, cast(Any, error).format_message().rstrip("."))
+
+
+def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:
+    """Note a message under the key of the first option that it names and that the experiment sets."""
+    options = (match.replace("-", "_") for match in re.findall(r"--([a-z][a-z-]*[a-z])", message))
+    mistakes.add(next((keys[option] for option in options if option in keys), keys["run"]), message)
+
+
+@dataclass
+class _Check(Rehearsal):
+    """Completes what a command checks by itself: is there such a rasterizer here, and do the stages fit the images?"""
+
+    spec: RunSpec
+    size: Sizes | None  # None: the scene is missing, which is said already
+    here: bool
+
+    def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
+        from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
+        from lapgs_plugin.training.trainer import check_storage, make_plan
+
+        if self.size is not None:
+            make_plan(self.size(reference.resolution) or ANY_SIZE, settings)
+        if self.here or rasterizer != AUTO:  # elsewhere it may be another one
+            check_storage(settings, training_rasterizer(choose_rasterizer(rasterizer), settings).device)
+
+    def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
+        assert self.size is not None, "there are no commands of a checkout without a scene"
+        if self.spec.method == "bare" or _sets(self.spec.arguments, "--iterations"):
+            return
+        known = None
+        if not _sets(self.spec.arguments, "-r", "--resolution"):
+            # A script reads scenes in its own way: what we cannot read, it may.
+            with suppress(SceneError):
+                known = self.size(BACKBONE_PREFIX + arguments[list(arguments).index("-r") + 1])
+        StagePlan.create(known or ANY_SIZE, self.spec.iterations, settings.levels, settings.shares, settings.kind)
+
+
+def _rehearse(job: Job, check: _Check) -> None:
+    """Have a run's first command check its options and end.
+
+    Raises:
+        LapgsError, click's UsageError: the command would refuse them.
+    """
+    name, *words = job.steps[0].command[len(LAPGS) :]
+    if not check.here and name == "run":
+        words = _without_device(words)
+    command = _command(name)
+    with command.make_context(name, words, obj=check) as context:
+        command.invoke(context)
+
+
+def _without_device(words: Sequence[str]) -> list[str]:
+    """A command line that leaves the device to the machine: another one may have a GPU."""
+    kept = list(words)
+    if "--device" in kept and kept[(at := kept.index("--device")) + 1] == "cuda":
+        del kept[at : at + 2]
+    return kept
+
+
+@cache
+def _command(name: str) -> Any:
+    """The command of that name, as click's object."""
+    from lapgs_plugin.cli.app import app
+
+    return cast(Any, typer.main.get_command(app)).commands[name]
+
+
+def _check_kinds(spec: RunSpec) -> None:
+    """Refuse a value where an option is a flag, and true or false where it takes a value.
+
+    Raises:
+        UserInputError: an option is given the other kind.
+    """
+    flags = {
+        p.name: bool(getattr(p, "is_flag", False)) for p in _command("train" if spec.checkout is None else "run").params
+    }
+    for name, value in spec.options.items():
+        if flags[name] and not isinstance(value, bool):
+            raise UserInputError(f"--{name.replace('_', '-')} {value}: expected true or false")
+        if isinstance(value, bool) and not flags[name]:
+            raise UserInputError(f"--{name.replace('_', '-')} {str(value).lower()}: expected a number or text")
+        if isinstance(value, str) and "\0" in value:
+            raise UserInputError(f"--{name.replace('_', '-')} {value}: expected no NUL, which no command line can hold")
+
+
+def _check_name(spec: RunSpec) -> None:
+    """Refuse a run whose files would have names that no file system takes.
+
+    Raises:
+        UserInputError: the names of its scene and its backbone are too long together.
+    """
+    if len(spec.run_id) > LONGEST_RUN:
+        raise UserInputError(
+            f"a run called {spec.run_id:.60}... takes {len(spec.run_id)} characters, expected at most {LONGEST_RUN}; "
+            "choose shorter names for the scene and the backbone"
+        )
+
+
+def _check_arguments(spec: RunSpec) -> None:
+    """Refuse words for a checkout's script that would take its run out of the experiment's folder.
+
+    Raises:
+        UserInputError: there is one.
+    """
+    for word in spec.arguments:
+        if "\0" in word:
+            raise UserInputError(f"arguments {word!r}: expected no NUL, which no command line can hold")
+        if _sets([word], *OWN_ARGUMENTS):
+            raise UserInputError(
+                f"arguments {word!r}: the experiment says where a run is written and which scene it is trained on; "
+                "expected other options of the script"
+            )
+
+
+def _sets(arguments: Sequence[str], *options: str) -> bool:
+    return any(word == option or word.startswith(f"{option}=") for word in arguments for option in options)
+
+
+def _sizes_of(scenes: Mapping[str, tuple[SceneSpec, Path]]) -> dict[str, Sizes]:
+    """How large the images of each scene are, each looked up once."""
+    return {name: cache(_SceneSizes(*where)) for name, where in scenes.items()}
+
+
+@dataclass(frozen=True)
+class _SceneSizes:
+    scene: SceneSpec
+    folder: Path
+
+    def __call__(self, resolution: str) -> tuple[int, int] | None:
+        """The smallest width and height, from headers alone; None where nothing here reads scenes.
+
+        Raises:
+            SceneError: the scene cannot be trained on.
+        """
+        if self.scene.sample is not None and not self.folder.is_dir():
+            from lapgs_plugin.scenes.sample import parse_size
+
+            return parse_resolution(resolution).size_for(*parse_size(self.scene.sample.size))
+        if any(find_spec(name) is None for name in READS_SCENES):
+            return None
+        from lapgs_plugin.scenes import load_cameras
+
+        train, test = load_cameras(self.folder, resolution=resolution, images=self.scene.images, eval=True)
+        cameras = [*train.values(), *test.values()]
+        return min(camera.width for camera in cameras), min(camera.height for camera in cameras)

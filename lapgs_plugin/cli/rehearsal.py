@@ -1,0 +1,21 @@
+"""Let a command check its options and end, for experiments that check all runs before the first one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lapgs_plugin.runner.settings import RunSettings
+    from lapgs_plugin.runs.archive import SceneReference
+    from lapgs_plugin.training.settings import TrainSettings
+
+
+class Rehearsal:
+    """Receive what a command would train with. A command whose context has one as its object ends there."""
+
+    def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
+        """Receive the settings of `lapgs train`, the scene and how it is read, and the value of --rasterizer."""
+
+    def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
+        """Receive the settings of `lapgs run` and the script's own arguments."""

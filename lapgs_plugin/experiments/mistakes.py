@@ -1,0 +1,85 @@
+"""Collects everything that is wrong with an experiment, so that it is said at once and before anything is written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.experiments.expansion import PlannedRun, Selection
+from lapgs_plugin.experiments.schema import Experiment, one_line
+
+
+class Mistakes:
+    """The mistakes of one experiment file, each one line: file, key path, value, what was expected.
+
+    Args:
+        file: the experiment file.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._lines: dict[str, None] = {}
+
+    def add(self, key: str, message: str) -> None:
+        """Note a mistake; the same one only once, however many runs make it."""
+        self._lines[one_line(f"{self._file}: {key}: {message}")] = None
+
+    @contextmanager
+    def at(self, key: str) -> Iterator[None]:
+        """Note the error that ends the block, if one does."""
+        try:
+            yield
+        except LapgsError as error:
+            self.add(key, str(error))
+
+    def refuse(self) -> None:
+        """Say all of them.
+
+        Raises:
+            UserInputError: there is any.
+        """
+        if self._lines:
+            raise UserInputError("\n".join(self._lines))
+
+
+def scene_key(experiment: Experiment, name: str) -> str:
+    """Where the file names a scene."""
+    number = next(i for i, entry in enumerate(experiment.scenes) if name in entry.names)
+    return f"scenes.{number} ({name})"
+
+
+def keys_of(experiment: Experiment, selection: Selection, run: PlannedRun) -> dict[str, str]:
+    """Where the file, or the command line, says what a run is: by the name of an option, the key path and its value.
+
+    "run" is the key of the whole run, "scene" of its scene.
+    """
+    spec = run.spec
+    scene = next(i for i, entry in enumerate(experiment.scenes) if spec.scene in entry.names)
+    number = next(i for i, variant in enumerate(experiment.variants) if variant.name == run.variant)
+    variant, backbone = experiment.variants[number], experiment.backbones[spec.backbone]
+    own, its = f"variants.{number}", f"backbones.{spec.backbone}"
+    seeds: Sequence[int] = experiment.seeds if selection.seeds is None else selection.seeds
+    keys: dict[str, tuple[str, Any]] = {
+        "seed": (f"seeds.{seeds.index(spec.seed)}" if selection.seeds is None else "--seeds", spec.seed),
+        "iterations": (
+            "--iterations" if selection.iterations else f"{own}.iterations" if variant.iterations else "iterations",
+            spec.iterations,
+        ),
+        "resolution": (f"{own if variant.resolution else f'scenes.{scene}'}.resolution", spec.resolution),
+        "images": (f"scenes.{scene}.images", spec.images),
+    }
+    if spec.rasterizer is not None:
+        keys["rasterizer"] = (f"{its}.rasterizer", spec.rasterizer)
+    for name, value in spec.options.items():
+        if name in variant.options or name in backbone.options:
+            keys[name] = (f"{own if name in variant.options else its}.options.{name}", value)
+    whole = f"{own} ({json.dumps(variant.name, ensure_ascii=False)} on {spec.backbone})"
+    return {
+        "run": whole,
+        "scene": scene_key(experiment, spec.scene),
+        **{name: f"{key} = {json.dumps(value):.80}" for name, (key, value) in keys.items()},
+    }

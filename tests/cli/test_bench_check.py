@@ -1,0 +1,326 @@
+"""Experiments that cannot be run as they are: what can be known is refused before the first run, a line a mistake."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli import bench_check
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.bench_experiment import _option_names
+from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.experiments import launchers, runner
+from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.scenes.sample import make_sample_scene
+from tests.contract.stub_runs import CHECKOUTS
+
+GOOD = """
+name = "tiny"
+title = "Tiny"
+iterations = 20
+seeds = [0, 1]
+[[scenes]]
+name = "mine"
+path = "scene"
+resolution = "full"
+[backbones.cpu]
+rasterizer = "cpu"
+options = { sh_degree = 1 }
+[backbones.fast]
+checkout = "fastgs"
+arguments = ["--dense", "0.1"]
+[[variants]]
+name = "bare"
+method = "bare"
+backbones = ["cpu"]
+[[variants]]
+name = "both"
+options = { levels = 2 }
+[[variants]]
+name = "ours"
+backbones = ["cpu"]
+options = { densify_every = 50 }
+[[variants]]
+name = "theirs"
+backbones = ["fast"]
+options = { fused_adam = false }
+"""
+SAMPLE = 'sample = { size = "64x48", views = 8, points = 100 }'
+PATH = 'path = "scene"'
+OURS = "densify_every = 50"
+THEIRS = "fused_adam = false"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene of 48x32 pixels."""
+    folder = tmp_path_factory.mktemp("experiments")
+    make_sample_scene(folder / "scene", width=48, height=32, views=10, points=100, progress=False)
+    (folder / "empty").mkdir()
+    (folder / "file").write_text("")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    for name in ("MINE", "FASTGS"):
+        monkeypatch.delenv(f"LAPGS_{name}", raising=False)
+
+    def started(*_: object) -> None:
+        raise AssertionError("something was started or written")
+
+    monkeypatch.setattr(launchers, "launch", started)
+    monkeypatch.setattr(runner, "make_samples", started)
+
+
+def lines_about(text: str, *words: str) -> list[str]:
+    """What `lapgs bench` says of an experiment that it refuses; nothing may be written."""
+    Path("tiny.toml").write_text(text)
+    before = everything()
+    paths = () if any(word.startswith("fastgs=") for word in words) else ("--path", f"fastgs={CHECKOUTS / 'fastgs'}")
+    result = CliRunner().invoke(app, ["bench", "tiny.toml", "--no-eval", "--out", "out", *paths, *words])
+    assert everything() == before
+    if isinstance(result.exception, SystemExit):  # what typer says of a value that is of no use to it
+        assert result.exit_code == 2
+        return [result.output]
+    assert isinstance(result.exception, LapgsError), result.exception
+    assert result.exception.exit_code == 2
+    return str(result.exception).split("\n")
+
+
+def everything() -> set[str]:
+    return {path.as_posix() for path in Path().rglob("*")}
+
+
+MISTAKES = [
+    ("seeds = [0, 1]", "seeds = [0, -1]", ["seeds.1 = -1", "expected 0 to 4294967295"]),
+    ("seeds = [0, 1]", "seeds = [4294967296]", ["seeds.0 = 4294967296", "expected 0 to 4294967295"]),
+    ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is there twice", "expected different seeds"]),
+    ("seeds = [0, 1]", 'seeds = ["one"]', ["seeds.0 = 'one'", "valid integer"]),
+    ("levels = 2", "levels = 0", ["variants.1.options.levels = 0"]),
+    ("levels = 2", "levels = -3", ["variants.1.options.levels = -3"]),
+    ("levels = 2", "levels = 99", ["variants.1.options.levels = 99", "would be 1x1 pixels, expected at least 16"]),
+    ("levels = 2", "levels = 1000000000", ["variants.1.options.levels = 1000000000", "expected at least 16"]),
+    ("levels = 2", "levels = 3", ["variants.1.options.levels = 3", "12x8 pixels, expected at least 16"]),
+    ("levels = 2", 'levels = "two"', ['variants.1.options.levels = "two"', "valid integer"]),
+    ("levels = 2", "levels = 2.5", ["variants.1.options.levels = 2.5", "valid integer"]),
+    ("levels = 2", "levels = true", ["variants.1.options.levels = true", "expected a number or text"]),
+    ("levels = 2", "levels = false", ["variants.1.options.levels = false", "expected a number or text"]),
+    ("levels = 2", "levels = [2]", ["variants.1.options.levels = [2]", "valid integer"]),
+    ("levels = 2", 'hierarchy = "flat"', ['variants.1.options.hierarchy = "flat"', "expected nested or laplacian"]),
+    ("levels = 2", 'split = "1/3,1/3,1/3"', ['options.split = "1/3,1/3,1/3"', "has 3 shares, expected 2"]),
+    ("levels = 2", 'split = "1/3,1/3"', ['options.split = "1/3,1/3"', "positive shares that sum to 1"]),
+    ("levels = 2", 'split = "half,half"', ['options.split = "half,half"', "expected fractions"]),
+    ("levels = 2", 'split = "0.001,0.999"', ["iterations = 20", "level 1 would train for 0 iterations"]),
+    ("levels = 2", 'grid = "odd"', ['variants.1.options.grid = "odd"', "expected"]),
+    ("levels = 2", "prune = 1.0", ["variants.1.options.prune = 1.0", "to below 1"]),
+    ("levels = 2", "prune = nan", ["variants.1.options.prune = NaN", "to below 1"]),
+    ("levels = 2", "coarse_threshold = inf", ["options.coarse_threshold = Infinity", "expected a positive factor"]),
+    ("levels = 2", 'hierarchy = "laplacian", joint = 2.0', ["variants.1.options.joint = 2.0", "from 0 to 1"]),
+    ("levels = 2", 'hierarchy = "laplacian", inherit = "xyz:7"', ['options.inherit = "xyz:7"', "expected a ratio"]),
+    ("levels = 2", r'split = "a\nb\u001b[31m"', [r"\n", r"\x1b", "expected fractions"]),
+    (OURS, "densify_every = 0", ["variants.2.options.densify_every = 0", "greater than or equal to 1"]),
+    (OURS, "accumulate_views = -1", ["variants.2.options.accumulate_views = -1", "expected at least 1"]),
+    (OURS, "sh_degree = 9", ["variants.2.options.sh_degree = 9", "expected 0, 1, 2 or 3"]),
+    (OURS, "threads = 100000", ["variants.2.options.threads = 100000", "1024"]),
+    (OURS, 'strategy = "best"', ['variants.2.options.strategy = "best"', "expected default or mcmc"]),
+    (OURS, 'strategy = "mcmc"', ['variants.2.options.strategy = "mcmc"', "only gsplat on a CUDA device"]),
+    (OURS, "packed = true", ["variants.2.options.packed = true", "only gsplat on a CUDA device"]),
+    (OURS, 'packed = "yes"', ['variants.2.options.packed = "yes"', "expected true or false"]),
+    (OURS, 'background = "pink"', ['variants.2.options.background = "pink"', "expected black, white or R,G,B"]),
+    (OURS, 'background = "0,0,9"', ['variants.2.options.background = "0,0,9"', "from 0 to 1"]),
+    (OURS, 'images_on = "tape"', ['variants.2.options.images_on = "tape"', "expected auto, "]),
+    (OURS, 'images_on = "gpu"', ['variants.2.options.images_on = "gpu"', "expected memory or disk"]),
+    (OURS, 'prediction_precision = "int4"', ['options.prediction_precision = "int4"', "expected auto, "]),
+    (OURS, r'images_on = "a\u0000"', [r'variants.2.options.images_on = "a\u0000"', "expected no NUL"]),
+    (THEIRS, 'fused_adam = "no"', ['variants.3.options.fused_adam = "no"', "expected true or false"]),
+    (THEIRS, 'images_on = "tape"', ['variants.3.options.images_on = "tape"', "expected auto, gpu"]),
+    (THEIRS, 'prediction_precision = "int4"', ['options.prediction_precision = "int4"', "expected auto, float32"]),
+    (THEIRS, 'backbone = "slow"', ['variants.3.options.backbone = "slow"', "expected fastgs"]),
+    (THEIRS, 'device = "tpu"', ['variants.3.options.device = "tpu"', "expected auto, cuda or cpu"]),
+    (THEIRS, "test_every = 0", ["variants.3.options.test_every = 0", "greater than or equal to 1"]),
+    ("sh_degree = 1", "sh_degree = -1", ["backbones.cpu.options.sh_degree = -1", "expected 0, 1, 2 or 3"]),
+    ('rasterizer = "cpu"', 'rasterizer = "gpu"', ['backbones.cpu.rasterizer = "gpu"', "expected auto, gsplat, cpu"]),
+    ('checkout = "fastgs"', 'checkout = "fast"', ["backbones.fast.checkout", "nothing says where it is"]),
+    ('"--dense"', '"-m", "elsewhere", "--dense"', ["variants.1", "arguments '-m'", "other options of the script"]),
+    ('"--dense"', '"--source_path=x", "--dense"', ["arguments '--source_path=x'", "other options of the script"]),
+    ('resolution = "full"', 'resolution = "big"', ['scenes.0.resolution = "big"', "expected 1k, 2k, 4k"]),
+    ('resolution = "full"', 'resolution = "3dgs:x"', ['scenes.0.resolution = "3dgs:x"', "expected -1, 1, 2"]),
+    ('resolution = "full"', 'resolution = "4"', ['scenes.0.resolution = "4"', "at least 16 pixels"]),
+    ('resolution = "full"', 'resolution = "1/2"', ['scenes.0.resolution = "1/2"', "12x8 pixels, expected at least 16"]),
+    ('resolution = "full"', f'images = "{"n" * 300}"', ["scenes.0 (mine)", "has no image folder nnn"]),
+    ('resolution = "full"', 'images = "photos"', ["scenes.0 (mine)", "has no image folder photos"]),
+    (PATH, 'path = "nowhere"', ["scenes.0 (mine)", "nowhere is not a folder"]),
+    (PATH, 'path = "file"', ["scenes.0 (mine)", "file is not a folder"]),
+    (PATH, 'path = "empty"', ["scenes.0 (mine)", "has no image folder images"]),
+    (PATH, f'path = "{"n" * 300}"', ["scenes.0 (mine)", "is not a folder"]),
+    (PATH, SAMPLE.replace("64x48", "big"), ["scenes.0 (mine)", "--size 'big': expected WIDTHxHEIGHT"]),
+    (PATH, SAMPLE.replace("64x48", "8x8"), ["scenes.0 (mine)", "--size 8x8: expected at least 16x16"]),
+    (PATH, SAMPLE.replace("64x48", "99999x99999"), ["scenes.0 (mine)", "expected at most 8192x8192"]),
+    (PATH, SAMPLE.replace("64x48", "20x20"), ["variants.1.options.levels = 2", "10x10 pixels"]),
+    (PATH, SAMPLE.replace("views = 8", "views = 10000"), ["scenes.0 (mine)", "--views 10000: expected 2 to 9999"]),
+    (PATH, SAMPLE.replace("views = 8", "views = -1"), ["scenes.0.sample.views = -1", "greater than or equal to 2"]),
+    (PATH, SAMPLE.replace("100", "1000000000000"), ["--points 1000000000000: expected at most 1000000"]),
+    ("iterations = 20", "iterations = -5", ["iterations = -5", "greater than or equal to 1"]),
+    ("iterations = 20", "iterations = 1e9", ["iterations = 1000000000.0", "valid integer"]),
+    ("iterations = 20", "iterations = 1", ["iterations = 1", "at least one for each of the 2 levels"]),
+    ('name = "mine"', f'name = "{"n" * 240}"', ["a run called nnnn", "expected at most 230"]),
+    ('name = "both"', 'name = "bare"', ["variants", "two variants are called 'bare'"]),
+    ('title = "Tiny"', 'title = "Tiny"\n[table]\ncolumns = ["psrn"]', ["table", "'psrn' is not known"]),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), MISTAKES, ids=[new[:40] for _, new, _ in MISTAKES])
+def test_a_mistake_is_one_line_that_names_file_key_value_and_what_was_expected(
+    old: str, new: str, expected: Sequence[str]
+) -> None:
+    assert old in GOOD
+    text = GOOD.replace(old, new, 1)
+    if "[table]" in new:
+        text = GOOD + new.partition("\n")[2]
+    lines = lines_about(text)
+    # Two commands may say it in words of their own, and of a scene it is said for each variant that cannot use it.
+    assert all(line.startswith("tiny.toml: ") and line.isprintable() for line in lines)
+    (line, *_) = [each for each in lines if all(word in each for word in expected)] or [None]
+    assert line is not None, lines
+    assert all(each.split(": ")[1] == line.split(": ")[1] or expected[-1] in each for each in lines), lines
+
+
+def test_every_mistake_is_said_once_and_all_at_once() -> None:
+    text = GOOD.replace("levels = 2", "levels = 99").replace("[0, 1]", "[0, 1, 2, -1]").replace(OURS, "cap_max = 0")
+    lines = lines_about(text.replace('checkout = "fastgs"', 'checkout = "nowhere"'))
+    keys = sorted(line.removeprefix("tiny.toml: ").split(": ")[0] for line in lines)
+    assert keys == [
+        "backbones.fast.checkout",
+        "seeds.3 = -1",
+        "variants.1.options.levels = 99",
+        "variants.2.options.cap_max = 0",
+    ]
+
+
+def test_mistakes_of_the_file_itself_are_all_said_at_once() -> None:
+    text = GOOD.replace("iterations = 20", "iterations = 0\ncolour = 1").replace('method = "bare"', 'method = "naked"')
+    assert sorted(line.split(": ")[1].split(";")[0].split(" = ")[0] for line in lines_about(text)) == [
+        "iterations",
+        "unknown key colour",
+        "variants.0.method",
+    ]
+    text = GOOD.replace("levels = 2", "levles = 2").replace(OURS, "densify_evry = 5")
+    assert [line.split(": ")[1] for line in lines_about(text)] == [
+        "variants.1.options.levles = 2",
+        "variants.2.options.densify_evry = 5",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--seeds", "-1"), "--seeds = -1: --seed -1: expected 0 to 4294967295"),
+        (("--seeds", "3,3"), "--seeds 3,3: expected different numbers"),
+        (("--seeds", ""), "--seeds : expected whole numbers"),
+        (("--iterations", "1"), "--iterations = 1: --iterations 1: expected at least one for each of the 2 levels"),
+        (("--iterations", "0"), "Invalid value for '--iterations'"),
+        (("--iterations", "nan"), "Invalid value for '--iterations'"),
+        (("--workers", "1000000"), "Invalid value for '--workers'"),
+        (("--workers", "-1"), "Invalid value for '--workers'"),
+        (("--gpus", "0,,1"), "--gpus '0,,1': expected names separated by commas"),
+        (("--launcher", "cloud"), "--launcher cloud: expected local, slurm, ray"),
+        (("--launcher", "slurm", "--gpus", "0"), "--gpus 0: slurm deals out GPUs itself"),
+        (("--launcher-option", "partition=gpu"), "--launcher-option partition: the local launcher has none"),
+        (("--path", "fastgs=empty"), "backbones.fast.checkout: checkout fastgs: "),
+        (("--path", "fastgs=file"), "file is not a folder"),
+        (("--path", "fastgs=nowhere"), "nowhere is not a folder"),
+        (("--path", "mine=empty"), "scenes.0 (mine): scene mine: "),
+        (("--path", "mine=~nobody-of-that-name/x"), "--path mine=~nobody-of-that-name/x: no such user"),
+        (("--out", "file"), "--out file: "),
+        (("--out", "file/below"), "is a file; expected a folder"),
+        (("--out", "n" * 300), "a name of more than 255 bytes"),
+        (("--eval", "--lpips-weights", "nowhere.pth"), "--lpips-weights nowhere.pth: no such file"),
+        (("--eval", "--lpips-weights", "empty"), "--lpips-weights empty: no such file"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_found_before_anything_is_written(
+    words: tuple[str, ...], expected: str
+) -> None:
+    (line,) = lines_about(GOOD, *words)
+    assert expected in re.sub(r"[\s│]+", " ", line)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("num_cpus", "0"), ("num_cpus", "-1"), ("num_gpus", "many"), ("num_gpus", "nan")]
+)
+def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launchers, "find_spec", lambda name: object())
+    (line,) = lines_about(GOOD, "--launcher", "ray", "--launcher-option", f"{name}={value}")
+    assert line.startswith(f"--launcher-option {name}={value}: expected a number of a worker")
+
+
+def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A login node has no GPU, and commands are printed anywhere."""
+    text = GOOD.replace('rasterizer = "cpu"', 'rasterizer = "gsplat"').replace(THEIRS, 'device = "cuda"')
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    refused = lines_about(text)
+    assert sorted(line.split(": ")[1] for line in refused) == [
+        'backbones.cpu.rasterizer = "gsplat"',
+        'variants.3.options.device = "cuda"',
+    ]
+    Path("tiny.toml").write_text(text)
+    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
+    assert result.stdout.count("\n# ") + 1 == 10, "two seeds of five runs"
+
+
+def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is left out on the way, but where a run elsewhere renders."""
+    checked = []
+    real = bench_check._rehearse
+
+    def noting(job: object, check: object) -> None:
+        checked.append(job)
+        real(job, check)  # type: ignore[arg-type]  # passed through
+
+    monkeypatch.setattr(bench_check, "_rehearse", noting)
+    Path("tiny.toml").write_text(GOOD)
+    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
+    printed = CliRunner().invoke(app, words).stdout
+    assert len(checked) == 10
+    assert [line[2:] for line in printed.splitlines() if line.startswith("# ")] == [job.run_id for job in checked]
+
+
+def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a scene in place of the data sets', large enough for its levels."""
+    scene = place / "scene"
+    monkeypatch.setattr(bench_check._SceneSizes, "__call__", lambda self, resolution: (1600, 1066))
+    for path in sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml")):
+        experiment = load_experiment(path, _option_names())
+        names = {name for entry in experiment.scenes for name in entry.names}
+        for name in names:
+            link = place / "links" / name
+            link.parent.mkdir(exist_ok=True)
+            if not link.exists():
+                link.symlink_to(scene)
+        paths = [f"{name}={place / 'links' / name}" for name in names]
+        paths += [f"{name}={CHECKOUTS / name}" for name in ("fastgs", "taming", "graphdeco")]
+        words = ["bench", str(path), "--dry-run", "--no-eval", *(word for p in paths for word in ("--path", p))]
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, (path.name, str(result.exception))
+
+
+def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(place: Path) -> None:
+    """A script has its own way to read scenes."""
+    model = place / "scene" / "sparse" / "0" / "points3D.bin"
+    whole = model.read_bytes()
+    model.write_bytes(whole[:50])
+    try:
+        lines = lines_about(GOOD)
+    finally:
+        model.write_bytes(whole)
+    assert len(lines) == 1
+    assert lines[0].startswith("tiny.toml: scenes.0 (mine): ")
+    assert "points3D" in lines[0]
