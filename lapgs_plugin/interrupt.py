@@ -52,7 +52,7 @@ class _Interruption:
         number: the first signal; None before.
         installed: whether this process ends as described above.
         in_command: whether there may be something to clean up.
-        raised: whether `Interrupted` was raised.
+        raised: whether `Interrupted` was raised, or is still to be.
     """
 
     def __init__(self) -> None:
@@ -95,9 +95,15 @@ class _Interruption:
 
     def come_back(self, seconds: float) -> None:
         """Act again after so many seconds."""
+        self.raised = True
         if hasattr(signal, "setitimer"):  # not on Windows
             signal.signal(signal.SIGALRM, lambda _, frame: self.act(frame))
             signal.setitimer(signal.ITIMER_REAL, seconds)
+
+    def cancel(self) -> None:
+        """Do not act again."""
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def say(self) -> None:
         """Write the line, once. Written without Python's streams, which the signal may have interrupted."""
@@ -133,8 +139,8 @@ def install() -> None:
     atexit.register(_ignore_signals)
     sys.unraisablehook = _unraisable
     if hasattr(signal, "pthread_sigmask"):
-        ExtensionFileLoader.create_module = _holding(ExtensionFileLoader.create_module)  # type: ignore[method-assign]
-        ExtensionFileLoader.exec_module = _holding(ExtensionFileLoader.exec_module)  # type: ignore[method-assign]
+        for name in ("create_module", "exec_module"):
+            setattr(ExtensionFileLoader, name, _holding(getattr(ExtensionFileLoader, name)))
 
 
 @contextmanager
@@ -158,6 +164,10 @@ def command() -> Iterator[None]:
         sys.exit(_interruption.exit_code)
     finally:
         _interruption.in_command = False
+        _interruption.cancel()
+    if _interruption.raised:  # it was over before it could be interrupted, or went on all the same
+        _interruption.say()
+        sys.exit(_interruption.exit_code)
 
 
 def exit_code(code: int) -> int:
@@ -211,7 +221,7 @@ def stop_request() -> Iterator[StopRequest]:
             raise KeyboardInterrupt
         before(number, frame)
 
-    previous = {number: signal.signal(number, ask) for number in SIGNALS}
+    previous: dict[int, Any] = {number: signal.signal(number, ask) for number in SIGNALS}
     try:
         yield request
     finally:
@@ -243,8 +253,8 @@ def _unraisable(unraisable: Any) -> None:
 def _holding(load: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Let signals wait while a compiled module is loaded, and put our handlers back in their place.
 
-    Modules call Python from C++ while they are loaded, which must not raise; the threads they start leave signals to
-    the main thread; and pycolmap installs a handler of SIGTERM that prints a C++ stack.
+    Modules call Python from C++ while they are loaded, where raising aborts the process (OpenImageIO does); the threads
+    they start leave signals to the main thread; and pycolmap installs a handler of SIGTERM that prints a C++ stack.
     """
 
     def held(self: Any, argument: Any) -> Any:

@@ -164,6 +164,70 @@ def test_a_second_ctrl_c_ends_as_the_first(delay: float, gap: float, scene: Path
     assert ended.clean, ended.text
 
 
+# OpenImageIO makes its enumerations by Python's `enum`, from C++ that aborts the process when that raises.
+WHILE_LOADING = """
+import os, signal, sys
+from lapgs_plugin.training import interrupt
+signal.signal(signal.SIGINT, signal.default_int_handler)
+interrupt.install()
+
+def press(frame, event, argument):
+    if event == "call" and frame.f_back and frame.f_back.f_code.co_name == "_call_with_frames_removed":
+        if frame.f_code.co_filename.endswith("enum.py"):
+            sys.setprofile(None)
+            os.kill(os.getpid(), signal.{signal})
+
+import enum, numpy
+with interrupt.command():
+    sys.setprofile(press)
+    import OpenImageIO
+"""
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_compiled_module_is_loaded(which: signal.Signals) -> None:
+    code = WHILE_LOADING.format(signal=which.name)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == CODES[which], done.stderr
+    name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[which]
+    assert done.stderr == f"lapgs: stopped by {name}\n"
+
+
+AFTER_PYCOLMAP = """
+import os, signal
+from lapgs_plugin.training import interrupt
+interrupt.install()
+with interrupt.command():
+    import pycolmap
+    os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+def test_pycolmap_does_not_keep_its_handler_of_sigterm() -> None:
+    done = subprocess.run([sys.executable, "-c", AFTER_PYCOLMAP], capture_output=True, text=True, check=False)
+    assert done.returncode == 143
+    assert done.stderr == "lapgs: stopped by SIGTERM\n"
+
+
+LOST = """
+import ctypes, os, signal, time
+from lapgs_plugin.training import interrupt
+interrupt.install()
+press = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(0.01))
+with interrupt.command():
+    press()  # ctypes cannot pass on what is raised in a callback
+    time.sleep(30)
+"""
+
+
+def test_an_interruption_that_a_callback_loses_is_raised_again() -> None:
+    begin = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, check=False)
+    assert time.monotonic() - begin < 25
+    assert done.returncode == 143
+    assert done.stderr == "lapgs: stopped by SIGTERM\n"
+
+
 CAMPAIGN = 150
 
 
