@@ -167,7 +167,7 @@ def test_a_second_ctrl_c_ends_as_the_first(delay: float, gap: float, scene: Path
 # OpenImageIO makes its enumerations by Python's `enum`, from C++ that aborts the process when that raises.
 WHILE_LOADING = """
 import os, signal, sys
-from lapgs_plugin.training import interrupt
+from lapgs_plugin import interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 interrupt.install()
 
@@ -195,7 +195,7 @@ def test_a_signal_while_a_compiled_module_is_loaded(which: signal.Signals) -> No
 
 AFTER_PYCOLMAP = """
 import os, signal
-from lapgs_plugin.training import interrupt
+from lapgs_plugin import interrupt
 interrupt.install()
 with interrupt.command():
     import pycolmap
@@ -211,7 +211,7 @@ def test_pycolmap_does_not_keep_its_handler_of_sigterm() -> None:
 
 LOST = """
 import ctypes, os, signal, time
-from lapgs_plugin.training import interrupt
+from lapgs_plugin import interrupt
 interrupt.install()
 press = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(0.01))
 with interrupt.command():
