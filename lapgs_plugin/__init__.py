@@ -10,16 +10,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
-    from lapgs_plugin.camera import Camera, level_intrinsics
-    from lapgs_plugin.field import GaussianField
-    from lapgs_plugin.imagestore import ImageStore
-    from lapgs_plugin.inheritance import field_from_points, inherit
-    from lapgs_plugin.plan import Stage, StagePlan, level_size
-    from lapgs_plugin.pyramid import Pyramid
-    from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
-    from lapgs_plugin.splats import field_from_splats, splats_from_field
-    from lapgs_plugin.supervision import photometric_loss
+    from lapgs_plugin.fields.camera import Camera
+    from lapgs_plugin.fields.gaussian_field import GaussianField
+    from lapgs_plugin.fields.splats import field_from_splats, splats_from_field
+    from lapgs_plugin.hierarchy.cameras import level_camera, level_intrinsics
+    from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
+    from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
+    from lapgs_plugin.hierarchy.pyramid import Pyramid
+    from lapgs_plugin.ops.photometric_loss import photometric_loss
+    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
+    from lapgs_plugin.runs.image_store import ImageStore
 
 __version__ = "0.1.0"
 

@@ -401,8 +401,8 @@ def _probe_rasterizer() -> dict[str, Any]:
     import numba
     from numba.core.dispatcher import Dispatcher
 
-    from lapgs_plugin.reference_raster import loss
-    from lapgs_plugin.reference_raster.threads import num_threads
+    from lapgs_plugin.jit.threads import num_threads
+    from lapgs_plugin.ops.photometric_loss import in_numba as loss
 
     folders = [value.stats.cache_path for value in vars(loss).values() if isinstance(value, Dispatcher)]
     return {

@@ -20,8 +20,10 @@ from importlib.metadata import entry_points
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.supervision import DEFAULT_SSIM_WEIGHT, Supervision, photometric_loss, supervised_pair
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.supervision import Supervision, supervised_pair
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
 
 ENTRY_POINT_GROUP = "lapgs_plugin.hooks"
 """Entry point group whose members are StageHook classes, created without arguments for every run."""

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.plan import Stage
 
 
 class Killed(BaseException):

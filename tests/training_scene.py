@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.scenes.scene import Scene, View
 

@@ -20,12 +20,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from lapgs_plugin.adapters.attachment import Replacement
-from lapgs_plugin.adapters.level_views import make_level_view
-from lapgs_plugin.adapters.script import Script
+from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.level_views import make_level_view
+from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Hierarchy, Stage, goes_on, nested_densify_until
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, goes_on, nested_densify_until
 
 logger = logging.getLogger(__name__)
 

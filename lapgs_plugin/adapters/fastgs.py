@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.attachment import Replacement
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.checkouts.attachment import Replacement
 
 LATE_PRUNING_FROM, LATE_PRUNING_EVERY = 1 / 2, 1 / 10
 """When FastGS prunes late, as shares of the iterations: hard-coded there for 30,000."""

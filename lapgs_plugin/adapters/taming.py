@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.attachment import Replacement
 from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import Hierarchy
+from lapgs_plugin.hierarchy.plan import Hierarchy
 
 logger = logging.getLogger(__name__)
 

@@ -62,9 +62,9 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     """What can run on this machine, by the name to ask for it; each entry makes what is checked under that name."""
     import torch
 
-    from lapgs_plugin.adapters import gsplat
-    from lapgs_plugin.adapters.extensions import installed_extensions
     from lapgs_plugin.evaluation.conformance import Subject
+    from lapgs_plugin.rasterizers import gsplat
+    from lapgs_plugin.rasterizers.extensions import installed_extensions
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 
     found: dict[str, Callable[[], list[Subject]]] = {
@@ -86,9 +86,9 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
 
 def _extension_subjects(name: str) -> list[Subject]:
     """An extension on the path it takes by itself and, where that is the native one, on the other too."""
-    from lapgs_plugin.adapters.extensions import CudaExtension
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.signed_color import ColorPath, SignedColorRasterizer
+    from lapgs_plugin.rasterizers.extensions import CudaExtension
+    from lapgs_plugin.rasterizers.signed_color import ColorPath, SignedColorRasterizer
 
     extension = CudaExtension(name)
     paths = dict.fromkeys([SignedColorRasterizer(extension).path, ColorPath.PRECOMPUTED])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from lapgs_plugin.adapters.known import KnownCheckout
+    from lapgs_plugin.adapters.registry import KnownCheckout
     from lapgs_plugin.environment import Finding, Probe
 
 IMPORTED = ("OpenImageIO", "pycolmap")
@@ -46,7 +46,7 @@ def examine() -> dict[str, list[Finding]]:
     from pathlib import Path
 
     from lapgs_plugin import environment
-    from lapgs_plugin.adapters.known import KNOWN_EXTENSIONS, recognise_checkout
+    from lapgs_plugin.adapters.registry import KNOWN_EXTENSIONS, recognise_checkout
 
     requirements = environment.own_requirements()
     with ThreadPoolExecutor() as pool:

@@ -74,9 +74,9 @@ def evaluate(
         _stability(run, baseline, trajectory, frames, scene, device, rasterizer)
         return
     refuse({"--baseline": baseline, "--frames": frames}, "needs --trajectory")
-    from lapgs_plugin.archive import METRICS, RunArchive
     from lapgs_plugin.evaluation.figures import evaluate_run
     from lapgs_plugin.evaluation.lpips import LpipsRequest
+    from lapgs_plugin.runs.archive import METRICS, RunArchive
 
     wanted = LpipsRequest.parse(lpips, lpips_weights or ())
     archive = RunArchive.open(run)
@@ -100,9 +100,9 @@ def _stability(
     from rich.console import Console
     from rich.table import Table
 
-    from lapgs_plugin.archive import STABILITY, RunArchive
     from lapgs_plugin.evaluation.stability import evaluate_stability
     from lapgs_plugin.rendering.paths import path_cameras
+    from lapgs_plugin.runs.archive import STABILITY, RunArchive
 
     archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)
     show_log()

@@ -10,7 +10,7 @@ import typer
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
-    from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
 
 FORMATS = ("ply", "spz")
 
@@ -37,9 +37,9 @@ def export(
 
         lapgs export runs/garden --level 1 --out /tmp/base
     """
-    from lapgs_plugin.archive import EXPORT, RunArchive
+    from lapgs_plugin.fields.spz import save_spz
     from lapgs_plugin.files import one_line_errors
-    from lapgs_plugin.spz import save_spz
+    from lapgs_plugin.runs.archive import EXPORT, RunArchive
 
     if file_format not in FORMATS:
         raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")

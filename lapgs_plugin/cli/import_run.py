@@ -47,8 +47,8 @@ def import_run(
 
         lapgs import-run output/garden -o runs/garden -s /data/garden --backbone taming
     """
-    from lapgs_plugin.adapters.imported import import_run as make_run
-    from lapgs_plugin.adapters.imported import read_foreign_run
+    from lapgs_plugin.runner.imported import import_run as make_run
+    from lapgs_plugin.runner.imported import read_foreign_run
 
     run = read_foreign_run(folder, iteration)
     target = folder / "lapgs" if out is None else out

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lapgs_plugin.plan import Hierarchy, parse_hierarchy, require_no_residuals
+from lapgs_plugin.hierarchy.plan import Hierarchy, parse_hierarchy, require_no_residuals
 
 HIERARCHY = "Hierarchy"
 """Title of the options about levels."""

@@ -13,7 +13,7 @@ from lapgs_plugin.errors import UserInputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lapgs_plugin.camera import Camera
+    from lapgs_plugin.fields.camera import Camera
     from lapgs_plugin.rendering.compose import HierarchyRenderer
     from lapgs_plugin.scenes import Scene, View
 
@@ -105,10 +105,10 @@ def render(
         refuse({"--size": None if fps else size}, "needs --trajectory or --fps")
     else:
         refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
-    from lapgs_plugin.archive import RENDERS, RunArchive
-    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.rendering.paths import path_cameras
     from lapgs_plugin.rendering.run import run_renderer, run_scene
+    from lapgs_plugin.runs.archive import RENDERS, RunArchive
 
     _require_one_of("--views", views, (None, *SPLITS))
     _require_one_of("--format", image_format, FORMATS)

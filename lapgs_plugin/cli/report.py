@@ -13,7 +13,7 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lapgs_plugin.evaluation.report import MeasuredRun
+    from lapgs_plugin.reports.report import MeasuredRun
 
 
 def report(
@@ -39,10 +39,10 @@ def report(
     between them. Runs that were not measured yet are measured first, as `lapgs eval` does. Of an experiment the page
     holds the tables and every scene, as far as its runs are still there.
     """
-    from lapgs_plugin.archive import RunArchive
     from lapgs_plugin.evaluation.figures import run_metrics
-    from lapgs_plugin.evaluation.report import MeasuredRun, write_report
     from lapgs_plugin.experiments.exports import CSV
+    from lapgs_plugin.reports.report import MeasuredRun, write_report
+    from lapgs_plugin.runs.archive import RunArchive
 
     run = run or _newest(Path("runs"))
     if (run / CSV).is_file():
@@ -91,7 +91,7 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from lapgs_plugin.evaluation.comparison import comparison_rows, unlike
+    from lapgs_plugin.reports.comparison import comparison_rows, unlike
 
     names = [escape(each.archive.path().name) for each in runs]
     table = Table("", *names, *(["change"] if len(runs) > 1 else []), box=box.SIMPLE_HEAD)

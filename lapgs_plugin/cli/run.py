@@ -20,7 +20,7 @@ from lapgs_plugin.cli.options import (
 )
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import DEFAULT_HIERARCHY, JOINT_SHARE, NESTED_COARSE_THRESHOLD, RESIDUAL_COLOR_RATE
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, JOINT_SHARE, NESTED_COARSE_THRESHOLD, RESIDUAL_COLOR_RATE
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
@@ -172,18 +172,18 @@ def run(
 
     import torch
 
-    from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
-    from lapgs_plugin.adapters.driver import HierarchyDriver
-    from lapgs_plugin.adapters.installed_rasterizer import explained
-    from lapgs_plugin.adapters.known import adapter_class
-    from lapgs_plugin.adapters.run_state import HierarchyOptions
-    from lapgs_plugin.adapters.script import loaded_script, require_script
-    from lapgs_plugin.adapters.witness import Witness
-    from lapgs_plugin.inheritance import parse_inheritance
+    from lapgs_plugin.adapters.registry import adapter_class
+    from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+    from lapgs_plugin.checkouts.script import loaded_script, require_script
+    from lapgs_plugin.hierarchy.inheritance import parse_inheritance
+    from lapgs_plugin.runner.driver import HierarchyDriver
+    from lapgs_plugin.runner.installed_rasterizer import explained
+    from lapgs_plugin.runner.recording import BareRunRecorder
+    from lapgs_plugin.runner.run_state import HierarchyOptions
 
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
-    logging.getLogger("lapgs_plugin.adapters.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
+    logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(
@@ -225,7 +225,7 @@ def run(
     try:
         with on_device, loaded_script(script, words) as loaded:
             if off and record:
-                Witness(kind(loaded), chosen).run()
+                BareRunRecorder(kind(loaded), chosen).run()
                 return
             if off:
                 loaded.run_main()

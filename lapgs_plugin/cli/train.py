@@ -22,15 +22,15 @@ from lapgs_plugin.cli.options import (
 )
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import DEFAULT_HIERARCHY, NESTED_COARSE_THRESHOLD
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, NESTED_COARSE_THRESHOLD
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lapgs_plugin.archive import RunArchive, SceneReference
+    from lapgs_plugin.runs.archive import RunArchive, SceneReference
+    from lapgs_plugin.runs.watching import Watcher
     from lapgs_plugin.scenes import Scene
     from lapgs_plugin.training.settings import TrainSettings
-    from lapgs_plugin.watching import Watcher
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
@@ -221,8 +221,8 @@ def train(
     from rich.console import Console
     from rich.markup import escape
 
-    from lapgs_plugin.archive import SceneReference
-    from lapgs_plugin.inheritance import parse_inheritance
+    from lapgs_plugin.hierarchy.inheritance import parse_inheritance
+    from lapgs_plugin.runs.archive import SceneReference
     from lapgs_plugin.training.backend import ANTIALIASING, AUTO, choose_rasterizer
     from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, TrainSettings
 
@@ -347,8 +347,8 @@ def _resume(
     Returns:
         The run, its scene, and its settings, of which `anew` gives those that may change.
     """
-    from lapgs_plugin.archive import RunArchive
     from lapgs_plugin.rendering.run import require_same_scene
+    from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.settings import TrainSettings
     from lapgs_plugin.training.trainer import check_cache
@@ -397,7 +397,7 @@ def _create(
     out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
 ) -> tuple[RunArchive, Scene]:
     """Read the scene, check that it can be trained as asked, and only then make the run folder."""
-    from lapgs_plugin.archive import Manifest, RunArchive
+    from lapgs_plugin.runs.archive import Manifest, RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.trainer import check_cache, make_plan
 
@@ -429,7 +429,7 @@ def _run(
     """Train with a progress display."""
     import torch
 
-    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import ProgressMonitor
     from lapgs_plugin.training.trainer import Trainer

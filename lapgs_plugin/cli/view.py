@@ -53,7 +53,7 @@ def view(
 
     # A browser loads the page while this process imports what draws.
     with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run.absolute())) as page:
-        from lapgs_plugin.reference_raster.threads import one_pool
+        from lapgs_plugin.jit.threads import one_pool
 
         show_log()
         with one_pool():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
-from lapgs_plugin.watching import Watcher
+from lapgs_plugin.runs.watching import Watcher
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -88,7 +88,7 @@ def keep_preview(run: Path, device: str = "auto") -> None:
         run: its folder.
         device: where to render.
     """
-    from lapgs_plugin.reference_raster.threads import one_pool
+    from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.viewer.preview import keep_preview_of
 
     with one_pool():

@@ -23,9 +23,9 @@ import torch
 from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
 
 TILE = 16
 NEAR_DEPTH = 0.2
@@ -35,7 +35,7 @@ MIN_TRANSMITTANCE = 1e-4
 
 
 class GsplatTorchRasterizer:
-    """gsplat's `_torch_impl` behind `lapgs_plugin.raster.Rasterizer`; unsigned fields in float32 on the CPU only.
+    """gsplat's `_torch_impl` behind `lapgs_plugin.fields.rasterizer.Rasterizer`; unsigned fields in float32 on the CPU only.
 
     Attributes:
         tile_loop_seconds: what the last call spent in gsplat's listing of tiles, a Python loop over Gaussians.
@@ -51,7 +51,7 @@ class GsplatTorchRasterizer:
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """Render `field`; see `lapgs_plugin.raster.Rasterizer`."""
+        """Render `field`; see `lapgs_plugin.fields.rasterizer.Rasterizer`."""
         assert not field.signed
         degree = field.sh_degree if sh_degree is None else sh_degree
         size = camera.width, camera.height

@@ -27,12 +27,12 @@ from torch import Tensor
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer, pipeline
-from lapgs_plugin.reference_raster.adam import FieldAdam
-from lapgs_plugin.reference_raster.loss import photometric_loss_cpu
-from lapgs_plugin.reference_raster.threads import one_pool
-from lapgs_plugin.supervision import photometric_loss_torch
 
 FAST, ORACLE, GSPLAT = "cpu", "oracle", "gsplat"
 """Names of the contenders: the fast rasterizer with our loss and Adam; the others with PyTorch's."""

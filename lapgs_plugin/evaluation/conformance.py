@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, pixel_weights, random_case
-from lapgs_plugin.raster import Rasterizer, RenderResult, Semantics, render_transmittance
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, render_transmittance
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from lapgs_plugin import supervision
+from lapgs_plugin.hierarchy import supervision
 
 SMALLEST_MSE = 1e-10
 """Mean squared errors below this, which float32 images hardly resolve, count as this: no PSNR is above 100 dB."""
@@ -34,7 +34,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
     """
     image, target = image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)
     if image.device.type == "cpu":
-        from lapgs_plugin.reference_raster.loss import ssim_cpu
+        from lapgs_plugin.ops.photometric_loss.in_numba import ssim_cpu
 
         return float(ssim_cpu(image, target))
     return float(supervision.ssim(image, target))

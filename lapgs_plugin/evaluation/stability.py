@@ -16,16 +16,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import require_complete
 from lapgs_plugin.evaluation.metrics import SMALLEST_MSE
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.depth import DepthImage, render_depth
 from lapgs_plugin.rendering.run import run_renderer
+from lapgs_plugin.runs.archive import RunArchive
 
 SAME_DEPTH = 0.01
 """Two depths of one surface differ by less than this share of them; more is something in front of it."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lapgs_plugin.archive import LevelRecord
+from lapgs_plugin.runs.archive import LevelRecord
 
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.adapters.known import recognise_checkout
+from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, BACKBONE_PREFIX, parse_resolution

@@ -13,7 +13,7 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.schema import Backbone, Experiment, SampleScene, Scenes, Variant, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
-from lapgs_plugin.plan import DEFAULT_HIERARCHY
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
 
 
 @dataclass(frozen=True)

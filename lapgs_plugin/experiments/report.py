@@ -13,12 +13,14 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
-from lapgs_plugin.archive import REPORT, RunArchive
-from lapgs_plugin.breakdown import PARTS
 from lapgs_plugin.errors import LapgsError, RunFolderError
-from lapgs_plugin.evaluation.charts import Bar, BarChart, Chart, Move, draw_bars, draw_moves
-from lapgs_plugin.evaluation.pictures import Strip
-from lapgs_plugin.evaluation.report import (
+from lapgs_plugin.experiments.commands import IMPORTED
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
+from lapgs_plugin.experiments.runner import RUNS
+from lapgs_plugin.rendering.run import run_renderer
+from lapgs_plugin.reports.charts import Bar, BarChart, Chart, Move, draw_bars, draw_moves
+from lapgs_plugin.reports.pictures import Strip
+from lapgs_plugin.reports.report import (
     MeasuredRun,
     ViewRow,
     count_text,
@@ -29,10 +31,8 @@ from lapgs_plugin.evaluation.report import (
     view_table,
     write_page,
 )
-from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
-from lapgs_plugin.experiments.runner import RUNS
-from lapgs_plugin.rendering.run import run_renderer
+from lapgs_plugin.runs.archive import REPORT, RunArchive
+from lapgs_plugin.runs.breakdown import PARTS
 
 TEMPLATE = "experiment.html.jinja"
 COLORS = 8

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
-from lapgs_plugin.plan import DEFAULT_HIERARCHY, Hierarchy
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, Hierarchy
 
 if sys.version_info >= (3, 11):
     import tomllib

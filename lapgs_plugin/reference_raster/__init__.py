@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 

@@ -1,4 +1,4 @@
-"""The fast CPU rasterizer: compiled kernels behind `lapgs_plugin.raster.Rasterizer`, with their own backward pass."""
+"""The fast CPU rasterizer: compiled kernels behind `lapgs_plugin.fields.rasterizer.Rasterizer`, with their own backward pass."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.jit.buffers import empty
+from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster import pipeline
-from lapgs_plugin.reference_raster.buffers import empty
-from lapgs_plugin.reference_raster.lanes import Floats
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
 
 
@@ -38,7 +38,7 @@ class CpuRasterizer:
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
+        """Render `field`; see `lapgs_plugin.fields.rasterizer.Rasterizer`.
 
         Args:
             field: float32 or float64, on the CPU.
@@ -70,7 +70,7 @@ class CpuRasterizer:
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Images alone; see `lapgs_plugin.raster.ImageRasterizer`.
+        """Images alone; see `lapgs_plugin.fields.rasterizer.ImageRasterizer`.
 
         Raises:
             UserInputError: as a call.

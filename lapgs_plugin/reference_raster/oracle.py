@@ -27,11 +27,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import RenderResult
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 
 TILE = 16
 """Side of a tile in pixels."""
@@ -111,7 +111,7 @@ class OracleRasterizer:
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """Render `field`; see `lapgs_plugin.raster.Rasterizer`.
+        """Render `field`; see `lapgs_plugin.fields.rasterizer.Rasterizer`.
 
         Raises:
             UserInputError: `sh_degree` is not one the field has, or `background` is not a colour.

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.reference_raster._jit import inline, jit
-from lapgs_plugin.reference_raster.lanes import at, fetch_add, prefetch
+from lapgs_plugin.jit.compiler import inline, jit
+from lapgs_plugin.jit.lanes import at, fetch_add, prefetch
 
 DIGIT_BITS = 11
 """Bits that one round of the radix sort looks at."""

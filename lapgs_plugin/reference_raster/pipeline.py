@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_plugin.jit.buffers import empty
+from lapgs_plugin.jit.lanes import WIDTH, Floats
+from lapgs_plugin.jit.threads import num_threads, parallel
 from lapgs_plugin.reference_raster import ordering_kernels, projection_kernels, tile_kernels
-from lapgs_plugin.reference_raster.buffers import empty
-from lapgs_plugin.reference_raster.lanes import WIDTH, Floats
 from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, SLOT, SPLAT, TILE
-from lapgs_plugin.reference_raster.threads import num_threads, parallel
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def gradients(
 def make_view(
     width: int, height: int, world_to_camera: Floats, focal: tuple[float, float], principal: tuple[float, float]
 ) -> View:
-    """A view from a camera as `lapgs_plugin.camera.Camera` describes one.
+    """A view from a camera as `lapgs_plugin.fields.camera.Camera` describes one.
 
     Args:
         world_to_camera: (4, 4), in the Gaussians' float type.

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.reference_raster._jit import inline, jit
-from lapgs_plugin.reference_raster.lanes import (
+from lapgs_plugin.jit.compiler import inline, jit
+from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
     Lanes,

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from lapgs_plugin.reference_raster._jit import inline
-from lapgs_plugin.reference_raster.lanes import (
+from lapgs_plugin.jit.compiler import inline
+from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
     Lanes,

@@ -29,8 +29,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import sh_basis
 from lapgs_plugin.reference_raster.oracle import (
     JACOBIAN_LIMIT,
     MAX_ALPHA,
@@ -47,7 +48,6 @@ from lapgs_plugin.reference_raster.oracle import (
     tile_rectangles,
     world_covariances,
 )
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_basis
 
 ROUNDINGS = 8
 """Default tolerance in units of the float type's epsilon: the longest dot products of the projection."""

@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.images import around_grey

@@ -11,15 +11,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import Manifest, RunArchive
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import level_size
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
-from lapgs_plugin.rendering.raising import add_raised
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample import upsample_add
+from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.runs.archive import Manifest, RunArchive
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
@@ -117,7 +117,7 @@ class HierarchyRenderer:
     clamped: bool = False
     concurrent: bool = True
     at_once: int = AT_ONCE_PIXELS
-    residence: Residence | None = None
+    residence: FieldOffload | None = None
 
     def __post_init__(self) -> None:
         given = sorted(self.fields, reverse=True)
@@ -166,7 +166,7 @@ class HierarchyRenderer:
                 fields[level] = archive.field(level)
             except RunFolderError as error:
                 raise _with_what_is_left(error, list(fields)) from error
-        return cls.of(manifest, fields, rasterizer, Residence(torch.device(device), keep))
+        return cls.of(manifest, fields, rasterizer, FieldOffload(torch.device(device), keep))
 
     @classmethod
     def of(
@@ -174,7 +174,7 @@ class HierarchyRenderer:
         manifest: Manifest,
         fields: Mapping[int, GaussianField],
         rasterizer: Rasterizer,
-        residence: Residence | None = None,
+        residence: FieldOffload | None = None,
     ) -> HierarchyRenderer:
         """A renderer of these fields of a run, where they are, or with a `residence` where that brings them."""
         return cls(
@@ -327,12 +327,14 @@ class HierarchyRenderer:
                 composed[each] = _times(base_gain, images)
             elif not nested:
                 residuals[each] = images
-                composed[each] = add_raised(self.pyramid, composed[each + 1], images)
+                composed[each] = upsample_add(self.pyramid, composed[each + 1], images)
             else:
                 assert coarser is not None, "the first level was another one"
                 adds = images - self.pyramid.up(coarser, (images.shape[-2], images.shape[-1]))
                 residuals[each] = _times(gains.get(each, 1.0), adds)
-                composed[each] = images if as_trained else add_raised(self.pyramid, composed[each + 1], residuals[each])
+                composed[each] = (
+                    images if as_trained else upsample_add(self.pyramid, composed[each + 1], residuals[each])
+                )
             coarser = images
         return Composition(composed[levels[0]], residuals, composed)
 

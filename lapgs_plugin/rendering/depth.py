@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.inheritance import SH_C0
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.inheritance import SH_C0
 
 SMALLEST_COVER = 1e-6
 

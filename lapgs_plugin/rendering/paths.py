@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
+from lapgs_plugin.runs.archive import RunArchive
 
 PATHS = ("orbit", "spline")
 

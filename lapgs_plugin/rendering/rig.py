@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 
 Vector = NDArray[np.float64]  # (3,)
 

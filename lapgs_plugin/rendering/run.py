@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lapgs_plugin.archive import RunArchive, SceneReference
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.plan import level_size
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.rasterizers import rasterizer_for
+from lapgs_plugin.runs.archive import RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 
 

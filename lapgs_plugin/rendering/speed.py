@@ -11,9 +11,10 @@ from statistics import median
 
 import torch
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.raster import render_images
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.rasterizer import render_images
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.rendering.compose import HierarchyRenderer
 
 ROUNDS = 5
 BATCH = 8

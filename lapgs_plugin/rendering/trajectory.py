@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
 
 MAX_KEYS = 24

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out, in_name_order
 

@@ -13,8 +13,8 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes.colmap_binary import check_whole
 from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out
 

@@ -14,8 +14,8 @@ from pathlib import Path, PurePath
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap

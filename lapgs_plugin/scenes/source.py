@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 
 HOLD_OUT_EVERY = 8
 """With evaluation every eighth view in name order is held out, starting with the first, as in 3DGS."""

@@ -11,10 +11,10 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.kernel_check import is_right
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.ops.self_check import matches_reference
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
 
@@ -33,7 +33,7 @@ class DensityControl(Protocol):
 
     state: dict[str, Any]
 
-    def looks_at(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """Whether `after_step` of that iteration wants to know more of a render than its image."""
         ...
 
@@ -43,7 +43,7 @@ class DensityControl(Protocol):
         Args:
             model: edited in place; its parameters are new tensors afterwards when something changed.
             iteration: counts from 1 within the stage.
-            result: the render, after `backward()`; it may be None where `looks_at` says so.
+            result: the render, after `backward()`; it may be None where `needs_statistics` says so.
             camera: it was rendered from.
 
         Returns:
@@ -82,13 +82,13 @@ class Densifier:
         )
         self.state: dict[str, Any] = self._strategy.initialize_state(scene_scale=extent)
 
-    def looks_at(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """See `DensityControl`."""
         return iteration < self._schedule.densify_until
 
     def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
         """See `DensityControl`."""
-        if not self.looks_at(iteration):
+        if not self.needs_statistics(iteration):
             return False
         assert result is not None, "looked at in this iteration"
         if _refines(self._schedule, iteration):
@@ -123,7 +123,7 @@ class Densifier:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
         given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
         if gradient.device.type == "cuda" and statistics_in_triton():
-            from lapgs_plugin.training.densification_triton import add_statistics
+            from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
             add_statistics(*given)
         else:
@@ -155,7 +155,7 @@ def statistics_in_triton() -> bool:
     """Whether our kernel sums up what PyTorch's operations do."""
 
     def difference() -> float:
-        from lapgs_plugin.training.densification_triton import add_statistics
+        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
         gradient = torch.linspace(-1, 1, 600, device="cuda").view(300, 2)
         radii = torch.arange(300, dtype=torch.int32, device="cuda") % 3
@@ -164,7 +164,9 @@ def statistics_in_triton() -> bool:
             add(gradient, radii, (8, 6), both[0], both[1])
         return float((sums[0] - sums[1]).abs().max())
 
-    return is_right("statistics of densification in several operations instead of one kernel", difference, 1e-5)
+    return matches_reference(
+        "statistics of densification in several operations instead of one kernel", difference, 1e-5
+    )
 
 
 class McmcDensifier:
@@ -189,7 +191,7 @@ class McmcDensifier:
         )
         self.state: dict[str, Any] = self._strategy.initialize_state()
 
-    def looks_at(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """Never: it goes by opacities."""
         return False
 

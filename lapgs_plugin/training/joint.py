@@ -12,12 +12,12 @@ from typing import Any
 
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer, render_image
-from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.raising import add_raised, raised
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.training.model import TrainableField
 
 
@@ -46,10 +46,10 @@ class JointFields:
             camera = level_camera(self.cameras[name], level)
             background = self.background.new_zeros(3) if model.signed else self.background
             image = render_image(self.rasterizer, model.field, camera, background)
-            composed = image if composed is None else add_raised(self.pyramid, composed, image)
+            composed = image if composed is None else upsample_add(self.pyramid, composed, image)
         assert composed is not None
         camera = level_camera(self.cameras[name], min(self.models) - 1)
-        return raised(self.pyramid, composed, (camera.height, camera.width))
+        return upsample(self.pyramid, composed, (camera.height, camera.width))
 
     def step(self, means_rate: float) -> None:
         """One Adam step on every field, after backward passes through what `predict` gave.

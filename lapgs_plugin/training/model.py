@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.reference_raster.adam import FieldAdam
-from lapgs_plugin.splats import SPLAT_NAMES, field_from_splats, splats_from_field
-from lapgs_plugin.training.gpu_adam import GpuFieldAdam, adam_in_triton, step_together
-from lapgs_plugin.training.settings import ADAM_EPS, LearningRates
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats, splats_from_field
+from lapgs_plugin.ops.adam import ADAM_EPS, GpuFieldAdam, adam_in_triton, step_together
+from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.training.settings import LearningRates
 
 SH_REST_SCALE = 1 / 20
 """SH coefficients above degree 0 learn at a twentieth of the rate of degree 0, as in 3DGS."""

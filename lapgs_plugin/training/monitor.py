@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
-from lapgs_plugin.archive import Manifest
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.inheritance import check_inheritance
-from lapgs_plugin.plan import (
+from lapgs_plugin.hierarchy.inheritance import check_inheritance
+from lapgs_plugin.hierarchy.plan import (
     DEFAULT_HIERARCHY,
     Hierarchy,
     Stage,
@@ -21,8 +20,9 @@ from lapgs_plugin.plan import (
     parse_hierarchy,
     require_no_residuals,
 )
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.supervision import joint_from, parse_supervision
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.supervision import joint_from, parse_supervision
+from lapgs_plugin.runs.archive import Manifest
 
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""

@@ -12,14 +12,14 @@ import torch
 from gsplat.strategy.ops import remove
 from torch import Tensor
 
-from lapgs_plugin.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_image
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.pruning import blended_pixels, least_blended
-from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -67,7 +67,7 @@ class StageRun:
         model: the field, edited in place.
         densifier: density control with its statistics.
         joint_from: the iteration from which the finished fields are trained too; None when they never are.
-        thaw: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
+        unfreeze: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: those fields while they are being trained; None before.
         breakdown: told which part of an iteration begins.
 
@@ -79,7 +79,7 @@ class StageRun:
     settings: TrainSettings
     views: Sequence[LevelView]
     images: LevelImages
-    accumulated: RaisedImages | None
+    accumulated: UpsampledImages | None
     background: Tensor
     extent: float
     rasterizer: Rasterizer
@@ -87,7 +87,7 @@ class StageRun:
     model: TrainableField
     densifier: DensityControl
     joint_from: int | None = None
-    thaw: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
+    unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     progress: StageProgress = field(default_factory=StageProgress)
@@ -146,8 +146,8 @@ class StageRun:
 
     def _iterate(self, iteration: int) -> None:
         if iteration == self.joint_from:
-            assert self.thaw is not None, "a stage that trains finished fields can have them"
-            self.joint = self.thaw(None)
+            assert self.unfreeze is not None, "a stage that trains finished fields can have them"
+            self.joint = self.unfreeze(None)
         view = self._view(iteration)
         target, coarse_target = self.images.get(view.name)
         context = StageContext(
@@ -158,7 +158,7 @@ class StageRun:
             accumulated=self._prediction(view),
             coarse_target=coarse_target,
         )
-        self._announce_next(iteration)
+        self._prefetch_next(iteration)
         degree = self.schedule.active_sh_degree(iteration)
         self.progress.gaussian_steps += self.num_optimized
         self.hooks.before_render(context)
@@ -190,7 +190,7 @@ class StageRun:
         self, gaussians: GaussianField, view: LevelView, iteration: int, degree: int
     ) -> tuple[Tensor, RenderResult | None]:
         """The image, and what else is known of the render where somebody looks at it."""
-        if self.densifier.looks_at(iteration):
+        if self.densifier.needs_statistics(iteration):
             result = self.rasterizer(gaussians, view.camera, background=self.background, sh_degree=degree)
             return result.image, result
         return render_image(self.rasterizer, gaussians, view.camera, self.background, degree), None
@@ -205,14 +205,14 @@ class StageRun:
             return self.joint.predict(view.name)
         return None if self.accumulated is None else self.accumulated.get(view.name)
 
-    def _announce_next(self, iteration: int) -> None:
+    def _prefetch_next(self, iteration: int) -> None:
         """Let the next iteration's images come while this one renders."""
         if iteration == self.stage.iterations:
             return
         name = self._view(iteration + 1).name
-        self.images.announce(name)
+        self.images.prefetch(name)
         if self.accumulated is not None and self.joint is None:
-            self.accumulated.announce(name)
+            self.accumulated.prefetch(name)
 
     def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
         changed = self.densifier.after_step(self.model, context.iteration, result, view.camera)
@@ -284,8 +284,8 @@ class StageRun:
             for name, value in state["densifier"].items()
         }
         if (joint := state.get("joint")) is not None:
-            assert self.thaw is not None
-            self.joint = self.thaw(joint)
+            assert self.unfreeze is not None
+            self.joint = self.unfreeze(joint)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)

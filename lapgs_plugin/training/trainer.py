@@ -11,34 +11,36 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.archive import CACHE, LevelRecord, RunArchive
-from lapgs_plugin.breakdown import Breakdown, breakdown_on
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision
 from lapgs_plugin.hooks import HookDispatcher, StageHook
-from lapgs_plugin.imagestore import PLACES, PRECISIONS, ImageStore, place
-from lapgs_plugin.inheritance import field_from_points, inherit
-from lapgs_plugin.overhead import Overhead
-from lapgs_plugin.peak_memory import PeakMemory
-from lapgs_plugin.plan import Hierarchy, Stage, StagePlan, goes_on, parse_hierarchy, parse_split
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer, render_image
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
-from lapgs_plugin.rendering.raised_images import RaisedImages
-from lapgs_plugin.rendering.raising import raised
+from lapgs_plugin.interrupt import StopRequest, stop_request
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.upsample import upsample
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.runs.archive import CACHE, LevelRecord, RunArchive
+from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.image_store import PLACES, PRECISIONS, ImageStore, place
+from lapgs_plugin.runs.overhead import Overhead
+from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.supervision import Supervision, parse_supervision, photometric_loss
 from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
-from lapgs_plugin.training.interrupt import StopRequest, stop_request
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import AUTO, StageSchedule, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
-from lapgs_plugin.watching import Watcher
 
 TRAIN, TEST = "train", "test"
 """Folders of cached predictions, by the views that they are of."""
@@ -94,9 +96,9 @@ def warm_up(
         statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
     if residuals:
-        raised(Pyramid(), coarse, (16, 16))
+        upsample(Pyramid(), coarse, (16, 16))
     if joint:
-        below = raised(Pyramid(), coarse.requires_grad_(), (16, 16))
+        below = upsample(Pyramid(), coarse.requires_grad_(), (16, 16))
         below.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
@@ -138,8 +140,8 @@ class Trainer:
         check_cache(self.settings, self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
-        self._train_cache: RaisedImages | None = None
-        self._test_cache: RaisedImages | None = None
+        self._train_cache: UpsampledImages | None = None
+        self._test_cache: UpsampledImages | None = None
         self._memory = PeakMemory(self.device)
         self._last_tick = (0.0, 0)
         self._last_checkpoint = time.monotonic()
@@ -223,7 +225,7 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
             return model
 
-    def _heir_wants_moments(self, stage: Stage) -> bool:
+    def _next_stage_inherits_moments(self, stage: Stage) -> bool:
         """Whether the stage after this one goes on with Adam's state."""
         return stage.level > 0 and (self.plan.hierarchy is Hierarchy.NESTED or self.settings.inherit == "full")
 
@@ -256,11 +258,11 @@ class Trainer:
             model=model,
             densifier=density_control(schedule, self.settings.densification_of(stage), self.scene.extent),
             joint_from=self.settings.joint_from(stage),
-            thaw=self._thaw,
+            unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
         )
 
-    def _thaw(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
+    def _unfreeze(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
         """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived.
 
         What was kept of their predictions is let go of: from here on these are rendered.
@@ -292,10 +294,10 @@ class Trainer:
         with self._overhead.timed("evaluation"):
             self._test_cache = self._predictions(stage, self.scene.test, TEST)
 
-    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> RaisedImages:
+    def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
         """Up(I_hat^(l+1)) of each view, for the stage of level l."""
         coarser = stage.level + 1
-        cache = RaisedImages(self._empty_cache(coarser, views, name), self._pyramid)
+        cache = UpsampledImages(self._empty_cache(coarser, views, name), self._pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
@@ -413,7 +415,7 @@ class Trainer:
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
         )
-        moments = run.model.optimizer_moments() if self._heir_wants_moments(run.stage) else None
+        moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 

@@ -9,12 +9,12 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.imagestore import EIGHT_BIT_TOLERANCE, ImageStore, place
-from lapgs_plugin.plan import level_size
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.runs.image_store import EIGHT_BIT_TOLERANCE, ImageStore, place
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import View
 
 
@@ -50,10 +50,10 @@ class LevelImages:
     ) -> None:
         self._held: dict[str, Tensor] = {}
         self._targets = _empty_store(views, level, device) if _wants_store(device) else None
-        self._coarse: RaisedImages | None = None
+        self._coarse: UpsampledImages | None = None
         if with_coarse and level < levels - 1:
             precision = "float16" if _wants_store(device) else "float32"
-            self._coarse = RaisedImages(_empty_store(views, level + 1, device, precision), pyramid)
+            self._coarse = UpsampledImages(_empty_store(views, level + 1, device, precision), pyramid)
         for view in views:
             self._make(view, level, pyramid, device)
 
@@ -67,10 +67,10 @@ class LevelImages:
         if self._coarse is not None:
             self._coarse.put(view.name, images[level + 1], (target.shape[1], target.shape[2]))
 
-    def announce(self, name: str) -> None:
+    def prefetch(self, name: str) -> None:
         """Start bringing a view's images, which the next iteration will ask for."""
         for store in self._stores:
-            store.announce(name)
+            store.prefetch(name)
 
     def get(self, name: str) -> tuple[Tensor, Tensor | None]:
         """A view's target (3, h, w), and Up of the coarser one or None."""

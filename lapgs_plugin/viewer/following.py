@@ -10,16 +10,16 @@ from pathlib import Path
 
 import torch
 
-from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import PictureSettings, ShownRun, draw
 from lapgs_plugin.viewer.preview import keep_preview, read_preview

@@ -12,21 +12,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
-from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import ShownRun
 from lapgs_plugin.viewer.server import Viewer
 from lapgs_plugin.viewer.session import Exhibit, Pace
 from lapgs_plugin.viewer.start import start_at, start_outside
-from lapgs_plugin.watching import Watcher
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from viser.transforms import SO3
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Vector, posed
 from lapgs_plugin.viewer.start import centred_lens, vertical_fov
 

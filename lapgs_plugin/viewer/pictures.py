@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import Rasterizer, RenderResult, render_images
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_images
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.rig import Rig
 

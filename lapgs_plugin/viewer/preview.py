@@ -19,7 +19,7 @@ from PIL import Image
 from lapgs_plugin.files import MANIFEST, PREVIEW, atomic_write
 
 if TYPE_CHECKING:
-    from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.viewer.pictures import ShownRun
     from lapgs_plugin.viewer.start import Start
 
@@ -79,9 +79,9 @@ def keep_preview_of(run: Path, device: str = "auto") -> None:
     """
     with _logged(run):
         # In here: a backbone's environment may lack OpenImageIO, say, and has trained all the same.
-        from lapgs_plugin.archive import RunArchive
         from lapgs_plugin.rendering.rig import Rig
         from lapgs_plugin.rendering.run import run_cameras, run_renderer
+        from lapgs_plugin.runs.archive import RunArchive
         from lapgs_plugin.viewer.pictures import ShownRun
         from lapgs_plugin.viewer.start import start_at
 

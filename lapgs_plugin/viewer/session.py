@@ -15,7 +15,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.viewer.controls import Controls
 from lapgs_plugin.viewer.navigation import Pose

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rendering.rig import Rig, Vector, forward, looking
 
 

@@ -9,9 +9,9 @@ import pytest
 import typer
 from plyfile import PlyData
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.export import export
 from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_run, write_scene
 from tests.unit.test_spz import read_spz

@@ -14,15 +14,15 @@ import torch.nn.functional as F
 import typer
 from torch import Tensor
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.cli.report import report
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_scene
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_scene

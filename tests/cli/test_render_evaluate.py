@@ -15,12 +15,12 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.lpips import NETWORKS
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import typer
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.report import report
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.rendering.trajectory import trajectory_json
+from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.cli import app
 from lapgs_plugin.files import LOCK, MANIFEST
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.viewer.preview import read_preview
 from tests.cli.run_folder import write_run, write_scene

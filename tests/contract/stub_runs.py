@@ -19,16 +19,16 @@ import numpy as np
 import torch
 
 from lapgs_plugin.adapters.base import BackboneAdapter
-from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
-from lapgs_plugin.adapters.driver import HierarchyDriver
-from lapgs_plugin.adapters.known import adapter_class
-from lapgs_plugin.adapters.run_state import HierarchyOptions
-from lapgs_plugin.adapters.script import loaded_script
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+from lapgs_plugin.checkouts.script import loaded_script
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.plan import Stage
 from lapgs_plugin.rendering.run import run_renderer, run_scene
-from lapgs_plugin.watching import Watcher
+from lapgs_plugin.runner.driver import HierarchyDriver
+from lapgs_plugin.runner.run_state import HierarchyOptions
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.watching import Watcher
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from tests.contract.stub_runs import NAMES, STUBS, drive_residuals, loaded, run_hierarchy
 
 PARTS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from torch import Tensor
 
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.plan import Stage
 from tests.contract.stub_runs import NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
 
 # Two stages of 3 and 6 iterations that densify at 2, and at 2 and 4.
@@ -124,7 +124,7 @@ def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path,
 def test_every_replaced_symbol_is_logged_once(
     name: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO, "lapgs_plugin.adapters.attachment")
+    caplog.set_level(logging.INFO, "lapgs_plugin.checkouts.attachment")
     run_hierarchy(STUBS[name], scene, tmp_path / "run", *TINY, levels=1)
     lines = [record.getMessage() for record in caplog.records if record.getMessage().startswith("replaced ")]
     assert all("; used by " in line for line in lines)

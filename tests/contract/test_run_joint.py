@@ -12,15 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters import joint
-from lapgs_plugin.adapters.joint import JointLevels
-from lapgs_plugin.adapters.level_views import view_name
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.pyramid import Pyramid
 from lapgs_plugin.rendering.run import run_renderer
+from lapgs_plugin.runner import joint
+from lapgs_plugin.runner.joint import JointLevels
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (

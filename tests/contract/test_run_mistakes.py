@@ -14,16 +14,16 @@ from typing import Any
 import pytest
 import torch
 
-from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
-from lapgs_plugin.adapters.installed_rasterizer import explained
-from lapgs_plugin.adapters.known import adapter_class
-from lapgs_plugin.adapters.run_state import HierarchyOptions
-from lapgs_plugin.adapters.script import loaded_script, require_script
-from lapgs_plugin.archive import CACHE, RunArchive
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+from lapgs_plugin.checkouts.script import loaded_script, require_script
 from lapgs_plugin.cli import app
 from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.runner.installed_rasterizer import explained
+from lapgs_plugin.runner.run_state import HierarchyOptions
+from lapgs_plugin.runs.archive import CACHE, RunArchive
 from tests.contract.stub_runs import (
     CHECKOUTS,
     NAMES,

@@ -13,16 +13,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters import driver
 from lapgs_plugin.adapters.base import PARAMETERS
-from lapgs_plugin.archive import OPTIMIZER, RunArchive
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.rendering.rasterizers import rasterizer_for
+from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
+from lapgs_plugin.runner import driver
+from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (

@@ -10,7 +10,7 @@ import pytest
 import torch
 import typer
 
-from lapgs_plugin.adapters.script import loaded_script
+from lapgs_plugin.checkouts.script import loaded_script
 from lapgs_plugin.cli.run import run
 from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (

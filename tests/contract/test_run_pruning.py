@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 import torch
+from lapgs_plugin.hierarchy.cameras import level_camera
 from torch import Tensor
 
-from lapgs_plugin.adapters import active_stage
-from lapgs_plugin.adapters.active_stage import ActiveStage
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pruning import blended_pixels, least_blended
-from lapgs_plugin.rendering.compose import level_camera
-from lapgs_plugin.rendering.rasterizers import rasterizer_for
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
+from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
+from lapgs_plugin.runner import active_stage
+from lapgs_plugin.runner.active_stage import ActiveStage
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, run_hierarchy, run_residuals
 
 SHARE = 0.05

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from lapgs_plugin.adapters.imported import import_run, read_foreign_run
-from lapgs_plugin.adapters.witness import Witness
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
-from lapgs_plugin.field import count_gaussians
+from lapgs_plugin.fields.gaussian_field import count_gaussians
 from lapgs_plugin.files import BARE_RECORD
+from lapgs_plugin.runner.imported import import_run, read_foreign_run
+from lapgs_plugin.runner.recording import BareRunRecorder
 from tests.contract.stub_runs import ITERATIONS, NAMES, STUBS, Result, arguments, captured, loaded, run_bare
 
 SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
@@ -25,7 +25,7 @@ SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 def record(name: str, scene: Path, folder: Path) -> Result:
     results: list[Result] = []
     with captured(folder, results), loaded(STUBS[name], scene, folder, *SAVING) as adapter:
-        Witness(adapter, "cpu").run()
+        BareRunRecorder(adapter, "cpu").run()
     return results[0]
 
 

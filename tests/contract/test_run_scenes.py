@@ -17,11 +17,11 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
+from lapgs_plugin.rasterizers.signed_color import signed_degree
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.signed_color import signed_degree
 from tests.contract.stub_runs import (
     ITERATIONS,
     KINDS,

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.adapters.run_state import HierarchyOptions
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import Hierarchy, Stage, StagePlan
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan
+from lapgs_plugin.runner.run_state import HierarchyOptions
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy
 
 TOTAL = 30_000

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.adapters.known import adapter_class
+from lapgs_plugin.adapters.registry import adapter_class
 from tests.contract.stub_runs import STUBS
 
 

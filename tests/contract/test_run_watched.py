@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from lapgs_plugin.archive import RunArchive
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.watching import Watcher
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.watching import Watcher
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, run_hierarchy
 
 EVERY = 4

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.adapters.known import adapter_class
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from tests.contract.stub_runs import STUBS, Stub, run_bare
 
 VARIANTS = [

@@ -13,16 +13,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.interrupt import stop_request
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.interrupt import stop_request
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.archive import LevelRecord, Manifest, RunArchive, SceneReference
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
 
 SMALL: dict[str, Any] = {
     "name": "small",

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from hypothesis import strategies as st
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.evaluation.cases import *  # noqa: F403 - one place to import cases and strategies from
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, make_camera, random_case
+from lapgs_plugin.fields.camera import Camera
 
 
 def backgrounds() -> st.SearchStrategy[tuple[float, float, float]]:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.signed_color import signed_degree
+from lapgs_plugin.rasterizers.signed_color import signed_degree
 
 WIDTH, HEIGHT, TAN_X = 33, 19, 0.6
 GAUSSIANS = 24

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.adam import FieldAdam
+from lapgs_plugin.ops.adam.in_numba import FieldAdam
 
 SH_SHAPE = (37, 16, 3)
 

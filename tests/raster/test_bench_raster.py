@@ -18,7 +18,7 @@ from lapgs_plugin.evaluation import bench_gsplat, bench_raster
 from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
 from lapgs_plugin.evaluation.bench_raster import CASES, FAST, GSPLAT, ORACLE, BenchCase, CaseResult, planned_turns
 from lapgs_plugin.evaluation.bench_scene import blended_per_pixel, make_scene
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from tests.raster.scenes import Case, gradients, pixel_weights, random_case
 

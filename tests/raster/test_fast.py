@@ -10,12 +10,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
 from tests.raster import scenes
 from tests.raster.assertions import (

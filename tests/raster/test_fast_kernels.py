@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lapgs_plugin.reference_raster import lanes, layout, ordering_kernels, pipeline, projection_kernels, tile_kernels
-from lapgs_plugin.reference_raster._jit import jit
+from lapgs_plugin.jit import lanes
+from lapgs_plugin.jit.compiler import jit
+from lapgs_plugin.jit.lanes import Floats
+from lapgs_plugin.jit.threads import parallel
+from lapgs_plugin.reference_raster import layout, ordering_kernels, pipeline, projection_kernels, tile_kernels
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
-from lapgs_plugin.reference_raster.lanes import Floats
-from lapgs_plugin.reference_raster.threads import parallel
 from tests.raster import scenes
 
 KINDS = [np.float32, np.float64]

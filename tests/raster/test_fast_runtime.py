@@ -24,9 +24,10 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from lapgs_plugin.reference_raster import buffers, pipeline
+from lapgs_plugin.jit import buffers
+from lapgs_plugin.jit.threads import num_threads, one_pool, parallel
+from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
-from lapgs_plugin.reference_raster.threads import num_threads, one_pool, parallel
 from tests.raster import scenes
 from tests.raster.scenes import Case
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.loss import photometric_loss_cpu, ssim_cpu, ssim_map_cpu
+from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu, ssim_cpu, ssim_map_cpu
 
 INTERIOR = (slice(None), slice(5, -5), slice(5, -5))
 """Pixels whose window lies inside the image."""

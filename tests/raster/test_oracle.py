@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer, footprint_radii, tile_rectangles
 from lapgs_plugin.reference_raster.thresholds import threshold_mask
 from tests.raster import naive, scenes

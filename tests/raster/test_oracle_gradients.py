@@ -142,7 +142,7 @@ def test_screen_gradients_equal_differences_of_shifted_centres(name: str) -> Non
 
 
 def test_screen_gradient_equals_differences_of_the_principal_point() -> None:
-    """Moving the principal point moves the one centre and nothing else; in pixels, not in the unit of clip space."""
+    """AdamSlot the principal point moves the one centre and nothing else; in pixels, not in the unit of clip space."""
     case = scenes.one_gaussian()
     weights, _ = masked_weights(case, STEP_TOLERANCE)
     actual = scenes.gradients(ORACLE, case, weights)["means2d"]

@@ -10,7 +10,7 @@ import torch
 from scipy.special import lpmv
 from torch import Tensor
 
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_basis, sh_to_color
+from lapgs_plugin.fields.spherical_harmonics import sh_basis, sh_to_color
 
 
 def sphere_quadrature(degree: int) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.archive import (
+from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.runs.archive import (
     FORMAT_VERSION,
     MANIFEST,
     LevelRecord,
@@ -25,8 +27,6 @@ from lapgs_plugin.archive import (
     RunArchive,
     SceneReference,
 )
-from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
-from lapgs_plugin.field import GaussianField
 from tests.mishaps import FailingWrites, Killed, disk_full
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
@@ -511,7 +511,7 @@ def test_a_disk_that_fills_in_the_middle_of_a_file(tmp_path: Path) -> None:
     script = f"""
 import resource, sys
 sys.path.insert(0, {str(Path(__file__).parents[2])!r})
-from lapgs_plugin.imagestore import ImageStore
+from lapgs_plugin.runs.image_store import ImageStore
 from tests.unit.test_archive import *
 archive = RunArchive.create({str(tmp_path)!r}, manifest())
 finish(archive, 1)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.evaluation.charts import (
+from lapgs_plugin.reports.charts import (
     INSET,
     INSET_AT,
     WHOLE,

@@ -9,16 +9,17 @@ from typing import Any
 
 import pytest
 import torch
+from lapgs_plugin.hierarchy.cameras import level_camera
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer, level_camera, to_full_size
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.field_offload import FieldOffload
 
 BACKGROUND = (0.2, 0.5, 0.9)
 CAMERA = Camera(45, 30, fx=40.0, fy=41.0, cx=21.0, cy=16.0, world_to_camera=torch.eye(4))
@@ -268,7 +269,7 @@ def test_fields_come_to_the_device_when_they_are_rendered(monkeypatch: pytest.Mo
     monkeypatch.setattr(HierarchyRenderer, "behind", lambda renderer, level: torch.zeros(3))
     for keep in (True, False):
         asked.clear()
-        residence = Residence(there, keep)
+        residence = FieldOffload(there, keep)
         renderer = HierarchyRenderer(fields, 2, Pyramid(), Elsewhere(), residence=residence)
         assert renderer.device == there
         renderer.render(CAMERA, level=1)
@@ -278,7 +279,7 @@ def test_fields_come_to_the_device_when_they_are_rendered(monkeypatch: pytest.Mo
         assert all(field.means.device == there for field in asked)
         bases = {id(field) for field in asked if not field.signed}
         assert len(bases) == (1 if keep else 3)
-    assert Residence(torch.device("cpu")).bring(0, fields[0]) is fields[0]
+    assert FieldOffload(torch.device("cpu")).bring(0, fields[0]) is fields[0]
 
 
 def test_a_full_gpu_is_one_line() -> None:

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.cli import conformance as command
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation import cases, conformance
 from lapgs_plugin.evaluation.cases import Case
 from lapgs_plugin.evaluation.conformance import Outcome, Subject, check, check_case
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.raster import RenderResult, Semantics
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
 from lapgs_plugin.reference_raster import OracleRasterizer, oracle
 
 ORACLE = OracleRasterizer()

@@ -17,8 +17,8 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils._device import _device_constructors
 
-from lapgs_plugin.adapters import absent_modules as absent
-from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+from lapgs_plugin.checkouts import absent_modules as absent
+from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 CUDA = ["cuda", "cuda:0", torch.device("cuda"), torch.device("cuda", 1)]

@@ -9,8 +9,8 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 
-from lapgs_plugin.plan import StagePlan
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin import environment
-from lapgs_plugin.adapters.known import recognise_checkout
+from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.environment import Finding, Probe, Requirement
 
 GPU = "NVIDIA H100, 80 GiB, compute capability 9.0"

@@ -17,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 from plyfile import PlyData, PlyElement
 
 from lapgs_plugin.errors import FieldError
-from lapgs_plugin.field import GaussianField, count_gaussians
+from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
 
 REST_COUNT = {0: 0, 1: 9, 2: 24, 3: 45}
 

@@ -7,10 +7,10 @@ import gc
 import pytest
 import torch
 
-from lapgs_plugin.adapters import gsplat_direct
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers import gsplat_direct
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 

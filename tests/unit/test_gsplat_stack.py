@@ -9,18 +9,19 @@ from dataclasses import replace
 import gsplat
 import pytest
 import torch
+from lapgs_plugin.hierarchy.cameras import level_camera
 from torch import Tensor
 
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.adapters.gsplat_stack import GsplatStack
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import DeviceMemoryError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import FieldStack, StackingRasterizer
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack, StackingRasterizer
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, level_camera
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
+from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.gsplat_on_cpu import gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
@@ -78,7 +79,7 @@ def hierarchy(counts: Sequence[int], degrees: Sequence[int] = (1, 1, 1, 1)) -> d
 
 def at_once(fields: Mapping[int, GaussianField], rasterizer: OnCpu | None = None) -> HierarchyRenderer:
     return HierarchyRenderer(
-        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=Residence(CPU)
+        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=FieldOffload(CPU)
     )
 
 
@@ -166,7 +167,7 @@ def test_what_stays_field_by_field() -> None:
         replace(renderer, at_once=0),
         replace(renderer, at_once=53 * 37 - 1),
         replace(renderer, residence=None),
-        replace(renderer, residence=Residence(CPU, keep=False)),
+        replace(renderer, residence=FieldOffload(CPU, keep=False)),
     ):
         asked.clear()
         assert_same(other.render(CAMERA), expected.render(CAMERA))

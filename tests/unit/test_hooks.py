@@ -10,10 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from torch import Tensor
 
 from lapgs_plugin import hooks as hooks_module
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.supervision import Supervision
 from lapgs_plugin.hooks import (
     Composition,
     HookDispatcher,
@@ -23,8 +26,6 @@ from lapgs_plugin.hooks import (
     entry_point_hooks,
     verify_hook,
 )
-from lapgs_plugin.plan import Stage
-from lapgs_plugin.supervision import Supervision, photometric_loss_torch
 
 BASE = Stage(level=1, image_size=(16, 12), iterations=5, signed=False)
 RESIDUAL = Stage(level=0, image_size=(32, 24), iterations=9, signed=True)

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor
 
-from lapgs_plugin import imagestore
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
-from lapgs_plugin.imagestore import AHEAD, ImageStore, _PageLocked, _release, place
+from lapgs_plugin.runs import image_store as imagestore
+from lapgs_plugin.runs.image_store import AHEAD, ImageStore, _PageLocked, _release, place
 
 ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
 
@@ -110,7 +110,7 @@ def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, wh
         kept.put("a", image)
         image.data.zero_()
         assert torch.equal(kept.get("a").cpu(), torch.ones(3, 2, 2))
-        kept.announce("a")
+        kept.prefetch("a")
         kept.put("a", torch.full((3, 3, 1), 2.0, dtype=torch.float64))
         assert torch.equal(kept.get("a").cpu(), torch.full((3, 3, 1), 2.0))
         assert (kept.names, len(kept)) == (("a",), 1)
@@ -125,20 +125,20 @@ def test_announcing_changes_nothing_but_when_it_is_brought(tmp_path: Path, devic
     with store(tmp_path, where, "float32", device) as kept:
         for name, image in images.items():
             kept.put(name, image)
-        kept.announce("3")
-        kept.announce("3")
+        kept.prefetch("3")
+        kept.prefetch("3")
         assert torch.equal(kept.get("3").cpu(), images["3"])
         assert torch.equal(kept.get("3").cpu(), images["3"])
         for name in images:  # more than may be under way
-            kept.announce(name)
+            kept.prefetch(name)
         for name, image in images.items():
             assert torch.equal(kept.get(name).cpu(), image)
         order = random.Random(0).choices(list(images), k=100)
         for name, following in zip(order, [*order[1:], "0"], strict=True):
-            kept.announce(following)
+            kept.prefetch(following)
             assert torch.equal(kept.get(name).cpu(), images[name])
-        kept.announce("5")
-    for ask in (kept.get, kept.announce):
+        kept.prefetch("5")
+    for ask in (kept.get, kept.prefetch):
         with pytest.raises(KeyError):
             ask("5")
 
@@ -154,7 +154,7 @@ def test_bytes_are_counted_where_they_lie(tmp_path: Path, device: str, where: st
         assert "a" in kept
         at_rest = {"gpu": 0, "memory": 0, "disk": 0, where: 3 * each}
         assert (kept.bytes_on_device, kept.bytes_in_memory, kept.bytes_on_disk) == tuple(at_rest.values())
-        kept.announce("b")
+        kept.prefetch("b")
         if where == "disk" or (device, where) == ("cuda", "memory"):
             at_rest["gpu" if device == "cuda" else "memory"] += each
         assert (kept.bytes_on_device, kept.bytes_in_memory, kept.bytes_on_disk) == tuple(at_rest.values())
@@ -180,7 +180,7 @@ def test_the_disk_is_read_in_the_background(tmp_path: Path, monkeypatch: pytest.
     with store(tmp_path, "disk", "float32") as kept:
         kept.put("slow", torch.ones(3, 2, 2))
         kept.put("other", torch.zeros(3, 2, 2))
-        kept.announce("slow")
+        kept.prefetch("slow")
         assert reading.wait(10)
         assert torch.equal(kept.get("other"), torch.zeros(3, 2, 2))
         threading.Timer(0.05, go_on.set).start()
@@ -194,7 +194,7 @@ def test_files_that_are_gone_or_cut_short(tmp_path: Path, device: str) -> None:
     with store(tmp_path, "disk", "float16", device) as kept:
         for name in "abc":
             kept.put(name, torch.rand(3, 4, 5))
-        kept.announce("c")
+        kept.prefetch("c")
         time.sleep(0.05)
         (tmp_path / "images" / "000000.bin").write_bytes(b"x")
         (tmp_path / "images" / "000001.bin").unlink()
@@ -353,7 +353,7 @@ def test_a_busy_gpu_gets_no_torn_and_no_stale_image(tmp_path: Path, where: str, 
         wrong = torch.zeros((), dtype=torch.int64, device="cuda")
         for i, name in enumerate(order):
             for following in order[i + 1 : i + 4]:
-                kept.announce(following)
+                kept.prefetch(following)
             got = kept.get(name)
             for _ in range(4):
                 load = (load @ load).clamp_(-1, 1)

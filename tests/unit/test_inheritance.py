@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.inheritance import field_from_points, inherit
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 
 FLOOR = math.sqrt(1e-7)

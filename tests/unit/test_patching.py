@@ -41,7 +41,8 @@ from lapgs_plugin.patching import (
     uncommitted,
     write_all,
 )
-from lapgs_plugin.signed_color import SIGNED_COLOR_BIT, signed_degree
+from lapgs_plugin.rasterizers.signed_color import signed_degree
+from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
 # An anchor is written between [name and name], so that its index among the tokens is known.
 PROGRAMS = {

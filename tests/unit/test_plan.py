@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import (
+from lapgs_plugin.hierarchy.plan import (
     DEFAULT_SPLITS,
     MIN_LEVEL_SIDE,
     Hierarchy,
@@ -118,5 +118,5 @@ def test_parse_split() -> None:
 
 
 def test_importing_the_package_and_the_plan_pulls_in_no_torch() -> None:
-    code = "import sys, lapgs_plugin, lapgs_plugin.plan, lapgs_plugin.cli; assert 'torch' not in sys.modules"
+    code = "import sys, lapgs_plugin, lapgs_plugin.hierarchy.plan, lapgs_plugin.cli; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -20,9 +20,9 @@ import typer
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes import prepare as prepare_module
 from lapgs_plugin.scenes.images import write_image

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lapgs_plugin.inheritance import SH_C0
-from lapgs_plugin.pruning import blended_pixels, least_blended
+from lapgs_plugin.hierarchy.inheritance import SH_C0
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from tests.training_scene import blob_field, ring_camera

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.imagestore import ImageStore
-from lapgs_plugin.pyramid import GRIDS, Pyramid
-from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid
+from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from tests.unit.test_imagestore import on_every_device
 
 SIZES = {"a": (6, 10), "b": (7, 9)}
@@ -23,11 +23,11 @@ Seen: 1.8e-7, 2.1e-4 and 2.8e-3."""
 @on_every_device
 @pytest.mark.parametrize("precision", WORST)
 def test_it_is_up_of_what_was_put(grid: str, device: str, where: str, precision: str, tmp_path: Path) -> None:
-    images = RaisedImages(ImageStore(where, precision, device=device, folder=tmp_path / "images"), Pyramid(grid))
+    images = UpsampledImages(ImageStore(where, precision, device=device, folder=tmp_path / "images"), Pyramid(grid))
     coarse = {name: torch.rand(3, -(-h // 2), -(-w // 2)) * 1.5 - 0.5 for name, (h, w) in SIZES.items()}
     for name, size in SIZES.items():
         images.put(name, coarse[name].requires_grad_(), size)
-    images.announce("b")
+    images.prefetch("b")
     for name, size in SIZES.items():
         got = images.get(name)
         assert (got.dtype, got.device.type, got.requires_grad) == (torch.float32, device, False)
@@ -38,14 +38,14 @@ def test_it_is_up_of_what_was_put(grid: str, device: str, where: str, precision:
 
 
 def test_what_is_kept_is_a_quarter() -> None:
-    images = RaisedImages(ImageStore("memory", "float16"), Pyramid())
+    images = UpsampledImages(ImageStore("memory", "float16"), Pyramid())
     images.put("a", torch.rand(3, 8, 16), (16, 32))
     assert images.store.bytes_in_memory == 2 * 3 * 16 * 32 // 4
     assert images.get("a").shape == (3, 16, 32)
 
 
 def test_an_image_of_another_size_is_refused_and_not_kept() -> None:
-    images = RaisedImages(ImageStore("memory", "float32"), Pyramid())
+    images = UpsampledImages(ImageStore("memory", "float32"), Pyramid())
     with pytest.raises(UserInputError, match=r"Up to 16x32 .* got 16x32"):
         images.put("a", torch.rand(3, 16, 32), (16, 32))
     assert len(images.store) == 0

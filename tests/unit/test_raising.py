@@ -19,17 +19,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.kernel_check import is_right
-from lapgs_plugin.pyramid import GRIDS, Pyramid, transposed_taps
-from lapgs_plugin.rendering import raising
-from lapgs_plugin.rendering.raising import add_raised, raised
+from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid, transposed_taps
+from lapgs_plugin.ops import upsample as raising
+from lapgs_plugin.ops.self_check import matches_reference
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 
 TRITON = """
 import os
 os.environ["TRITON_INTERPRET"] = "1"
 import torch
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.rendering.raising_triton import add_raised_triton, raised_triton
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton, upsample_triton
 for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
     for grid in ("camera", "even"):
         h, w = shape[-2:]
@@ -37,9 +37,9 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
         expected = Pyramid(grid).up(coarse, (h, w)) + fine
         turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as gsplat has them
         for images in ((coarse, fine), turned):
-            torch.testing.assert_close(add_raised_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
+            torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
         gradients = []
-        for up in (Pyramid(grid).up, lambda *given: raised_triton(Pyramid(grid), *given)):
+        for up in (Pyramid(grid).up, lambda *given: upsample_triton(Pyramid(grid), *given)):
             leaf = coarse.clone().requires_grad_()
             (up(leaf, (h, w)) * fine).sum().backward()
             gradients.append(leaf.grad)
@@ -65,27 +65,27 @@ def test_on_a_cpu_it_is_up_and_the_sum(grid: str, shape: tuple[int, int, int], d
     coarse, fine, expected = images(grid, shape, dtype)
     # Sums in another order; worst seen 9e-7 and 2e-15.
     tolerance = 5e-6 if dtype == torch.float32 else 1e-14
-    torch.testing.assert_close(add_raised(Pyramid(grid), coarse, fine), expected, rtol=0, atol=tolerance)
-    up = raised(Pyramid(grid), coarse, (shape[1], shape[2]))
+    torch.testing.assert_close(upsample_add(Pyramid(grid), coarse, fine), expected, rtol=0, atol=tolerance)
+    up = upsample(Pyramid(grid), coarse, (shape[1], shape[2]))
     torch.testing.assert_close(up, expected - fine, rtol=0, atol=tolerance)
 
 
 def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     coarse, fine, expected = images("camera", (2, 3, 33, 50), torch.float32)
     turned = [image.movedim(1, -1).contiguous().movedim(-1, 1) for image in (coarse, fine)]
-    torch.testing.assert_close(add_raised(Pyramid(), *turned), expected, rtol=0, atol=5e-6)
-    torch.testing.assert_close(raised(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
+    torch.testing.assert_close(upsample_add(Pyramid(), *turned), expected, rtol=0, atol=5e-6)
+    torch.testing.assert_close(upsample(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
 
 
 def test_what_is_not_half_of_the_size_is_refused() -> None:
     with pytest.raises(UserInputError, match=r"Up to 33x50 .* needs an image of 17x25, got 16x25"):
-        raised(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
+        upsample(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
 
 
 def test_gradients_go_through() -> None:
     coarse, fine, _ = images("camera", (3, 8, 9), torch.float32)
     coarse.requires_grad_()
-    add_raised(Pyramid(), coarse, fine).sum().backward()
+    upsample_add(Pyramid(), coarse, fine).sum().backward()
     assert coarse.grad is not None
     # Every fine pixel is an average of coarse ones: their gradients add up to the number of fine pixels.
     assert coarse.grad.sum().item() == pytest.approx(3 * 8 * 9, rel=1e-5)
@@ -117,17 +117,17 @@ def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     """What runs on a CPU in place of the kernels: PyTorch's operations, and of the sum so many times Up."""
     kernels = ModuleType("kernels")
     vars(kernels).update(
-        raised_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
-        add_raised_triton=lambda pyramid, coarse, fine: factor * pyramid.up(coarse, fine.shape[-2:]) + fine,
+        upsample_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
+        upsample_add_triton=lambda pyramid, coarse, fine: factor * pyramid.up(coarse, fine.shape[-2:]) + fine,
     )
-    monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.raising_triton", kernels)
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.ops.upsample.in_triton", kernels)
 
 
 def is_used() -> bool:
     def difference() -> float:
         return raising._difference_in_triton(Pyramid(), torch.device("cpu"))
 
-    return is_right("PyTorch's operations", difference, raising.LARGEST_DIFFERENCE)
+    return matches_reference("PyTorch's operations", difference, raising.LARGEST_DIFFERENCE)
 
 
 @pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False), (math.nan, False)])
@@ -144,7 +144,7 @@ def test_a_kernel_that_does_not_compile_is_not_used(caplog: pytest.LogCaptureFix
         raise RuntimeError("Failed to find C compiler\nat length")
 
     caplog.set_level(logging.INFO)
-    assert not is_right("PyTorch's operations", difference, 1.0)
+    assert not matches_reference("PyTorch's operations", difference, 1.0)
     assert "PyTorch's operations: Failed to find C compiler" in caplog.text
     assert "at length" not in caplog.text
 
@@ -178,11 +178,11 @@ def test_the_kernel_of_a_gpu_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
-    from lapgs_plugin.rendering.raising import _triton_works
+    from lapgs_plugin.ops.upsample import _triton_works
 
     assert _triton_works()
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")
-    torch.testing.assert_close(add_raised(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
+    torch.testing.assert_close(upsample_add(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
     gradients = []
     for up in (raised, Pyramid.up):
         leaf = coarse.clone().requires_grad_()

@@ -15,21 +15,21 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from lapgs_plugin.adapters import gsplat as gsplat_adapter
-from lapgs_plugin.adapters.extensions import CudaExtension
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.archive import Manifest, SceneReference
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
-from lapgs_plugin.raster import render_transmittance
+from lapgs_plugin.fields.rasterizer import render_transmittance
+from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
+from lapgs_plugin.rasterizers.extensions import CudaExtension
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.reference_raster.standins import install, stand_ins
-from lapgs_plugin.rendering.rasterizers import PlacedRasterizer, rasterizer_for
-from lapgs_plugin.signed_color import SignedColorRasterizer
+from lapgs_plugin.runs.archive import Manifest, SceneReference
 
 FASTGS, GRAPHDECO = "diff_gaussian_rasterization_fastgs", "diff_gaussian_rasterization"
-LOGGER = "lapgs_plugin.rendering.rasterizers"
+LOGGER = "lapgs_plugin.rasterizers.choice"
 
 
 def manifest(rasterizer: str, **raster: Any) -> Manifest:

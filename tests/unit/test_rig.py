@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig, forward
 from tests.training_scene import ring_camera
 

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import Scene, load_scene
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 

@@ -16,19 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lapgs_plugin import signed_color
-from lapgs_plugin.adapters.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.cases import Case, gradients, make_camera, make_field, pixel_weights, random_case
 from lapgs_plugin.evaluation.conformance import Subject, check, check_case, conformance_cases
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
-from lapgs_plugin.raster import RenderResult
-from lapgs_plugin.reference_raster import OracleRasterizer
-from lapgs_plugin.reference_raster.standins import VARIANTS, install
-from lapgs_plugin.signed_color import (
-    SIGNED_COLOR_BIT,
+from lapgs_plugin.rasterizers import signed_color
+from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
     SignedColorRasterizer,
     explain_fallback,
@@ -36,6 +33,9 @@ from lapgs_plugin.signed_color import (
     precomputed_colors,
     signed_degree,
 )
+from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
+from lapgs_plugin.reference_raster.standins import VARIANTS, install
 
 ORACLE = OracleRasterizer()
 CONSTANT = 0.28209479177387814  # the first basis function

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering import speed
 from lapgs_plugin.rendering.compose import HierarchyRenderer

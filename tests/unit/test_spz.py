@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import FieldError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import sh_basis, sh_to_color
+from lapgs_plugin.fields.spz import save_spz
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_basis, sh_to_color
-from lapgs_plugin.spz import save_spz
 from tests.training_scene import blob_field, ring_camera
 
 HALF_TURN = Rotation.from_euler("x", 180, degrees=True)  # between y down, z ahead and y up, z back

@@ -7,17 +7,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch, ssim
 from scipy.ndimage import correlate1d
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.supervision import (
-    Supervision,
-    parse_supervision,
-    photometric_loss,
-    photometric_loss_torch,
-    ssim,
-    supervised_pair,
-)
+from lapgs_plugin.hierarchy.supervision import Supervision, parse_supervision, supervised_pair
+from lapgs_plugin.ops.photometric_loss import photometric_loss
 
 
 def ssim_with_scipy(x: np.ndarray, y: np.ndarray) -> float:
@@ -120,7 +115,7 @@ def test_supervisions_by_name() -> None:
 
 def test_a_gpu_takes_the_fused_ssim_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The choice alone: the stand-in of the package renders its SSIM on the CPU."""
-    from lapgs_plugin import supervision
+    from lapgs_plugin.hierarchy import supervision
     from lapgs_plugin.reference_raster.standins.fused_ssim import fused_ssim
 
     prediction = torch.rand(3, 20, 30, requires_grad=True)

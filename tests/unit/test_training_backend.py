@@ -14,15 +14,15 @@ from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from torch import Tensor
 
-from lapgs_plugin.adapters import gsplat as gsplat_adapter
-from lapgs_plugin.adapters.gsplat import GsplatRasterizer
-from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.pyramid import Pyramid
-from lapgs_plugin.raster import Rasterizer
+from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
+from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training import views as training_views
@@ -282,7 +282,7 @@ def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, m
     monkeypatch.setattr(training_views, "_wants_store", lambda device: True)
     stored = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
     for view in eight_bit:
-        stored.announce(view.name)
+        stored.prefetch(view.name)
         (target, coarse), (expected, expected_coarse) = stored.get(view.name), held.get(view.name)
         assert (expected_coarse is None) == (coarse is None) == (level == 1)
         if level == 0:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.plan import Hierarchy, StagePlan, parse_split
+from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan, parse_split
 from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
 from lapgs_plugin.training.views import view_index
 

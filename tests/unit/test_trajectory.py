@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig, camera_positions, forward
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, trajectory_json, walking_order, with_size
 from tests.training_scene import ring_camera

@@ -12,10 +12,10 @@ import torch
 
 CHECKS = """
 import torch
-from lapgs_plugin.adapters.gsplat_triton import activated, colors_of_shown, finish_gradients, place_seen
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
-from lapgs_plugin.supervision_triton import weighted_l1
-from lapgs_plugin.training.densification_triton import add_statistics
+from lapgs_plugin.rasterizers.gsplat_triton import activated, colors_of_shown, finish_gradients, place_seen
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
 def close(found, expected, absolute=1e-5, relative=1e-4):
     torch.testing.assert_close(found, expected, atol=absolute, rtol=relative)
@@ -72,7 +72,7 @@ add_statistics(pixels, torch.where(shown, 5, 0).int(), (40, 30), norms, counts)
 close(norms, expected[0])
 close(counts, expected[1])
 
-from lapgs_plugin.training.gpu_adam import largest_difference
+from lapgs_plugin.ops.adam import largest_difference
 torch.set_default_device(None)
 assert largest_difference(torch.device(DEVICE)) < 1e-5  # worst seen 4e-6
 """

@@ -19,7 +19,7 @@ import pytest
 BARE = """
 import runpy, sys
 from pathlib import Path
-from lapgs_plugin.adapters.cpu_device import cuda_on_cpu
+from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 
 variant, *sys.argv = sys.argv[1:]
 sys.path[0] = str(Path(sys.argv[0]).parent)
@@ -32,7 +32,7 @@ COUNTING = """
 import json, sys
 from dataclasses import replace
 from pathlib import Path
-from lapgs_plugin.adapters import driver
+from lapgs_plugin.runner import driver
 from lapgs_plugin.cli import main
 
 calls = []

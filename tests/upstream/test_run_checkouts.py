@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.adapters.known import adapter_class
-from lapgs_plugin.archive import RunArchive
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.runs.archive import RunArchive
 from tests.upstream.checkouts import Done, checkout, knows_antialiasing, run_bare, run_lapgs
 
 pytestmark = pytest.mark.upstream

@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.rendering.trajectory import read_trajectory
+from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene
 from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
 from tests.training_scene import ring_camera

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.rasterizers import PlacedRasterizer
+from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from lapgs_plugin.archive import Manifest, RunArchive, SceneReference
-from lapgs_plugin.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
-from lapgs_plugin.watching import Watcher
 from tests.training_scene import ring_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")

@@ -12,12 +12,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.pyramid import Pyramid
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.residence import Residence
+from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.viewer.navigation import Pose
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw, side_by_side
 from tests.training_scene import blob_field, ring_camera
@@ -62,7 +62,7 @@ def test_gains_and_switched_off_levels(run: ShownRun) -> None:
 
 
 @dataclass
-class Elsewhere(Residence):
+class Elsewhere(FieldOffload):
     """Fields that come as other objects each time."""
 
     def bring(self, level: int, wanted: GaussianField) -> GaussianField:

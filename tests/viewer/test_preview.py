@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_plugin.archive import RunArchive
 from lapgs_plugin.files import PREVIEW
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.preview import SIZE, fitted, keep_preview_of, read_preview
 from tests.cli.run_folder import write_run
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.reference_raster._jit import jit
-from lapgs_plugin.reference_raster.buffers import empty
-from lapgs_plugin.reference_raster.lanes import (
+from lapgs_plugin.jit.buffers import empty
+from lapgs_plugin.jit.compiler import jit
+from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
     at,
@@ -26,6 +26,7 @@ from lapgs_plugin.reference_raster.lanes import (
     store,
     store_sums,
 )
+from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.reference_raster.layout import (
     BLOCK,
     BLOCKS,
@@ -43,7 +44,6 @@ from lapgs_plugin.reference_raster.layout import (
     TILE_PIXELS,
 )
 from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
-from lapgs_plugin.reference_raster.threads import parallel
 
 _FINAL = 2 * TILE_PIXELS  # `tile_kernels.FINAL`; kernels see constants of `layout` and their own module change only
 

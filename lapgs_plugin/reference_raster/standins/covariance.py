@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from lapgs_plugin.jit.lanes import Floats
+from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.reference_raster import pipeline, tile_kernels
-from lapgs_plugin.reference_raster.lanes import Floats
 from lapgs_plugin.reference_raster.layout import (
     FACTOR_SCALE,
     FACTOR_XX,
@@ -34,7 +35,6 @@ from lapgs_plugin.reference_raster.layout import (
     TRANSLATION,
 )
 from lapgs_plugin.reference_raster.pipeline import Kept, View
-from lapgs_plugin.reference_raster.threads import parallel
 
 MIN_SHARE = 2.5e-5
 """Lower bound of the determinant without the 0.3 px^2 over that with it, in antialiasing."""

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster import pipeline
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION, SIGNED_COLOR_BIT
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
 from lapgs_plugin.reference_raster.standins.contributions import Contributions, contributions
 from lapgs_plugin.reference_raster.standins.covariance import (
@@ -26,7 +26,6 @@ from lapgs_plugin.reference_raster.standins.covariance import (
     principal_axes,
 )
 from lapgs_plugin.reference_raster.standins.snug_tiles import snug_tiles
-from lapgs_plugin.signed_color import SIGNED_COLOR_BIT
 
 FOCAL_TOLERANCE = 1e-3
 """How far, relatively, the focal lengths in `projmatrix` may be from those that the fields of view say."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.loss import photometric_loss_cpu
+from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
 __all__ = ["fused_ssim", "fused_ssim_", "fusedssim", "fusedssim_backward"]
 

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.field import GaussianField
-from lapgs_plugin.inheritance import SH_C0
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.hierarchy.inheritance import SH_C0
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_to_color
 
 __all__ = ["rasterization", "spherical_harmonics"]
 

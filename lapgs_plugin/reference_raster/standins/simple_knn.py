@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from lapgs_plugin.inheritance import mean_squared_distance
+from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
 
 __all__ = ["distCUDA2"]
 

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_plugin.jit.compiler import inline, jit
+from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster import ordering_kernels
-from lapgs_plugin.reference_raster._jit import inline, jit
-from lapgs_plugin.reference_raster.lanes import Floats
 from lapgs_plugin.reference_raster.layout import (
     CENTRE_X,
     CENTRE_Y,

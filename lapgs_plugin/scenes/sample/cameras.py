@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 
 TARGET = (0.0, 0.0, 0.85)
 ELEVATIONS = (6.0, 36.0)  # degrees

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits, pixel_colors, surfaces
 from lapgs_plugin.scenes.sample.shapes import Floats, dot
 from lapgs_plugin.scenes.sample.world import World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes.sample.shapes import Floats, Mask, dot, rotate
 from lapgs_plugin.scenes.sample.textures import linear_rgb
 from lapgs_plugin.scenes.sample.world import PALETTE, World

@@ -13,8 +13,8 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.output import fresh_scene, write_model

@@ -2,7 +2,7 @@
 
 import torch
 
-from lapgs_plugin import supervision
+from lapgs_plugin.hierarchy import supervision
 
 
 def l1_loss(network_output, gt):

@@ -1,6 +1,6 @@
 """Spherical harmonics."""
 
-from lapgs_plugin.reference_raster.spherical_harmonics import sh_basis
+from lapgs_plugin.fields.spherical_harmonics import sh_basis
 
 C0 = 0.28209479177387814
 

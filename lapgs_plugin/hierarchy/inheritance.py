@@ -1,0 +1,179 @@
+"""How a field begins: from a point cloud, or from the field of the level before."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.gaussian_field import GaussianField
+
+INHERIT_MODES = ("geometry", "xyz", "full")
+
+SH_C0 = 0.5 / math.sqrt(math.pi)
+"""The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every side."""
+
+INITIAL_OPACITY = 0.1
+NEIGHBOURS = 3
+SMALLEST_SQUARED_DISTANCE = 1e-7
+"""Floor of the mean squared distance to the neighbours, in squared world units: points may coincide."""
+
+
+def parse_inheritance(text: str) -> tuple[str, float]:
+    """A mode and a ratio from what --inherit takes: MODE, RATIO or MODE:RATIO.
+
+    Raises:
+        UserInputError: it is none of these.
+    """
+    mode, _, ratio = text.partition(":")
+    try:
+        if mode not in INHERIT_MODES:
+            mode, ratio = "geometry", text
+        return mode, float(ratio or 1.0)
+    except ValueError as error:
+        raise UserInputError(
+            f"--inherit {text!r}: expected {', '.join(INHERIT_MODES)}, a ratio in (0, 1], or both as in xyz:0.5"
+        ) from error
+
+
+def check_inheritance(mode: str, ratio: float) -> None:
+    """Raise what `inherit` would about these arguments, before there is a field.
+
+    Raises:
+        UserInputError: an unknown mode, or a ratio outside (0, 1].
+    """
+    if mode not in INHERIT_MODES:
+        raise UserInputError(f"--inherit {mode}: expected {', '.join(INHERIT_MODES)}")
+    if not 0.0 < ratio <= 1.0:
+        raise UserInputError(f"--inherit {ratio}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)")
+
+
+class Inherited(NamedTuple):
+    """A new field and the Gaussians of the old one that it came from.
+
+    Attributes:
+        field: the field to train.
+        kept: (m,) int64 rows of the old field, ascending; row i of the new field is row kept[i] of the old one.
+    """
+
+    field: GaussianField
+    kept: Tensor  # (m,)
+
+
+def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> GaussianField:
+    """A fresh base field as 3DGS starts it: round Gaussians as large as their spacing, a tenth opaque.
+
+    Args:
+        points: (n, 3) positions in world units, n at least 1.
+        colors: (n, 3) RGB in [0, 1], the same from every side.
+        sh_degree: 0 to 3; coefficients above degree 0 are zero.
+
+    Returns:
+        A field of n Gaussians, float32, not signed.
+
+    Raises:
+        UserInputError: no points, or one is not finite.
+    """
+    sh = torch.zeros(len(points), (sh_degree + 1) ** 2, 3, device=points.device)
+    sh[:, 0] = (colors.to(sh) - 0.5) / SH_C0
+    return _fresh_field(points, sh, signed=False)
+
+
+def inherit(
+    field: GaussianField,
+    mode: str = "geometry",
+    ratio: float = 1.0,
+    generator: torch.Generator | None = None,
+    sh_degree: int | None = None,
+) -> Inherited:
+    """The residual field that continues from the field of the next coarser level (paper, "Initialization and
+    inheritance" and the supplement's ablation).
+
+    "geometry", ours, keeps positions, shapes and opacities and starts with zero colour: the residual renders exactly
+    zero, by Gaussians that already follow the scene's surfaces. "xyz", the paper's default, keeps the positions and
+    starts everything else afresh: scale from the nearest neighbours among the kept Gaussians, opacity 0.1, no rotation,
+    and zero colour. "full" keeps every parameter, colours included, as the paper ("retains all parameters") and its
+    authors' release do; `kept` tells which rows of the optimizer state go with it. As a residual's colour is the raw SH
+    value, what inherits fully from a base starts as the base's image minus 0.5 wherever that is opaque, and has to
+    unlearn it.
+
+    Args:
+        field: of the coarser level; not modified.
+        mode: "geometry", "xyz" or "full".
+        ratio: rho in (0, 1], the share of Gaussians to keep, drawn without replacement; at least one is kept.
+        generator: CPU generator of the draw; None takes PyTorch's global one. Not used when all are kept.
+        sh_degree: of the new field; None keeps the old one's. "full" can only keep it.
+
+    Raises:
+        UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
+    """
+    check_inheritance(mode, ratio)
+    if len(field) == 0:
+        raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
+    kept = _draw(len(field), ratio, generator).to(field.means.device)
+    degree = field.sh_degree if sh_degree is None else sh_degree
+    rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
+    if mode == "full":
+        if degree != field.sh_degree:
+            raise UserInputError(
+                f"full inheritance of a field of SH degree {field.sh_degree} cannot give degree {degree}; "
+                "keep the degree or inherit xyz"
+            )
+        return Inherited(GaussianField(**rows, signed=True), kept)
+    sh = torch.zeros(len(kept), (degree + 1) ** 2, 3, dtype=field.means.dtype, device=field.means.device)
+    if mode == "geometry":
+        return Inherited(GaussianField(**{**rows, "sh": sh}, signed=True), kept)
+    return Inherited(_fresh_field(rows["means"], sh, signed=True), kept)
+
+
+def _draw(n: int, ratio: float, generator: torch.Generator | None) -> Tensor:
+    """Ascending indices of a random share of n, at least one, (m,)."""
+    count = max(1, round(n * ratio))
+    if count == n:
+        return torch.arange(n)
+    return torch.randperm(n, generator=generator)[:count].sort().values
+
+
+def _fresh_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
+    """Everything but position and colour as 3DGS initialises a point cloud."""
+    if len(means) == 0 or not bool(torch.isfinite(means).all()):
+        raise UserInputError(
+            f"{len(means)} points, not all finite; expected at least one point with finite coordinates"
+        )
+    n, means = len(means), means.to(sh.dtype, copy=True)
+    log_scale = 0.5 * torch.log(mean_squared_distance(means).clamp_min(SMALLEST_SQUARED_DISTANCE))  # (n,)
+    quaternions = torch.zeros(n, 4, dtype=sh.dtype, device=sh.device)
+    quaternions[:, 0] = 1.0
+    return GaussianField(
+        means=means,
+        quaternions=quaternions,
+        log_scales=log_scale[:, None].repeat(1, 3),
+        opacity_logits=torch.full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))).to(sh),
+        sh=sh,
+        signed=signed,
+    )
+
+
+def mean_squared_distance(points: Tensor) -> Tensor:
+    """Mean of the squared distances from each point to its three nearest neighbours.
+
+    With fewer than four points the mean is over the neighbours there are, and 0 for a single point.
+
+    Args:
+        points: (n, 3), n at least 1.
+
+    Returns:
+        (n,) in squared units of the points, with their type and device.
+    """
+    count = min(NEIGHBOURS, len(points) - 1)
+    if count == 0:
+        return torch.zeros_like(points[:, 0])
+    positions = points.detach().to("cpu", torch.float64).numpy()
+    # The nearest of count + 1 is the point itself, or one at the same place: distance 0 either way.
+    distances, _ = cKDTree(positions).query(positions, k=count + 1, workers=-1)
+    return torch.from_numpy(np.mean(distances[:, 1:] ** 2, axis=1)).to(points)

@@ -1,0 +1,173 @@
+"""Adam on the CPU for the parameters of a Gaussian field: one pass over memory, on all threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.jit.compiler import inline, jit
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, at, fetch_add, load, sqrt, store
+from lapgs_plugin.jit.threads import parallel
+
+_FLAT_COLUMNS = 4096  # a parameter whose columns are all alike is cut into rows of this many elements
+_TASK_ELEMENTS = 16384
+
+Value = TypeVar("Value", Lanes, float)
+
+
+@inline
+def _moments(gradient: Value, mean: Value, square: Value, rates: Floats) -> tuple[Value, Value]:
+    """Both moments after this step."""
+    blend, decay, square_blend = at(rates, 0), at(rates, 1), at(rates, 2)
+    return mean + blend * (gradient - mean), decay * square + square_blend * (gradient * gradient)
+
+
+@inline
+def _moved(parameter: Value, scale: Value, mean: Value, root: Value, rates: Floats) -> Value:
+    """The parameter after this step; `root` is the square root of the second moment."""
+    step_size, correction, eps = at(rates, 3), at(rates, 4), at(rates, 5)
+    moved: Value = parameter - step_size * scale * mean / (correction * root + eps)
+    return moved
+
+
+@jit
+def _adam_kernel(
+    counter: NDArray[np.int64],
+    p: Floats,
+    g: Floats,
+    m: Floats,
+    v: Floats,
+    columns: int,
+    active: int,
+    scale: Floats,
+    rates: Floats,
+) -> None:
+    """Update the first `active` elements of each row of `columns`; all arrays flat, `scale` for one row.
+
+    No multiplication is fused with an addition, so that an element has the same bits in a vector and beside one.
+    """
+    rows = (len(p) + columns - 1) // columns
+    rows_of_task = max(_TASK_ELEMENTS // columns, 1)
+    while True:
+        first = fetch_add(counter, rows_of_task)
+        if first >= rows:
+            return
+        for row in range(first, min(first + rows_of_task, rows)):
+            start = row * columns
+            count = min(active, len(p) - start)
+            whole = count // WIDTH * WIDTH
+            for x in range(0, whole, WIDTH):
+                i = start + x
+                mean, square = _moments(load(g, i), load(m, i), load(v, i), rates)
+                store(m, i, mean)
+                store(v, i, square)
+                store(p, i, _moved(load(p, i), load(scale, x), mean, sqrt(square), rates))
+            for x in range(whole, count):
+                i = start + x
+                m[i], v[i] = _moments(at(g, i), at(m, i), at(v, i), rates)
+                p[i] = _moved(at(p, i), at(scale, x), at(m, i), np.sqrt(at(v, i)), rates)
+
+
+class FieldAdam(torch.optim.Optimizer):
+    """Adam with the formula and the state of `torch.optim.Adam`, for parameters of n Gaussians, (n, ...), on the CPU.
+
+    The state has torch's keys 'step', 'exp_avg' and 'exp_avg_sq', so densification code that edits the state of torch's
+    Adam edits this one. Updates have the same bits for any number of threads.
+
+    Each parameter group also has, and may change between steps:
+        column_scale: multiplies the learning rate, a tensor of the shape of one row, such as (k, 3) for SH; or None.
+        active_columns: only the first so many entries of dimension 1 are updated, such as the SH coefficients up to the
+            current degree; None for all. The rest costs nothing. While their gradients are and have been zero, skipping
+            them is exact: Adam would not move them either.
+
+    Args:
+        params: float32 or float64 tensors on the CPU.
+        lr, betas, eps: as in torch.optim.Adam; eps is 1e-15 as in 3DGS.
+
+    Raises:
+        UserInputError: an argument out of range, or a parameter that is not a contiguous CPU tensor of a fitting shape.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Tensor] | Iterable[dict[str, Any]],
+        lr: float,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+        column_scale: Tensor | None = None,
+        active_columns: int | None = None,
+    ) -> None:
+        if lr < 0 or eps < 0 or not all(0 <= beta < 1 for beta in betas):
+            raise UserInputError(f"lr {lr}, betas {betas}, eps {eps}: expected lr and eps >= 0 and betas in [0, 1)")
+        super().__init__(
+            params,
+            {"lr": lr, "betas": betas, "eps": eps, "column_scale": column_scale, "active_columns": active_columns},
+        )
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # as torch's own
+        """Update every parameter that has a gradient; returns what `closure` returns, if there is one."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._update_parameter(parameter, group)
+        return loss
+
+    def _update_parameter(self, parameter: Tensor, group: dict[str, Any]) -> None:
+        columns, active, scale = _rows(parameter, group["column_scale"], group["active_columns"])
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"] = torch.zeros_like(parameter)
+            state["exp_avg_sq"] = torch.zeros_like(parameter)
+        state["step"] += 1
+        step, (beta1, beta2) = state["step"].item(), group["betas"]
+        step_size, correction = group["lr"] / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
+        rates = np.array([1 - beta1, beta2, 1 - beta2, step_size, correction, group["eps"]], scale.dtype)
+        if parameter.numel() == 0:
+            return
+        assert parameter.grad is not None
+        tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"])
+        arrays = (tensor.detach().view(-1).numpy() for tensor in tensors)
+        parallel(_adam_kernel, *arrays, columns, active, scale, rates)
+        torch.autograd.graph.increment_version(parameter)  # autograd does not see what a kernel wrote
+
+
+def _rows(parameter: Tensor, scale: Tensor | None, active_columns: int | None) -> tuple[int, int, Floats]:
+    """Elements in a row, how many of them to update, and the scale of each."""
+    if (
+        parameter.device.type != "cpu"
+        or parameter.dtype not in (torch.float32, torch.float64)
+        or parameter.ndim == 0
+        or not parameter.is_contiguous()
+    ):
+        raise UserInputError(
+            f"FieldAdam got a parameter of shape {tuple(parameter.shape)}, {parameter.dtype}, on {parameter.device}: "
+            "expected a contiguous (n, ...), float32 or float64, on the CPU; use torch.optim.Adam for others"
+        )
+    dtype = torch.empty(0, dtype=parameter.dtype).numpy().dtype
+    if scale is None and active_columns is None:
+        return _FLAT_COLUMNS, _FLAT_COLUMNS, np.ones(_FLAT_COLUMNS, dtype)
+    row = parameter.shape[1:]
+    if scale is not None and scale.shape != row:
+        raise UserInputError(f"column_scale has shape {tuple(scale.shape)}, expected one row's: {tuple(row)}")
+    if active_columns is not None and not (row and 0 <= active_columns <= row[0]):
+        raise UserInputError(
+            f"active_columns {active_columns} for a parameter of shape {tuple(parameter.shape)}: "
+            "expected from 0 to the size of its dimension 1"
+        )
+    columns = row.numel()
+    active = columns if active_columns is None else active_columns * row[1:].numel()
+    scales = np.ones(columns, dtype) if scale is None else scale.detach().flatten().numpy().astype(dtype)
+    return columns, active, scales

@@ -1,0 +1,93 @@
+"""One Adam step of all tensors of a field in one kernel.
+
+PyTorch's fused Adam takes a launch for each tensor, and has one learning rate for it: SH would have to be two tensors,
+put together for every render and taken apart in every backward pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from lapgs_plugin.ops.adam import ADAM_EPS
+
+BLOCK = 512
+BETA1, BETA2, EPS = tl.constexpr(0.9), tl.constexpr(0.999), tl.constexpr(ADAM_EPS)
+LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(0.9)), tl.constexpr(math.log(0.999))
+
+
+class AdamSlot(NamedTuple):
+    """A tensor under optimization; all float32 and contiguous on one CUDA device.
+
+    Attributes:
+        values, gradient, mean, square: (n, ...) the tensor, its gradient, and Adam's first and second moment.
+        step: scalar, how many steps there have been with this one.
+        rate: step size of the first three columns.
+        rest: step size of all further columns.
+    """
+
+    values: Tensor
+    gradient: Tensor
+    mean: Tensor
+    square: Tensor
+    step: Tensor
+    rate: float
+    rest: float
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _move(
+    values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor, step: tl.tensor,
+    rate: float, rest: float, n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
+) -> None:  # fmt: skip
+    """The rows of this program of one tensor: `columns` times `block` numbers that lie beside each other."""
+    t = tl.load(step).to(tl.float64)
+    unbias1 = 1.0 / (1.0 - tl.exp(t * LOG_BETA1)).to(tl.float32)
+    unbias2 = 1.0 / tl.sqrt(1.0 - tl.exp(t * LOG_BETA2)).to(tl.float32)
+    start = tl.program_id(0).to(tl.int64) * block * columns
+    for part in range(columns):
+        places = start + part * block + tl.arange(0, block)
+        here = places < n.to(tl.int64) * columns
+        gradient = tl.load(gradients + places, here, 0.0)
+        mean = BETA1 * tl.load(means + places, here, 0.0) + (1 - BETA1) * gradient
+        square = BETA2 * tl.load(squares + places, here, 0.0) + (1 - BETA2) * gradient * gradient
+        size = rate * unbias1
+        if columns > 4:
+            size = tl.where(places % columns < 3, rate, rest) * unbias1
+        moved = tl.load(values + places, here, 0.0) - size * mean / (tl.sqrt(square) * unbias2 + EPS)
+        tl.store(means + places, mean, here)
+        tl.store(squares + places, square, here)
+        tl.store(values + places, moved, here)
+
+
+@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _kernel(
+    values0: tl.tensor, gradients0: tl.tensor, means0: tl.tensor, squares0: tl.tensor, step0: tl.tensor,
+    rate0: float, rest0: float, columns0: tl.constexpr,
+    values1: tl.tensor, gradients1: tl.tensor, means1: tl.tensor, squares1: tl.tensor, step1: tl.tensor,
+    rate1: float, rest1: float, columns1: tl.constexpr,
+    values2: tl.tensor, gradients2: tl.tensor, means2: tl.tensor, squares2: tl.tensor, step2: tl.tensor,
+    rate2: float, rest2: float, columns2: tl.constexpr,
+    values3: tl.tensor, gradients3: tl.tensor, means3: tl.tensor, squares3: tl.tensor, step3: tl.tensor,
+    rate3: float, rest3: float, columns3: tl.constexpr,
+    values4: tl.tensor, gradients4: tl.tensor, means4: tl.tensor, squares4: tl.tensor, step4: tl.tensor,
+    rate4: float, rest4: float, columns4: tl.constexpr,
+    n: int, block: tl.constexpr,
+) -> None:  # fmt: skip
+    _move(values0, gradients0, means0, squares0, step0, rate0, rest0, n, columns0, block)
+    _move(values1, gradients1, means1, squares1, step1, rate1, rest1, n, columns1, block)
+    _move(values2, gradients2, means2, squares2, step2, rate2, rest2, n, columns2, block)
+    _move(values3, gradients3, means3, squares3, step3, rate3, rest3, n, columns3, block)
+    _move(values4, gradients4, means4, squares4, step4, rate4, rest4, n, columns4, block)
+
+
+def step_five(tensors: Sequence[AdamSlot]) -> None:
+    """One step of the five tensors of a field, of n rows each, whose `step` has been counted up already."""
+    n = len(tensors[0].values)
+    launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
+    launch(*(value for one in tensors for value in (*one, one.values[:1].numel())), n, block=BLOCK)

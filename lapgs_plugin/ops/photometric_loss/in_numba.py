@@ -1,0 +1,377 @@
+"""L1 + SSIM on the CPU, fused with its gradient: the photometric loss of 3DGS in one pass over the images.
+
+SSIM is the one 3DGS trains with: an 11x11 Gaussian window of sigma 1.5, zeros outside the image, nothing clamped, the
+mean over all pixels and channels. As PyTorch convolutions it costs more than rasterizing the image on a CPU. Here the
+rows of a block stream through two buffers that stay in the cache, and only the gradient is written to memory:
+
+    prediction, target -> moments -> filtered down, then across -> SSIM and its derivatives with respect to the moments
+    -> filtered down, then across -> gradient
+
+The window is separable and symmetric and everything outside the image is zero, so the filter is its own adjoint.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.jit.buffers import empty
+from lapgs_plugin.jit.compiler import inline, jit
+from lapgs_plugin.jit.lanes import (
+    WIDTH,
+    Floats,
+    Lanes,
+    absolute,
+    fetch_add,
+    fma,
+    load,
+    select,
+    splat,
+    store,
+)
+from lapgs_plugin.jit.threads import parallel
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C2 as C2
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_RADIUS as RADIUS
+
+Integers = NDArray[np.int64]
+
+_MOMENTS = 4  # p, t, p^2 + t^2, p t: SSIM needs the squares in their sum only
+_DERIVATIVES = 3  # with respect to the means of p, p^2 and p t
+_GROUP = 4  # rows filtered down together: 14 rows are read for them, where one by one they would read 44
+_BLOCK_COLUMNS = 400  # both buffers of a block fit a level-2 cache of 256 KiB in float32
+_STRIP_ROWS = 192  # each strip computes 20 rows of its neighbours again
+
+
+def _half_window() -> tuple[float, ...]:
+    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
+    return tuple((gaussian / gaussian.sum())[: RADIUS + 1].tolist())
+
+
+_W0, _W1, _W2, _W3, _W4, _W5 = _half_window()
+"""The normalised window from its tail to its centre."""
+
+
+@inline
+def _window_sum(
+    v0: Lanes, v1: Lanes, v2: Lanes, v3: Lanes, v4: Lanes, v5: Lanes,
+    v6: Lanes, v7: Lanes, v8: Lanes, v9: Lanes, v10: Lanes,
+) -> Lanes:  # fmt: skip
+    """The 11 values weighted by the window."""
+    total = fma(_W1, v1 + v9, _W0 * (v0 + v10))
+    total = fma(_W3, v3 + v7, fma(_W2, v2 + v8, total))
+    return fma(_W5, v5, fma(_W4, v4 + v6, total))
+
+
+@inline
+def _filter_across(row: Floats, x: int) -> Lanes:
+    """The window over the 11 columns from x on, for 16 neighbouring x."""
+    return _window_sum(
+        load(row, x), load(row, x + 1), load(row, x + 2), load(row, x + 3), load(row, x + 4), load(row, x + 5),
+        load(row, x + 6), load(row, x + 7), load(row, x + 8), load(row, x + 9), load(row, x + 10),
+    )  # fmt: skip
+
+
+# A buffer holds the last 16 rows as a ring of four groups of four. A row is its maps one after the other, each `pitch`
+# long. From a group, filtering makes the four rows whose windows end with the group's rows.
+
+
+@inline
+def _filter_down(rows: Floats, group: int, size: int, out: Floats) -> None:
+    """Filter the 14 rows that end with a group into four, `size` elements each."""
+    oldest, older = (group + 1) % 4 * _GROUP * size, (group + 2) % 4 * _GROUP * size
+    newer, newest = (group + 3) % 4 * _GROUP * size, group % 4 * _GROUP * size
+    for x in range(0, size, WIDTH):
+        r0, r1 = load(rows, oldest + 2 * size + x), load(rows, oldest + 3 * size + x)
+        r2, r3 = load(rows, older + x), load(rows, older + size + x)
+        r4, r5 = load(rows, older + 2 * size + x), load(rows, older + 3 * size + x)
+        r6, r7 = load(rows, newer + x), load(rows, newer + size + x)
+        r8, r9 = load(rows, newer + 2 * size + x), load(rows, newer + 3 * size + x)
+        r10, r11 = load(rows, newest + x), load(rows, newest + size + x)
+        r12, r13 = load(rows, newest + 2 * size + x), load(rows, newest + 3 * size + x)
+        store(out, x, _window_sum(r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10))
+        store(out, size + x, _window_sum(r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11))
+        store(out, 2 * size + x, _window_sum(r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12))
+        store(out, 3 * size + x, _window_sum(r3, r4, r5, r6, r7, r8, r9, r10, r11, r12, r13))
+
+
+@inline
+def _store_moments(p_row: Floats, t_row: Floats, pitch: int, moments: Floats, start: int) -> None:
+    for x in range(0, pitch, WIDTH):
+        p, t = load(p_row, x), load(t_row, x)
+        store(moments, start + x, p)
+        store(moments, start + pitch + x, t)
+        store(moments, start + 2 * pitch + x, fma(p, p, t * t))
+        store(moments, start + 3 * pitch + x, p * t)
+
+
+@inline
+def _store_derivatives(
+    filtered: Floats, row: int, inside: Floats, pitch: int, derivatives: Floats, start: int, ssim: Floats
+) -> None:
+    """SSIM of a row and its derivatives with respect to the moments; zero where `inside` is.
+
+    With A1 = 2 mu_p mu_t + C1, A2 = 2 cov + C2, B1 = mu_p^2 + mu_t^2 + C1, B2 = var_p + var_t + C2 it is
+    S = A1 A2 / (B1 B2). What is stored lacks the factor 2 that all terms of the gradient share: its weight has it.
+    """
+    for x in range(0, pitch, WIDTH):
+        mean_p, mean_t = _filter_across(filtered, row + x), _filter_across(filtered, row + pitch + x)
+        squares, product = _filter_across(filtered, row + 2 * pitch + x), _filter_across(filtered, row + 3 * pitch + x)
+        mean_product, mean_squares = mean_p * mean_t, fma(mean_p, mean_p, mean_t * mean_t)
+        a1, a2 = fma(2.0, mean_product, C1), fma(2.0, product - mean_product, C2)
+        b1, b2 = mean_squares + C1, squares - mean_squares + C2
+        inverse = load(inside, x) / (b1 * b2)
+        by_product = a1 * inverse
+        s = a2 * by_product
+        store(ssim, x, s)
+        store(derivatives, start + x, fma(mean_t, a2 - a1, mean_p * s * (b1 - b2)) * inverse)
+        store(derivatives, start + pitch + x, -s * b1 * inverse)
+        store(derivatives, start + 2 * pitch + x, by_product)
+
+
+@inline
+def _store_gradient(
+    filtered: Floats,
+    row: int,
+    moments: Floats,
+    start: int,
+    pitch: int,
+    weights: tuple[float, float],
+    l1_sum: Floats,
+    out: Floats,
+) -> None:
+    """One row of the gradient; adds |p - t| to `l1_sum`."""
+    l1_weight, ssim_weight = weights
+    plus, minus = splat(out, l1_weight), splat(out, -l1_weight)
+    for x in range(0, pitch - 2 * WIDTH + 1, WIDTH):
+        p, t = load(moments, start + x), load(moments, start + pitch + x)
+        by_mean, by_square = _filter_across(filtered, row + x), _filter_across(filtered, row + pitch + x)
+        by_product = _filter_across(filtered, row + 2 * pitch + x)
+        difference = p - t
+        store(l1_sum, x, load(l1_sum, x) + absolute(difference))
+        by_l1 = select(difference > 0.0, plus, select(difference < 0.0, minus, 0.0))
+        store(out, x, fma(ssim_weight, fma(p, by_square, fma(t, by_product, by_mean)), by_l1))
+
+
+@inline
+def _copy_row(image: Floats, y: int, left: int, first: int, last: int, row: Floats) -> None:
+    """Columns first to last of row `y` with zeros around them; column `left` goes to the start of the row."""
+    if 0 <= y < image.shape[0]:
+        row[: first - left] = 0
+        row[first - left : last - left] = image[y, first:last]
+        row[last - left :] = 0
+    else:
+        row[:] = 0
+
+
+@inline
+def _add_row(total: Floats, row: Floats, pitch: int) -> None:
+    for x in range(0, pitch, WIDTH):
+        store(total, x, load(total, x) + load(row, x))
+
+
+@inline
+def _mark_inside(left: int, width: int, inside: Floats) -> None:
+    """One where column left + x lies in the image, zero elsewhere."""
+    for x in range(len(inside)):
+        inside[x] = 0 <= left + x < width
+
+
+@jit
+def _photometric_kernel(
+    counter: Integers,
+    blocks: Integers,
+    pitch: int,
+    prediction: Floats,
+    target: Floats,
+    weights: tuple[float, float],
+    gradient: Floats,
+    sums: NDArray[np.float64],
+) -> None:
+    """Gradient (c, h, w), and for each block the sums of |p - t| and of SSIM, (blocks, 2)."""
+    _, height, width = prediction.shape
+    dtype = prediction.dtype
+    wide, narrow = _MOMENTS * pitch, _DERIVATIVES * pitch
+    moments, derivatives = np.zeros(4 * _GROUP * wide, dtype), np.zeros(4 * _GROUP * narrow, dtype)
+    filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
+    p_row, t_row, row = np.empty(pitch, dtype), np.empty(pitch, dtype), np.empty(pitch, dtype)
+    inside, nothing = np.empty(pitch, dtype), np.zeros(pitch, dtype)
+    l1_sum, ssim_sum = np.empty(pitch, dtype), np.empty(pitch, dtype)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= len(blocks):
+            return
+        channel, top, bottom, start, stop = blocks[task]
+        left, first, last = start - 2 * RADIUS, max(start - 2 * RADIUS, 0), min(stop + 2 * RADIUS, width)
+        _mark_inside(start - RADIUS, width, inside)
+        # Summed by column first: vectors, in a fixed order, and precise enough in float32.
+        l1_sum[:] = 0
+        ssim_sum[:] = 0
+        for group, y in enumerate(range(top - 2 * RADIUS, bottom + 2 * RADIUS, _GROUP)):
+            ring = group % 4 * _GROUP
+            for i in range(_GROUP):
+                _copy_row(prediction[channel], y + i, left, first, last, p_row)
+                _copy_row(target[channel], y + i, left, first, last, t_row)
+                _store_moments(p_row, t_row, pitch, moments, (ring + i) * wide)
+            if y + _GROUP <= top:
+                continue
+            _filter_down(moments, group, wide, filtered)
+            for i in range(_GROUP):
+                centre = y - RADIUS + i
+                visible = inside if 0 <= centre < height else nothing
+                _store_derivatives(filtered, i * wide, visible, pitch, derivatives, (ring + i) * narrow, row)
+                if top <= centre < bottom:
+                    _add_row(ssim_sum, row, pitch)
+            if y + _GROUP <= top + 2 * RADIUS:
+                continue
+            _filter_down(derivatives, group, narrow, filtered)
+            for i in range(_GROUP):
+                out = y - 2 * RADIUS + i
+                if top <= out < bottom:
+                    there = ((group * _GROUP + i - 2 * RADIUS) % (4 * _GROUP)) * wide + 2 * RADIUS
+                    _store_gradient(filtered, i * narrow, moments, there, pitch, weights, l1_sum, row)
+                    gradient[channel, out, start:stop] = row[: stop - start]
+        sums[task, 0], sums[task, 1] = 0, 0
+        for x in range(stop - start):
+            sums[task, 0] += l1_sum[x]
+            sums[task, 1] += ssim_sum[x + RADIUS]
+
+
+@jit
+def _ssim_kernel(
+    counter: Integers, blocks: Integers, pitch: int, prediction: Floats, target: Floats, ssim: Floats
+) -> None:
+    """SSIM of each pixel, (c, h, w)."""
+    width, dtype = prediction.shape[2], prediction.dtype
+    wide = _MOMENTS * pitch
+    moments, unused = np.zeros(4 * _GROUP * wide, dtype), np.zeros(_DERIVATIVES * pitch, dtype)
+    filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
+    p_row, t_row = np.empty(pitch, dtype), np.empty(pitch, dtype)
+    inside, row = np.empty(pitch, dtype), np.empty(pitch, dtype)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= len(blocks):
+            return
+        channel, top, bottom, start, stop = blocks[task]
+        left, first, last = start - 2 * RADIUS, max(start - 2 * RADIUS, 0), min(stop + 2 * RADIUS, width)
+        _mark_inside(start - RADIUS, width, inside)
+        for group, y in enumerate(range(top - RADIUS, bottom + RADIUS, _GROUP)):
+            for i in range(_GROUP):
+                _copy_row(prediction[channel], y + i, left, first, last, p_row)
+                _copy_row(target[channel], y + i, left, first, last, t_row)
+                _store_moments(p_row, t_row, pitch, moments, (group % 4 * _GROUP + i) * wide)
+            if y + _GROUP <= top + RADIUS:
+                continue
+            _filter_down(moments, group, wide, filtered)
+            for i in range(_GROUP):
+                centre = y - RADIUS + i
+                if top <= centre < bottom:
+                    _store_derivatives(filtered, i * wide, inside, pitch, unused, 0, row)
+                    ssim[channel, centre, start:stop] = row[RADIUS : RADIUS + stop - start]
+
+
+@lru_cache(maxsize=64)
+def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
+    """How an image is cut, (blocks, 5): channel, rows and columns; and the length of a buffered row.
+
+    It depends on nothing but the size, so that sums over blocks have the same bits for any number of threads.
+    """
+    # An even number, so that two threads get the same work.
+    strips, columns = 2 * -(-height // (2 * _STRIP_ROWS)), -(-width // _BLOCK_COLUMNS)
+    blocks = [
+        (channel, i * height // strips, (i + 1) * height // strips, j * width // columns, (j + 1) * width // columns)
+        for channel in range(channels)
+        for i in range(strips)
+        for j in range(columns)
+    ]
+    pitch = -(-(-(-width // columns) + 4 * RADIUS) // WIDTH) * WIDTH
+    return np.array(blocks, dtype=np.int64), pitch
+
+
+def _check(prediction: Tensor, target: Tensor) -> None:
+    if prediction.ndim != 3 or prediction.shape != target.shape or prediction.numel() == 0:
+        raise UserInputError(
+            f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
+            "(channels, height, width); resize the target to the level that is rendered"
+        )
+    if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
+        raise UserInputError(
+            f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
+            "convert one with .to(dtype)"
+        )
+    if prediction.device.type != "cpu" or target.device.type != "cpu":
+        raise UserInputError(
+            f"prediction on {prediction.device} and target on {target.device}: expected the CPU; move them with .cpu()"
+        )
+
+
+class _PhotometricLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+        images = [image.detach().contiguous().numpy() for image in (prediction, target)]
+        count = prediction.numel()
+        gradient = empty(count, images[0].dtype).reshape(prediction.shape)
+        blocks, pitch = _blocks(*prediction.shape)
+        sums = np.empty((len(blocks), 2))
+        # The mean of 1 - SSIM, and the factor 2 that the stored derivatives lack.
+        weights = (1 - ssim_weight) / count, -2 * ssim_weight / count
+        parallel(_photometric_kernel, blocks, pitch, *images, weights, gradient, sums)
+        l1, ssim = sums.sum(axis=0) / count
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None]:
+        (gradient,) = ctx.saved_tensors
+        # A pass over the image that multiplies by one costs a tenth of the loss.
+        return (gradient if grad_loss.item() == 1 else gradient * grad_loss), None, None
+
+
+def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
+    """(1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once with respect to the prediction.
+
+    Args:
+        prediction: (c, h, w) image of any size and any value range, float32 or float64, on the CPU.
+        target: (c, h, w) image of the same type, a constant.
+        ssim_weight: w, in [0, 1]; 3DGS trains with 0.2.
+
+    Returns:
+        A scalar of the images' type, the same bits for any number of threads.
+
+    Raises:
+        UserInputError: the images do not match, the target requires a gradient, or the weight leaves [0, 1].
+    """
+    _check(prediction, target)
+    if target.requires_grad:
+        raise UserInputError("the target requires a gradient, expected a constant image; pass target.detach()")
+    if not 0 <= ssim_weight <= 1:
+        raise UserInputError(f"ssim_weight {ssim_weight}: expected a number from 0 to 1, such as 0.2")
+    loss: Tensor = _PhotometricLoss.apply(prediction, target, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
+    return loss
+
+
+def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
+    """SSIM of each pixel and channel, (c, h, w); not differentiable.
+
+    Raises:
+        UserInputError: the images differ in shape or type, or are not float32 or float64 on the CPU.
+    """
+    _check(prediction, target)
+    images = [image.detach().contiguous().numpy() for image in (prediction, target)]
+    ssim = np.empty_like(images[0])
+    parallel(_ssim_kernel, *_blocks(*prediction.shape), *images, ssim)
+    return torch.from_numpy(ssim)
+
+
+def ssim_cpu(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean of `ssim_map_cpu`, a scalar: the SSIM that papers on 3DGS report."""
+    return ssim_map_cpu(prediction, target).mean()

@@ -1,0 +1,337 @@
+"""CUDA rasterizers of the 3DGS family behind the one interface `lapgs_plugin.fields.rasterizer.Rasterizer`.
+
+They are forks of one another with the same Python face, so one wrapper serves all. What a build takes is read off the
+fields of its settings and the arguments of its rasterizer, never off a version: several forks share one module name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import math
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
+
+SEMANTICS = {
+    "diff_gaussian_rasterization": Semantics(
+        expanded_conic_gradient=True,
+        note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of needles "
+        "are right to a few hundredths",
+    ),
+    "diff_gaussian_rasterization_fastgs": Semantics(
+        three_sigma_cut=False,
+        expanded_conic_gradient=True,
+        note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are right to a "
+        "few hundredths",
+    ),
+}
+"""The modules, and where each departs from the oracle by design."""
+
+STAND_INS = {"diff_gaussian_rasterization": "graphdeco-aa", "diff_gaussian_rasterization_fastgs": "fastgs"}
+"""The stand-in that knows every setting of a module's builds which changes the image."""
+
+CONSTANTS: dict[str, Any] = {
+    "scale_modifier": 1.0,
+    "prefiltered": False,
+    "debug": False,
+    "antialiasing": False,  # another image than the paper's
+    "mult": 1.0,  # the ellipse alpha = 1/255 whole: less cuts off visible borders of Gaussians
+    "get_flag": False,
+    "pixel_weights": None,
+}
+"""Settings that are the same in every call, unless a run was trained with others."""
+VARYING = (
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
+    "metric_map",
+)  # fmt: skip
+"""Settings that each call sets."""
+NEAR, FAR = 0.01, 100.0
+"""Clipping planes of the projection matrix; the kernels use its other rows only."""
+SH_REST_COUNT = 15
+"""Coefficients above the first at degree 3."""
+LOOKED_AT = 65536
+"""Gaussians looked at, about, for one that is certain to be in a tile."""
+MARGIN = 0.01
+"""How far inside the image, in pixels, a centre counts as certain to be."""
+MODERATE = 100.0
+"""Largest standard deviation, in pixels on the optical axis, of a Gaussian that counts as certain to be in a tile."""
+VISIBLE_LOGIT = math.log(2.4 / (255 - 2.4))
+"""Opacity over exp(5/6) / 255, and still under the 0.01 that training resets opacities to."""
+COMPANION_OPACITY = 1.05 / 255
+POINT_DIMMING = 0.005
+"""What antialiasing leaves of the opacity of a Gaussian that is a point."""
+
+
+def installed_extensions() -> list[str]:
+    """Modules of `SEMANTICS` that can be imported, found without importing them."""
+    return [name for name in SEMANTICS if importlib.util.find_spec(name) is not None]
+
+
+class CudaExtension:
+    """One installed extension; see `lapgs_plugin.rasterizers.signed_color.Extension`.
+
+    Args:
+        name: of its module, one of `SEMANTICS`.
+        device: where it renders; a stand-in for the CPU renders there.
+        settings: what to set instead of `CONSTANTS`, such as {"mult": 0.5}.
+        module: the module of that name; None imports it.
+
+    Raises:
+        MissingExtraError: it is not installed, or was built for another PyTorch.
+        UserInputError: its settings have a field that is not known, or lack one of `settings`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: torch.device | str = "cuda",
+        *,
+        settings: Mapping[str, Any] | None = None,
+        module: ModuleType | None = None,
+    ) -> None:
+        module = import_extension(name) if module is None else module
+        self._name = name
+        self._device = torch.device(device)
+        self._settings = _known_settings(module)
+        self._constants = {**CONSTANTS, **(settings or {})}
+        unknown = [key for key in settings or {} if key not in options_of(module)]
+        if unknown:
+            raise UserInputError(
+                f"{name} as it is installed has no setting {', '.join(unknown)}; expected some of "
+                f"{', '.join(sorted(options_of(module)))}"
+            )
+        self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
+        # The first rasterizer to take DC apart also was the first to blend a tile's Gaussians in buckets of 32.
+        self._in_buckets = self._takes_dc
+        # One that also sums absolute gradients puts them behind the ordinary ones.
+        self._absolute = "metric_map" in self._settings
+        self._module = module
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    @property
+    def semantics(self) -> Semantics:
+        """Where it departs from the oracle."""
+        return SEMANTICS[self._name]
+
+    def render(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
+    ) -> RenderResult:
+        """Render without looking at `field.signed`; see `lapgs_plugin.rasterizers.signed_color.Extension`.
+
+        The result has no transmittance, which the extension does not return.
+
+        Raises:
+            UserInputError: a tensor is not float32, or not on `device`.
+        """
+        self._check(field, background)
+        n = len(field)
+        absgrad2d = field.means.new_zeros(n, 2) if self._absolute and torch.is_grad_enabled() else None
+        means2d = field.means.new_zeros(n, 2).requires_grad_(torch.is_grad_enabled())  # (n, 2)
+        image, radii = self._rasterize(field, camera, background, sh_degree, colors, means2d, absgrad2d)
+        with torch.no_grad():
+            means2d.copy_(_centres(field, camera) * (radii > 0)[:, None])
+        return RenderResult(image, None, radii, means2d, absgrad2d)
+
+    def _rasterize(
+        self,
+        field: GaussianField,
+        camera: Camera,
+        background: Tensor,
+        sh_degree: int,
+        colors: Tensor | None,
+        means2d: Tensor,
+        absgrad2d: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """(3, h, w) image and (n,) radii."""
+        n = len(field)
+        inputs = {
+            "means3D": field.means,
+            "means2D": _Screen.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
+                means2d, camera.width, camera.height, 4 if self._absolute else 3, absgrad2d
+            ),
+            "opacities": torch.sigmoid(field.opacity_logits)[:, None],  # (n, 1)
+            "scales": torch.exp(field.log_scales),
+            "rotations": torch.nn.functional.normalize(
+                field.quaternions, dim=-1
+            ),  # the kernels leave that to the caller
+            **(self._sh_inputs(field.sh) if colors is None else {"colors_precomp": colors}),
+        }
+        # Without Gaussians the kernels leave out the background. With none in any tile, those that blend in buckets
+        # write beyond their tiles' ranges, or launch a grid of no blocks in the backward pass.
+        antialiasing = "antialiasing" in self._settings and bool(self._constants["antialiasing"])
+        if n == 0 or (self._in_buckets and (antialiasing or not _surely_blends(field, camera))):
+            inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
+        rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
+        image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
+        return image, radii[:n]
+
+    def _check(self, field: GaussianField, background: Tensor) -> None:
+        for name, tensor in {**field.parameters, "background": background}.items():
+            if tensor.device.type != self._device.type or tensor.dtype != torch.float32:
+                raise UserInputError(
+                    f"{name} is {tensor.dtype} on {tensor.device}, expected float32 on {self._device}; use .to()"
+                )
+
+    def _sh_inputs(self, sh: Tensor) -> dict[str, Tensor]:
+        if not self._takes_dc:
+            return {"shs": sh}
+        rest = sh[:, 1:]
+        if rest.shape[1] == 0:
+            # A tensor without elements has no address, and without one their backward pass skips the first too.
+            rest = sh.new_zeros(len(sh), SH_REST_COUNT, 3)
+        return {"dc": sh[:, :1], "shs": rest}
+
+    def _make_settings(self, camera: Camera, background: Tensor, sh_degree: int) -> Any:
+        tan_x, tan_y = camera.tan_half_fov
+        view, projection = _matrices(camera, background.device)
+        values = {
+            "image_height": camera.height,
+            "image_width": camera.width,
+            "tanfovx": tan_x,
+            "tanfovy": tan_y,
+            "bg": background.contiguous(),
+            "viewmatrix": view,
+            "projmatrix": projection,
+            "sh_degree": sh_degree,
+            "campos": camera.position.to(background).contiguous(),
+            **self._constants,
+        }
+        if "metric_map" in self._settings:
+            values["metric_map"] = torch.zeros(
+                camera.height * camera.width, dtype=torch.int32, device=background.device
+            )
+        return self._module.GaussianRasterizationSettings(**{name: values[name] for name in self._settings})
+
+
+class _Screen(torch.autograd.Function):
+    """(n, 2) centres in pixels -> (n, columns) zeros that the extension takes for its screen-space points.
+
+    Its gradient for them is by normalised device coordinates, of which the image is 2 wide and high.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor, width: int, height: int, columns: int, absgrad2d: Tensor | None) -> Tensor:
+        ctx.pixel, ctx.absgrad2d = means2d.new_tensor([2 / width, 2 / height]), absgrad2d
+        return means2d.new_zeros(len(means2d), columns)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.absgrad2d is not None:
+            ctx.absgrad2d.copy_(gradient[:, 2:4] * ctx.pixel)
+        return gradient[:, :2] * ctx.pixel, None, None, None, None
+
+
+def options_of(module: ModuleType) -> frozenset[str]:
+    """Which of `CONSTANTS` the extension knows."""
+    return frozenset(CONSTANTS) & frozenset(module.GaussianRasterizationSettings._fields)
+
+
+def import_extension(name: str) -> ModuleType:
+    """The module of that name.
+
+    Raises:
+        MissingExtraError: it is not installed, or was built for another PyTorch.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{name} cannot be imported ({error}); install it as the README of its backbone says"
+        ) from error
+
+
+def _known_settings(module: ModuleType) -> tuple[str, ...]:
+    """Names of the fields of the extension's settings."""
+    names: tuple[str, ...] = module.GaussianRasterizationSettings._fields
+    unknown = [name for name in names if name not in CONSTANTS and name not in VARYING]
+    if unknown:
+        raise UserInputError(
+            f"{module.__name__}: its settings have {', '.join(unknown)}, expected no more than "
+            f"{', '.join([*VARYING, *CONSTANTS])}; install one of the rasterizers that `lapgs patch` knows"
+        )
+    return names
+
+
+def _surely_blends(field: GaussianField, camera: Camera) -> bool:
+    """Whether some Gaussian is certain to be in a tile, however kernels round; False may mean that it was not found.
+
+    A tile takes in a Gaussian whose alpha reaches 1/255 somewhere between its first and last pixels. One whose centre
+    is in the image is at most half a pixel each way from such a place, where with 0.3 px^2 or more of variance alpha
+    is still exp(-5/6) of its opacity.
+    """
+    with torch.no_grad():
+        step = len(field) // LOOKED_AT + 1
+        field = field.with_parameters({name: value[::step] for name, value in field.parameters.items()})
+        pose = camera.world_to_camera.to(field.means)
+        depths = field.means @ pose[2, :3] + pose[2, 3]  # (m,)
+        centres = _centres(field, camera)  # (m, 2)
+        last = centres.new_tensor([camera.width - 1, camera.height - 1])  # (2,)
+        inside = ((centres >= MARGIN) & (centres <= last - MARGIN)).all(1)  # (m,)
+        # A footprint of a few hundred pixels at most: the determinant of its covariance cannot round to 0, which culls.
+        moderate = torch.exp(field.log_scales.amax(1)) * max(camera.fx, camera.fy) < MODERATE * depths  # (m,)
+        visible = field.opacity_logits > VISIBLE_LOGIT  # (m,)
+        return bool((inside & moderate & visible & (depths > 2 * NEAR_DEPTH)).any())
+
+
+def _with_companion(inputs: dict[str, Tensor], camera: Camera, opacity: float) -> dict[str, Tensor]:
+    """A rasterizer's inputs with a last Gaussian that is in a tile and in no pixel: no bit of the image is another.
+
+    It is a point between the first four pixels, where its alpha, of that opacity, is just over 1/255. At the pixels,
+    which the 0.3 px^2 let it reach, it is less than half of that.
+    """
+    rows = {name: value.new_zeros(1, *value.shape[1:]) for name, value in inputs.items()}
+    pose = camera.world_to_camera.to("cpu", torch.float64)
+    # Far enough for float32, which knows the centre to an epsilon of the camera's distance from the origin.
+    depth = 1 + float(pose[:3, 3].norm())
+    point = torch.tensor([(1 - camera.cx) / camera.fx, (1 - camera.cy) / camera.fy, 1.0], dtype=torch.float64) * depth
+    rows["means3D"] = ((point - pose[:3, 3]) @ pose[:3, :3])[None].to(rows["means3D"])  # (1, 3)
+    rows["scales"] += 1e-4 * depth / max(camera.fx, camera.fy)
+    rows["rotations"][:, 0] = 1
+    rows["opacities"] += opacity
+    return {name: torch.cat([value, rows[name]]) for name, value in inputs.items()}
+
+
+def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """World to camera, and world to clip space, both (4, 4) float32 as the kernels read them: column after column."""
+    world_to_camera = camera.world_to_camera.to("cpu", torch.float64)
+    x, y, width, height = camera.fx, camera.fy, camera.width, camera.height
+    clip = torch.tensor(
+        [
+            [2 * x / width, 0, 2 * camera.cx / width - 1, 0],
+            [0, 2 * y / height, 2 * camera.cy / height - 1, 0],
+            [0, 0, FAR / (FAR - NEAR), -FAR * NEAR / (FAR - NEAR)],
+            [0, 0, 1, 0],
+        ],
+        dtype=torch.float64,
+    )
+    return tuple(  # type: ignore[return-value]  # a tuple of two, which mypy cannot count
+        matrix.T.contiguous().to(device, torch.float32) for matrix in (world_to_camera, clip @ world_to_camera)
+    )
+
+
+def _centres(field: GaussianField, camera: Camera) -> Tensor:
+    """(n, 2) projected centres in pixels, of no meaning behind the camera."""
+    pose = camera.world_to_camera.to(field.means)
+    x, y, depth = (field.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)  # (n,) each
+    centres = torch.stack([camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1)
+    return centres.nan_to_num(0, 0, 0)  # a depth of zero times the zero that culls it would stay not a number

@@ -1,0 +1,178 @@
+"""Several fields seen by one camera in one set of gsplat's launches, each at a size of its own.
+
+Up to some two megapixels a field takes a GPU less time than the processor needs to launch its dozen kernels. So the
+fields of a view are sorted into tiles and blended together, as if they were the images of several cameras: Gaussians of
+all fields lie in one list, which gsplat calls packed, with the number of its image beside each.
+
+Projection alone stays one launch a field. By the size of the image gsplat culls, and limits the Jacobian: a coarse
+field projected for the canvas of a finer one would look different near its border, and all that is right of its image
+and below would be blended for nobody. That is why this is not `gsplat.rasterization` with one dimension more.
+
+Tested with gsplat 1.5.3, whose `rasterization` is made of the same five functions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers import gsplat_direct
+from lapgs_plugin.rasterizers.gsplat import cameras_on_device
+from lapgs_plugin.rasterizers.gsplat_direct import TILE
+from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
+
+
+class GsplatStack:
+    """Fields on a device, one after the other in one tensor of each kind, activated; see `raster.FieldStack`.
+
+    They are copies: what becomes of `fields` later is not seen.
+
+    Args:
+        fields: float32, wherever they are.
+        device: where they are rendered.
+        antialiased: dim Gaussians that are smaller than a pixel.
+    """
+
+    def __init__(self, fields: Sequence[GaussianField], device: torch.device, *, antialiased: bool = False) -> None:
+        self._antialiased = antialiased
+        self._signed = [field.signed for field in fields]
+        self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field in the list, and its end
+        self._means = _joined([field.means for field in fields], device)  # (n, 3)
+        self._quaternions = _joined([field.quaternions for field in fields], device)  # (n, 4)
+        self._scales = _joined([field.log_scales for field in fields], device).exp_()  # (n, 3)
+        self._opacities = _joined([field.opacity_logits for field in fields], device).sigmoid_()  # (n,)
+        self._sh = _joined([field.sh for field in fields], device)  # (n, k, 3)
+        images = torch.arange(len(fields), device=device)
+        self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
+        self._direct = device.type == "cuda" and not antialiased and gsplat_direct.works()
+        parts = self._means, self._quaternions, self._scales, self._opacities, self._sh
+        self._parts = [[part[self._rows(i)] for part in parts] for i in range(len(fields))]
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)  # once: from now on every stream may use it
+
+    @torch.no_grad()
+    def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
+        """Images of the first fields; see `raster.FieldStack.render`."""
+        height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
+        viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
+        if self._starts[len(cameras)] == 0:
+            images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
+        elif self._direct:
+            with torch.cuda.device(self._means.device):  # Triton launches on the current one
+                projected, colors = self._see_directly(cameras, viewmats, intrinsics, positions[0])
+                count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
+                images, alphas, *_ = gsplat_direct.blend(
+                    projected, colors, self._opacities[:count], None, size, len(cameras), of_image
+                )
+        else:
+            projected = self._project(cameras, viewmats, intrinsics)
+            images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
+        rendered = []
+        for i, camera in enumerate(cameras):
+            image = images[i, : camera.height, : camera.width]  # (h, w, 3)
+            if background is not None and not self._signed[i]:
+                image = torch.addcmul(image, 1 - alphas[i, : camera.height, : camera.width], background)
+            rendered.append(image.permute(2, 0, 1))
+        return rendered
+
+    def _rows(self, index: int) -> slice:
+        return slice(self._starts[index], self._starts[index + 1])
+
+    def _see_directly(
+        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """What `_project` and `_colors` give, but for opacities, in two launches a field."""
+        from lapgs_plugin.rasterizers.gsplat_triton import place_seen
+
+        count, like = self._starts[len(cameras)], self._means
+        radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
+        means2d, depths, conics, colors = (like.new_empty(count, *columns) for columns in ((2,), (), (3,), (3,)))
+        for i, camera in enumerate(cameras):
+            means, quaternions, scales, opacities, sh = self._parts[i]
+            if len(means) == 0:
+                continue  # gsplat divides by their number
+            pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], (camera.width, camera.height)
+            found = gsplat_direct.project(means, quaternions, scales, opacities, pose, matrix, size)
+            placed = radii, means2d, depths, conics, colors
+            place_seen(means, position, sh, self._signed[i], found, placed, self._starts[i])
+        return [radii, means2d, depths, conics], colors
+
+    def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
+        """Radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields' n."""
+        from gsplat import fully_fused_projection
+
+        fields = []
+        for i, camera in enumerate(cameras):
+            rows = self._rows(i)
+            if rows.start == rows.stop:
+                continue  # gsplat divides by their number
+            *found, dimmed = fully_fused_projection(
+                self._means[rows],
+                None,
+                self._quaternions[rows],
+                self._scales[rows],
+                viewmats[i : i + 1],
+                intrinsics[i : i + 1],
+                camera.width,
+                camera.height,
+                eps2d=PIXEL_VARIANCE,
+                near_plane=NEAR_DEPTH,
+                calc_compensations=self._antialiased,
+                opacities=self._opacities[rows],
+            )  # (1, n_i, ...) each
+            fields.append([values[0] for values in (*found, *([dimmed] if self._antialiased else []))])
+        joined = [torch.cat(parts) if len(parts) > 1 else parts[0] for parts in zip(*fields, strict=True)]
+        opacities = self._opacities[: self._starts[len(cameras)]]
+        return [*joined[:4], opacities * joined[4] if self._antialiased else opacities]
+
+    def _colors(self, positions: Tensor) -> Tensor:
+        """(n, 3) of the first fields from the one place that all cameras, as many as `positions` (f, 3), have."""
+        from gsplat import spherical_harmonics
+
+        count = self._starts[len(positions)]
+        degree = math.isqrt(self._sh.shape[1]) - 1
+        colors: Tensor = spherical_harmonics(degree, self._means[:count] - positions[0], self._sh[:count])
+        for i in range(len(positions)):
+            if not self._signed[i]:
+                colors[self._rows(i)].add_(0.5).clamp_min_(0.0)
+        return colors
+
+    def _blend(
+        self, projected: Sequence[Tensor], colors: Tensor, count: int, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """Colours (f, h, w, 3) and opacities (f, h, w, 1) of `count` images of one size (h, w)."""
+        from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
+
+        radii, means2d, depths, conics, opacities = projected
+        height, width = size
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        of_image = self._images[: len(depths)]
+        # It asks for the number of each Gaussian, too, and makes no use of it.
+        _, keys, order = isect_tiles(
+            means2d, radii, depths, TILE, columns, rows,
+            packed=True, n_images=count, image_ids=of_image, gaussian_ids=of_image,
+        )  # fmt: skip
+        offsets = isect_offset_encode(keys, count, columns, rows)  # (f, rows, columns)
+        # No backgrounds: 1.5.3 takes one for all images of a packed list, not one for each.
+        images, alphas = rasterize_to_pixels(
+            means2d, conics, colors, opacities, width, height, TILE, offsets, order, packed=True
+        )
+        return images, alphas
+
+
+def _joined(values: Sequence[Tensor], device: torch.device) -> Tensor:
+    """(n_i, ...) of several fields as (n, ...) on `device`; those with fewer SH coefficients are filled with zeros."""
+    shape = [max(value.shape[axis] for value in values) for axis in range(1, values[0].ndim)]
+    joined = torch.zeros(sum(len(value) for value in values), *shape, device=device)
+    start = 0
+    for value in values:
+        # One by one into their places: brought there first and then joined, all would be there twice for a while.
+        joined[(slice(start, start + len(value)), *map(slice, value.shape[1:]))] = value.detach()
+        start += len(value)
+    return joined

@@ -1,0 +1,211 @@
+"""Signed colour: how one call asks a CUDA rasterizer for the raw SH value instead of max(SH + 0.5, 0), and what happens
+where the installed one does not know how.
+
+Whether an extension knows is found by rendering one Gaussian with it, never by reading a version. Where it does not, SH
+is evaluated in PyTorch and the same rasterizer gets precomputed colours: the same image, slower.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from enum import Enum
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import PatchError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.patching import State, Target, find_targets, status
+
+logger = logging.getLogger(__name__)
+
+SIGNED_COLOR_BIT = -(2**31)
+"""The bit of a call's `sh_degree` that asks for signed colour: the sign bit of C's int.
+
+Rasterizers patched with `patches/*.toml` strip it in both passes. Of all bits this one is harmless where it is not
+known: an unpatched build takes the degree for one below 1 and reads the first coefficient only, whereas any other high
+bit would be taken for a degree above 3 and read coefficients that a field of lower degree does not have.
+"""
+
+SIGNED_COLOR_SET = "signed-color"
+"""The set of edits in `patches/*.toml` that teaches a rasterizer the bit."""
+
+PROBE_TOLERANCE = 1e-3
+"""Largest error of the probe's image and gradient: float32 gives 1e-6, a colour map of another kind about 1."""
+
+
+class ColorPath(Enum):
+    """How the colours of a signed field reach the blending kernel."""
+
+    NATIVE = "native"
+    PRECOMPUTED = "precomputed"
+
+
+class Extension(Protocol):
+    """A rasterizer as its adapter presents it, before signed colour is decided on."""
+
+    @property
+    def name(self) -> str:
+        """The name of its Python module."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where fields have to be."""
+        ...
+
+    def render(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
+    ) -> RenderResult:
+        """Render without looking at `field.signed`.
+
+        Args:
+            field: n Gaussians on `device`.
+            camera: the view.
+            background: (3,) colour behind everything.
+            sh_degree: handed on as it is, flag included.
+            colors: (n, 3) the Gaussians' colours; the field's SH and `sh_degree` are then not looked at.
+        """
+        ...
+
+
+def signed_degree(degree: int) -> int:
+    """The `sh_degree` to pass for signed colour of this SH degree, 0 to 3."""
+    return degree | SIGNED_COLOR_BIT
+
+
+class SignedColorRasterizer:
+    """An extension as a `Rasterizer` that renders signed fields on the fastest path it has.
+
+    Args:
+        extension: what renders.
+        path: the path for signed fields; None finds out with the first of them, and says once what it costs if it is
+            the slow one.
+        checkout: folder where the sources of the extension are looked for, to say what is wrong with the build.
+    """
+
+    def __init__(self, extension: Extension, *, path: ColorPath | None = None, checkout: Path | None = None) -> None:
+        self._extension = extension
+        self._forced = path
+        self._checkout = checkout
+
+    @property
+    def name(self) -> str:
+        return self._extension.name
+
+    @cached_property
+    def path(self) -> ColorPath:
+        """How signed fields are rendered."""
+        if self._forced is not None:
+            return self._forced
+        if has_signed_color(self._extension):
+            return ColorPath.NATIVE
+        logger.warning("%s", explain_fallback(self.name, self._checkout or Path.cwd()))
+        return ColorPath.PRECOMPUTED
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `lapgs_plugin.fields.rasterizer.Rasterizer`."""
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        colors = None
+        if field.signed:
+            if self.path is ColorPath.NATIVE:
+                degree = signed_degree(degree)
+            else:
+                colors = precomputed_colors(field, camera, degree)
+        return self._extension.render(field, camera, background=background, sh_degree=degree, colors=colors)
+
+
+def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Tensor:
+    """The Gaussians' colours seen from a camera, (n, 3), evaluated and differentiated by PyTorch.
+
+    Args:
+        field: n Gaussians; `field.signed` chooses the colour map.
+        camera: the view.
+        degree: highest SH degree evaluated.
+    """
+    position = camera.position.to(field.means)  # (3,)
+    directions = torch.nn.functional.normalize(field.means - position, dim=-1)  # (n, 3)
+    return sh_to_color(field.sh, directions, degree, signed=field.signed)
+
+
+def has_signed_color(extension: Extension) -> bool:
+    """Whether the extension as it is installed renders and differentiates signed colour, found by trying."""
+    field, camera, degree = _probe_scene(extension.device)
+    expected = precomputed_colors(field, camera, degree)[0]  # (3,) of both signs
+    with torch.enable_grad():
+        sh = field.sh.clone().requires_grad_()
+        result = extension.render(
+            field.with_parameters({"sh": sh}),
+            camera,
+            background=torch.zeros(3, device=extension.device),
+            sh_degree=signed_degree(degree),
+        )
+        (gradient,) = torch.autograd.grad(result.image.sum(), sh)
+    black, white = torch.zeros(1, 3, device=extension.device), torch.ones(3, device=extension.device)
+    with torch.no_grad():
+        unseen = extension.render(field, camera, background=white, sh_degree=0, colors=black).image[0]  # (h, w)
+    weight = 1 - unseen  # of the only Gaussian
+    image_error = (result.image.detach() - weight * expected[:, None, None]).abs().max()
+    # The image is weight * C0 * sh_0 in each channel, so all have the same gradient unless a clamp is remembered in the
+    # negative ones. Its size is not looked at: an extension whose backward pass loses part of it still has the colours.
+    slope = float(weight.sum()) / math.sqrt(4 * math.pi)
+    spread = float(gradient[0, 0].max() - gradient[0, 0].min())
+    return bool(image_error <= PROBE_TOLERANCE) and slope > 0 and spread <= PROBE_TOLERANCE * slope
+
+
+def _probe_scene(device: torch.device) -> tuple[GaussianField, Camera, int]:
+    """One Gaussian before a camera, whose colour needs SH of degree 1 and is negative in two channels."""
+    camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4, device=device))
+    sh = torch.zeros(1, 4, 3)
+    sh[0, 0] = torch.tensor([-2.0, 1.0, -1.0])
+    sh[0, 2] = torch.tensor([-0.5, 0.5, 1.0])
+    field = GaussianField(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=torch.full((1, 3), math.log(0.2)),
+        opacity_logits=torch.tensor([2.0]),
+        sh=sh,
+        signed=True,
+    )
+    return field.to(device), camera, 1
+
+
+def explain_fallback(module: str, checkout: Path) -> str:
+    """Why signed colour takes the slow path, and the command that gets the fast one; one line.
+
+    Args:
+        module: name of the extension's Python module.
+        checkout: folder of the backbone, or of the rasterizer alone; it need not be one.
+    """
+    slow = (
+        f"{module} has no signed colour: residual fields are rendered with SH evaluated in PyTorch, correct but slower"
+    )
+    target = next(_sources(module, checkout), None)
+    if target is None:
+        return f"{slow}; `lapgs patch apply CHECKOUT` on the sources it was built from, then reinstall it"
+    reinstall = target.recipe.reinstall.format(folder=target.folder)
+    state = {found.set: found.state for found in status(target)}.get(SIGNED_COLOR_SET)
+    if state is State.APPLIED:
+        return (
+            f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run `{reinstall}`"
+        )
+    return f"{slow}; run `lapgs patch apply {checkout}` and then `{reinstall}`"
+
+
+def _sources(module: str, checkout: Path) -> Iterator[Target]:
+    """Known extensions in the checkout that install this module."""
+    try:
+        targets = find_targets(checkout)
+    except PatchError:  # no checkout, or none with a rasterizer in it: the message says less then
+        return
+    yield from (target for target in targets if (target.folder / module).is_dir())

@@ -1,0 +1,124 @@
+"""A hierarchy beside its baseline: the table that `lapgs report` prints and its page shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+from lapgs_plugin.runs.archive import Manifest
+
+Metrics = dict[str, Any]
+"""What metrics.json holds, see `figures.run_figures`."""
+
+NOT_EVERYWHERE = {"mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
+"""Left out where no run has them: imported runs tell little of their training, and there is no GPU on a CPU."""
+PAIR = 2
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure of one run.
+
+    Attributes:
+        value: the number; None where it was not measured.
+        text: how it is written.
+        parts: what it is the sum of, each with its name; empty when it is no sum.
+    """
+
+    value: float | None
+    text: str
+    parts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of every run.
+
+    Attributes:
+        key: short name for scripts.
+        label: what people read, with the unit.
+        cells: the run's, then the baseline's when there is one.
+        change: the run against the baseline, "" without one.
+    """
+
+    key: str
+    label: str
+    cells: tuple[Cell, ...]
+    change: str = ""
+
+
+def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
+    """The figures of a run, and of its baseline beside it.
+
+    Args:
+        metrics: of the run, and of the baseline when there is one.
+    """
+    views = "held-out" if metrics[0]["split"] == "test" else "training"
+    table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
+        ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
+        ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
+        *(
+            (LPIPS_KEY.format(name), f"LPIPS ({title_of(name)}), {views} views", "{:.4f}", _difference("{:+.4f}"))
+            for name in VARIANTS
+            if any(LPIPS_KEY.format(name) in each or name in each["lpips_missing"] for each in metrics)
+        ),
+        ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
+        ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
+        ("num_gaussians", "Gaussians to render", "{:,.0f}", _ratio),
+        ("weighted_gaussians", "Gaussians, mean of levels by iterations", "{:,.0f}", _ratio),
+        ("mean_gaussians", "Gaussians at once, mean of iterations", "{:,.0f}", _ratio),
+        ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),
+        ("peak_memory_bytes", "Peak GPU memory (GB)", "{:.2f}", _ratio),
+        ("peak_memory_without_images_bytes", "Peak GPU memory without images (GB)", "{:.2f}", _ratio),
+        ("fps", "Frames a second", "{:,.0f}", _ratio),
+    )
+    rows = []
+    for key, label, pattern, compare in table:
+        cells = tuple(_cell(each.get(key), pattern, 1e-9 if key.endswith("_bytes") else 1.0) for each in metrics)
+        values = [cell.value for cell in cells if cell.value is not None]
+        if not values and key in NOT_EVERYWHERE:
+            continue
+        rows.append(Row(key, label, cells, compare(*values) if len(values) == PAIR else ""))
+    return tuple(rows)
+
+
+def _cell(value: float | dict[str, float] | None, pattern: str, scale: float) -> Cell:
+    """A number, or the sum of named numbers."""
+    if value is None:
+        return Cell(None, "not measured")
+    if not isinstance(value, dict):
+        value *= scale
+        return Cell(value, pattern.format(value))
+    total = math.fsum(value.values())
+    parts = [f"{f'level {name}' if name.isdigit() else name} {pattern.format(part)}" for name, part in value.items()]
+    return Cell(total, pattern.format(total), tuple(parts) if len(parts) > 1 else ())
+
+
+def _difference(pattern: str) -> Callable[[float, float], str]:
+    return lambda run, baseline: pattern.format(run - baseline)
+
+
+def _speed(run: float, baseline: float) -> str:
+    return f"{baseline / run:.2f}x as fast" if run and baseline else ""
+
+
+def _ratio(run: float, baseline: float) -> str:
+    return f"{run / baseline:.2f}x" if baseline else ""
+
+
+def unlike(run: Manifest, baseline: Manifest) -> list[str]:
+    """In what the two runs differ that makes their figures no comparison of methods, in words."""
+    pairs = {
+        "scene": (run.scene.path, baseline.scene.path),
+        "images": (run.scene.images, baseline.scene.images),
+        "resolution": (run.scene.resolution, baseline.scene.resolution),
+        "held-out views": (run.scene.eval, baseline.scene.eval),
+        "background": (run.scene.background, baseline.scene.background),
+        "rasterizer": (run.rasterizer, baseline.rasterizer),
+        "iterations": (run.settings.get("iterations"), baseline.settings.get("iterations")),
+        "SH degree": (run.sh_degree, baseline.sh_degree),
+    }
+    return [f"{name} {ours} against {theirs}" for name, (ours, theirs) in pairs.items() if ours != theirs]

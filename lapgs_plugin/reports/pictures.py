@@ -1,0 +1,193 @@
+"""Views of runs as pictures for a page: photo, base, residuals, composition, baseline; whole, and cut out enlarged."""
+
+from __future__ import annotations
+
+import base64
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.images import around_grey
+from lapgs_plugin.scenes.images import resize_image, write_image
+from lapgs_plugin.scenes.scene import View
+
+IMAGE_SIDE = 800
+"""Longest side in pixels of a whole image on a page."""
+MOST_COLUMNS = 5
+CUTOUTS = 2
+"""Enlarged parts of a view."""
+CUTOUT_SHARE, CUTOUT_LEAST, CUTOUT_MOST = 1 / 6, 16, 96
+"""Side of a cut-out as a share of the image's shorter side, and its limits in pixels."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One image of the page.
+
+    Attributes:
+        caption, detail: what it is, in words.
+        width, height: in pixels, of what is embedded.
+        data: a data URI.
+    """
+
+    caption: str
+    detail: str
+    width: int
+    height: int
+    data: str
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """A part of a view with strong edges, in every picture of the view.
+
+    Attributes:
+        left, top, width, height: where, in percent of the image's width and height.
+        side: in pixels of the full-resolution image.
+        pictures: pixel by pixel, in the order of the view's pictures.
+    """
+
+    left: float
+    top: float
+    width: float
+    height: float
+    side: int
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """The pictures of one view, from the photo to the composition, and why this view is shown.
+
+    Attributes:
+        name: of the view.
+        why, figures: texts.
+        pictures: whole, all of the same size.
+        cutouts: parts of them.
+    """
+
+    name: str
+    why: str
+    figures: str
+    pictures: tuple[Picture, ...]
+    cutouts: tuple[Cutout, ...]
+
+    @property
+    def columns(self) -> int:
+        """Pictures in a row of a wide page: all of them, or half when they would get too small."""
+        count = len(self.pictures)
+        return count if count <= MOST_COLUMNS else (count + 1) // 2
+
+    @property
+    def compared(self) -> tuple[int, int]:
+        """Which pictures lie beside each other at first: the baseline, or else the photo, and the composition."""
+        captions = [picture.caption for picture in self.pictures]
+        return captions.index("Baseline") if "Baseline" in captions else 0, captions.index("Composition")
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """What one picture shows: (3, h, w) at full resolution."""
+
+    caption: str
+    detail: str
+    image: Tensor
+
+
+@torch.no_grad()
+def make_strip(view: View, why: str, figures: str, renderers: Sequence[HierarchyRenderer]) -> Strip:
+    """Render a view with a run, and with its baseline if there is one.
+
+    Args:
+        view: with its photo.
+        why, figures: see `Strip`.
+        renderers: of the run, and of the baseline.
+    """
+    layers = _layers(view, renderers)
+    cutouts = tuple(_cut_out(layers, place) for place in edge_squares(view.image, CUTOUTS))
+    return Strip(view.name, why, figures, tuple(_whole(layer) for layer in layers), cutouts)
+
+
+def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
+    """Everything brought to full resolution with Up, so that it lies on each other pixel by pixel."""
+    renderer = renderers[0]
+    composition = renderer.render(view.camera)
+    layers = [_Layer("Photo", "ground truth", view.image)]
+
+    def whole(image: Tensor, level: int) -> Tensor:
+        return to_full_size(image, view.camera, level, renderer.pyramid).cpu()
+
+    coarsest = renderer.levels - 1
+    if composition.residuals:
+        layers.append(_Layer("Base", _of_level(coarsest, composition.base), whole(composition.base, coarsest)))
+    for level, residual in composition.residuals.items():
+        detail = f"{_of_level(level, residual)}, zero is grey"
+        layers.append(_Layer("Residual", detail, around_grey(whole(residual, level))))
+    layers.append(_Layer("Composition", "what the run renders", composition.composed[0].cpu()))
+    for baseline in renderers[1:]:
+        image = baseline.render(view.camera).composed[0].cpu()
+        layers.append(_Layer("Baseline", "what it renders", image))
+    return layers
+
+
+def _of_level(level: int, image: Tensor) -> str:
+    height, width = image.shape[-2:]
+    return f"level {level}, {width}x{height}"
+
+
+def edge_squares(photo: Tensor, count: int) -> list[tuple[int, int, int]]:
+    """Where a photo's edges are strongest: where most of it is lost one pyramid level down.
+
+    Args:
+        photo: (3, h, w).
+        count: of squares, at most; fewer where there is no more room.
+
+    Returns:
+        Left, top and side in pixels of squares that do not overlap, strongest first.
+    """
+    height, width = photo.shape[-2:]
+    side = min(height, width, max(CUTOUT_LEAST, min(CUTOUT_MOST, round(min(height, width) * CUTOUT_SHARE))))
+    pyramid = Pyramid()
+    lost = (photo - pyramid.up(pyramid.down(photo), (height, width))).square().mean(0)  # (h, w)
+    strength = torch.nn.functional.avg_pool2d(lost[None, None], side, stride=1)[0, 0]  # (h - side + 1, w - side + 1)
+    squares: list[tuple[int, int, int]] = []
+    while len(squares) < count and bool((strength >= 0).any()):
+        top, left = divmod(int(strength.argmax()), strength.shape[1])
+        squares.append((left, top, side))
+        strength[max(0, top - side + 1) : top + side, max(0, left - side + 1) : left + side] = -1.0
+    return squares
+
+
+def _cut_out(layers: Sequence[_Layer], square: tuple[int, int, int]) -> Cutout:
+    left, top, side = square
+    height, width = layers[0].image.shape[-2:]
+    pictures = []
+    for layer in layers:
+        part = layer.image[:, top : top + side, left : left + side]
+        pictures.append(Picture(layer.caption, "", side, side, _data_uri(part, "png")))
+    return Cutout(
+        100 * left / width, 100 * top / height, 100 * side / width, 100 * side / height, side, tuple(pictures)
+    )
+
+
+def _whole(layer: _Layer) -> Picture:
+    height, width = layer.image.shape[-2:]
+    scale = min(1.0, IMAGE_SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = resize_image(layer.image.clamp(0.0, 1.0), size)
+    return Picture(layer.caption, layer.detail, *size, _data_uri(small, "jpg"))
+
+
+def _data_uri(image: Tensor, kind: str) -> str:
+    """(3, h, w) as the text of a JPEG or PNG file in a page."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"picture.{kind}"
+        write_image(file, image)
+        data = base64.b64encode(file.read_bytes()).decode()
+    return f"data:image/{'jpeg' if kind == 'jpg' else kind};base64,{data}"

@@ -1,0 +1,194 @@
+"""What a checkout's own run took: `lapgs run --off --record` watches a script from outside and changes nothing in it.
+
+The symbols that the driver of a hierarchy replaces to take its time are wrapped here for the same purpose, so that both
+are timed between the same moments: from the first iteration to the return of `training`, without saving. A call more an
+iteration, of about a microsecond, is all that the script gets. After the script's end its held-out views are rendered
+with its own `render`. Everything goes into one file of the script's output folder.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
+
+logger = logging.getLogger(__name__)
+
+TIMELINE_ENTRIES = 200
+"""About how many moments of a run are noted with their number of Gaussians."""
+
+
+class BareRunRecorder:
+    """Runs a script's main block and notes what it took.
+
+    Args:
+        adapter: of the script's backbone.
+        device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
+    """
+
+    def __init__(self, adapter: BackboneAdapter, device: str) -> None:
+        self._adapter, self._device = adapter, device
+        self._call: TrainingCall | None = None
+        self._scene: Any = None
+        self._began: float | None = None
+        self._seconds = self._saving = 0.0
+        self._iteration = self._peak = self._summed = 0
+        self._memory: dict[str, int] = {}
+        self._timeline: list[dict[str, float]] = []
+
+    def run(self) -> None:
+        """Run the main block and write `BARE_RECORD`.
+
+        Raises:
+            UserInputError: the script never trained.
+        """
+        with Attachment(self._replacements()):
+            self._adapter.script.run_main()
+        if self._call is None or self._began is None:
+            raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
+        path = Path(self._call.dataset.model_path) / BARE_RECORD
+        text = json.dumps(self._record(), indent=2) + "\n"
+        with one_line_errors(path), atomic_write(path) as stream:
+            stream.write(text.encode())
+        logger.info("recorded: %s", path)
+
+    def _replacements(self) -> list[Replacement]:
+        train = self._adapter.train
+        return [
+            Replacement(train, "training", self._make_training, ("dataset", "opt", "pipe"), "the main block"),
+            Replacement(train, "Scene", self._make_scene, ("args", "gaussians"), "training()"),
+            Replacement(
+                train.GaussianModel,
+                "update_learning_rate",
+                self._make_update_learning_rate,
+                ("self", "iteration"),
+                "training() at the start of every iteration",
+            ),
+            Replacement(train.Scene, "save", self._make_save, ("self", "iteration"), "training() at --save_iterations"),
+        ]
+
+    def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def training(*args: Any, **kwargs: Any) -> Any:
+            self._call = TrainingCall.bind(original, args, kwargs)
+            result = original(*args, **kwargs)
+            self._synchronize()
+            if self._began is not None:
+                self._seconds = time.perf_counter() - self._began - self._saving
+            if self._device == "cuda":
+                self._memory = {"peak": torch.cuda.max_memory_allocated(), "images": self._image_bytes()}
+            return result
+
+        return training
+
+    def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def make_scene(*args: Any, **kwargs: Any) -> Any:
+            self._scene = original(*args, **kwargs)
+            return self._scene
+
+        return make_scene
+
+    def _make_update_learning_rate(self, original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
+        def update_learning_rate(gaussians: Any, iteration: int) -> Any:
+            self._iteration_begins(len(gaussians._xyz), iteration)
+            return original(gaussians, iteration)
+
+        return update_learning_rate
+
+    def _make_save(self, original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
+        def save(scene: Any, iteration: int) -> Any:
+            self._synchronize()
+            start = time.perf_counter()
+            result = original(scene, iteration)
+            self._saving += time.perf_counter() - start
+            return result
+
+        return save
+
+    def _iteration_begins(self, count: int, iteration: int) -> None:
+        if self._began is None:
+            self._synchronize()
+            if self._device == "cuda":
+                torch.cuda.reset_peak_memory_stats()
+            self._began = time.perf_counter()
+        self._iteration += 1
+        self._summed += count
+        self._peak = max(self._peak, count)
+        assert self._call is not None, "training() makes iterations"
+        if iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
+            elapsed = time.perf_counter() - self._began - self._saving
+            self._timeline.append({"iteration": iteration, "elapsed": elapsed, "num_gaussians": count})
+
+    def _record(self) -> dict[str, Any]:
+        """What the file holds; `imported` and `experiments.rows` read it."""
+        gaussians = self._scene.gaussians
+        return {
+            "iterations": self._iteration,
+            "train_seconds": self._seconds,
+            "saving_seconds": self._saving,
+            "num_gaussians": len(gaussians._xyz),
+            "peak_gaussians": max(self._peak, len(gaussians._xyz)),
+            "mean_gaussians": self._summed / self._iteration,
+            "memory_bytes": self._memory,
+            **self._held_out(gaussians),
+            "timeline": self._timeline,
+        }
+
+    @torch.no_grad()
+    def _held_out(self, gaussians: Any) -> dict[str, float]:
+        """Means of PSNR in dB and SSIM over the held-out views, empty without any."""
+        assert self._call is not None, "called after training"
+        cameras = list(self._scene.getTestCameras())
+        background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
+        images: list[Tensor] = []
+
+        def keeping(original: Callable[..., Any]) -> Callable[..., Any]:
+            return lambda raster_settings: _Keeping(original(raster_settings=raster_settings), images)
+
+        renderer = sys.modules["gaussian_renderer"]
+        with Attachment([Replacement(renderer, "GaussianRasterizer", keeping, None, "render()")]):
+            return mean_quality(self._rendered(camera, gaussians, background, images) for camera in cameras)
+
+    def _rendered(self, camera: Any, gaussians: Any, background: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """A view as its rasterizer, which puts it into `images`, makes it, and its photo; (3, h, w) each."""
+        assert self._call is not None, "called after training"
+        self._adapter.render(self._call, camera, gaussians, background)
+        image = images.pop()
+        return image, camera.original_image.to(image.device)
+
+    def _image_bytes(self) -> int:
+        """Of the photos that lie on the GPU."""
+        cameras = [*self._scene.getTrainCameras(), *self._scene.getTestCameras()]
+        images = [camera.original_image for camera in cameras]
+        return sum(image.numel() * image.element_size() for image in images if image.device.type == "cuda")
+
+    def _synchronize(self) -> None:
+        if self._device == "cuda":
+            torch.cuda.synchronize()
+
+
+class _Keeping:
+    """A rasterizer of the checkout for one view, whose image is kept."""
+
+    def __init__(self, original: Any, images: list[Tensor]) -> None:
+        self._original, self._images = original, images
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._original, name)
+
+    def __call__(self, **inputs: Any) -> Any:
+        outputs = self._original(**inputs)
+        self._images.append(outputs[0])
+        return outputs
