@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
@@ -227,7 +228,10 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
             "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
         )
-    resized = camera.resized(*rule.size_for(width, height)).to(dtype=torch.float32)
+    size = rule.size_for(width, height)
+    subject = f"{frame.path}: at --resolution {rule.text} the image has {size[0]}x{size[1]} pixels"
+    VIEW_PIXELS.check(size[0] * size[1], subject, "choose a smaller --resolution", SceneError)
+    resized = camera.resized(*size).to(dtype=torch.float32)
     return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if rule.backbone is not None else resized
 
 

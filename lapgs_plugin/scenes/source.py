@@ -50,6 +50,14 @@ class SceneSource:
     colors: NDArray[np.float64]  # (n, 3)
 
 
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False too for names that the file system cannot have, of more than 255 bytes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
