@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
 from lapgs_plugin.files import atomic_write
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
@@ -298,7 +298,7 @@ def _describe(job: _Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRe
     left_out = sorted(set(job.names) - set(registered))
     if left_out:
         named = ", ".join(left_out[:10]) + (f" and {len(left_out) - 10} more" if len(left_out) > 10 else "")
-        logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), named)
+        logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), printable(named))
     return PrepareResult(
         registered=tuple(registered),
         left_out=tuple(left_out),
