@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.limits import FRAMES, VIEW_PIXELS
 from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
+from lapgs_plugin.scenes.source import LARGEST, LONGEST_FOCAL, LONGEST_SIDE
 
 MAX_KEYS = 24
 """Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
@@ -125,16 +127,20 @@ def read_trajectory(path: Path) -> list[Camera]:
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserInputError(f'--trajectory {path}: no cameras in it, expected a list "frames" as in transforms.json')
+    FRAMES.check(len(frames), f"--trajectory {path} has {len(frames)} frames")
     cameras = []
     for index, frame in enumerate(frames):
         try:
-            cameras.append(_read_camera({**values, **frame}))
+            camera = _read_camera({**values, **frame})
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise UserInputError(
                 f"--trajectory {path}: the camera of frame {index} is not usable: {reason}; expected a rigid 4x4 "
                 "transform_matrix, w, h and fl_x or camera_angle_x"
             ) from error
+        subject = f"--trajectory {path}: the camera of frame {index} has {camera.width}x{camera.height} pixels"
+        VIEW_PIXELS.check(camera.width * camera.height, subject, "write a smaller w and h")
+        cameras.append(camera)
     return cameras
 
 
@@ -201,12 +207,18 @@ def _read_camera(values: dict[str, Any]) -> Camera:
         raise ValueError(f"transform_matrix has shape {matrix.shape}")
     if not np.isfinite([*matrix.ravel(), focal, focal_y, cx, cy]).all():
         raise ValueError("NaN or inf in it")
+    if (largest := float(np.abs(matrix).max())) > LARGEST:
+        raise ValueError(f"{largest:g} in transform_matrix, at most {LARGEST:g} is of use")
     rotation = matrix[:3, :3]
     off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
     if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError("transform_matrix is not a rotation and a translation")
     if min(width, height, focal, focal_y) <= 0:
         raise ValueError(f"{width}x{height} pixels with focal lengths {focal:g} and {focal_y:g}")
+    if max(width, height) > LONGEST_SIDE or max(focal, focal_y, abs(cx), abs(cy)) > LONGEST_FOCAL * max(width, height):
+        raise ValueError(
+            f"{width:.6g}x{height:.6g} pixels with focal lengths {focal:g} and {focal_y:g} around ({cx:g}, {cy:g})"
+        )
     pose = torch.from_numpy(np.linalg.inv(matrix @ OPENGL_AXES)).float()
     return Camera(width, height, focal, focal_y, cx, cy, pose)
 
