@@ -8,7 +8,6 @@ frame (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -17,12 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.ply import read_ply, scalar_names
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out, in_name_order
+from lapgs_plugin.untrusted import read_json
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
@@ -90,10 +90,7 @@ def _read_pair(
 
 
 def _read_json(file: Path) -> Values:
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{file}: not readable as JSON ({error}); export the scene again") from error
+    values = read_json(file, error=SceneError, advice="export the scene again", finite=False)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
         raise SceneError(f"{file}: no list of frames in it, expected the transforms of NeRF, instant-ngp or nerfstudio")
     return values
@@ -189,13 +186,20 @@ def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArr
     if file is None:
         return None
     try:
-        vertices = PlyData.read(str(file))["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    except (OSError, KeyError, ValueError, PlyParseError) as error:
+        element = read_ply(file)["vertex"]
+    except (OSError, KeyError, ValueError) as error:
         raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+    vertices, channels = element.data, ("red", "green", "blue")
+    lists = {prop.name for prop in element.properties} - scalar_names(element)
+    if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
+        raise SceneError(
+            f"{file}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number of "
+            "each point); export or remove it"
+        )
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if not set(channels) <= scalar_names(element):
         return points, np.full_like(points, 0.5)
-    colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
+    colors = np.stack([vertices[channel] for channel in channels], axis=1)
     return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
 
 
