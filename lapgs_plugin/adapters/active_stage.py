@@ -23,7 +23,7 @@ from lapgs_plugin.adapters.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.adapters.shim import StageRendering
 from lapgs_plugin.adapters.stage_images import StageImages
 from lapgs_plugin.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
-from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.field import GaussianField
 from lapgs_plugin.inheritance import inherit
@@ -283,6 +283,11 @@ class ActiveStage:
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.path(f"level_{self.stage.level}", OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
+            if not all(isinstance(left.get(part), dict) for part in ("carried", "moments")):
+                raise RunFolderError(
+                    f"{self._archive.path(f'level_{self.stage.level}', OPTIMIZER)} holds {', '.join(map(str, left))}, "
+                    "expected carried and moments; start again with --overwrite"
+                )
         carried = {
             name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
             for name, value in left["carried"].items()

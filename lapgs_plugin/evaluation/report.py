@@ -9,7 +9,8 @@ from typing import Any
 
 import jinja2
 
-from lapgs_plugin.archive import REPORT, RunArchive
+from lapgs_plugin.archive import METRICS, REPORT, RunArchive
+from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.charts import (
     INSET_AT,
     Bar,
@@ -31,6 +32,7 @@ from lapgs_plugin.progress import item_progress
 from lapgs_plugin.reference_raster.threads import one_pool
 from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"
 MINUTES_FROM = 300.0
@@ -307,6 +309,11 @@ def view_strips(
     with one_pool():
         scene = run_scene(run.archive, moved_to)
         views = {view.name: view for view in (*scene.train, *scene.test)}
+        if unknown := sorted(shown.keys() - views.keys()):
+            raise RunFolderError(
+                f"{run.archive.path(METRICS)} measures the view {shortened(unknown[0])}, which {scene.path} does not "
+                "have; write it again with `lapgs eval`"
+            )
         with item_progress("views") as progress:
             return [
                 make_strip(views[name], why, figures[name], renderers)
@@ -333,7 +340,9 @@ def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
     keys = {"psnr": "PSNR (dB)", "ssim": "SSIM"}
     keys |= {
-        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})" for name in VARIANTS if LPIPS_KEY.format(name) in views[0]
+        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})"
+        for name in VARIANTS
+        if all(LPIPS_KEY.format(name) in view for view in views)
     }
     others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]
     rows = []

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.untrusted import parse_json
 
 CSV, PARQUET, MARKDOWN, LATEX = "results.csv", "results.parquet", "tables.md", "tables.tex"
 
@@ -71,8 +71,8 @@ def read_csv(path: Path) -> list[dict[str, Any]]:
 
 def _value(text: str) -> Any:
     try:
-        value = json.loads(text)
-    except ValueError:
+        value = parse_json(text, "a cell", advice="")
+    except UserInputError:
         return text
     return value if isinstance(value, (int, float)) else text
 

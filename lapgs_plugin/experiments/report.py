@@ -268,7 +268,7 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
         kinds = [results.style(variant) for variant in runs]
         charts = training_charts(list(runs.values()), kinds)
     names = {results.style(variant): variant for variant in runs}
-    measured = [name for name in runs if "views" in runs[name].metrics]
+    measured = [name for name in runs if runs[name].metrics.get("views")]
     shown = next((name for name in measured if name != base), base)
     strips: list[Strip] = []
     columns: list[str] = []

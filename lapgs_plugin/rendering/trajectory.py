@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,6 +19,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.limits import FRAMES, VIEW_PIXELS
 from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
 from lapgs_plugin.scenes.source import LARGEST, LONGEST_FOCAL, LONGEST_SIDE
+from lapgs_plugin.untrusted import read_json
 
 MAX_KEYS = 24
 """Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
@@ -114,16 +114,8 @@ def read_trajectory(path: Path) -> list[Camera]:
     Raises:
         UserInputError: the file or one of its cameras is not usable; names the frame.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserInputError(
-            f"--trajectory {path}: cannot be read ({error.strerror}); expected orbit, spline or a JSON file of cameras"
-        ) from error
-    except ValueError as error:
-        raise UserInputError(
-            f"--trajectory {path}: not JSON ({error}); expected cameras as in transforms.json"
-        ) from error
+    advice = "give orbit, spline or a JSON file of cameras as in transforms.json"
+    values = read_json(path, advice=advice, finite=False)
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserInputError(f'--trajectory {path}: no cameras in it, expected a list "frames" as in transforms.json')

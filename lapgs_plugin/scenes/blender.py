@@ -8,21 +8,18 @@ frame (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.ply import read_ply, scalar_names
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.source import (
     LARGEST,
@@ -34,6 +31,7 @@ from lapgs_plugin.scenes.source import (
     in_name_order,
     is_file,
 )
+from lapgs_plugin.untrusted import read_json
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
@@ -45,7 +43,6 @@ SHORTEST_FOCAL = 1e-3
 """Of a side of the image; shorter ones are of files that hold other units than radians."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 POINT_COLORS = ("red", "green", "blue")
-PLY_HEADER_BYTES = 1 << 16
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
 RANDOM_POINTS = 100_000
@@ -103,10 +100,7 @@ def _read_pair(
 
 
 def _read_json(file: Path) -> Values:
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{file}: not readable as JSON ({error}); export the scene again") from error
+    values = read_json(file, error=SceneError, advice="export the scene again", finite=False)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
         raise SceneError(f"{file}: no list of frames in it, expected the transforms of NeRF, instant-ngp or nerfstudio")
     return values
@@ -209,35 +203,21 @@ def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArr
     if file is None:
         return None
     try:
-        _check_counts(file)
-        vertices = PlyData.read(str(file))["vertex"].data
-        points = _columns(vertices, ("x", "y", "z"))
-        coloured = set(POINT_COLORS) <= set(vertices.dtype.names)
-        colors = _columns(vertices, POINT_COLORS) if coloured else np.full_like(points, 0.5)
-    except (OSError, KeyError, ValueError, ArithmeticError, MemoryError, PlyParseError) as error:
+        element = read_ply(file)["vertex"]
+    except (OSError, KeyError, ValueError) as error:
         raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
-    in_bytes = coloured and all(vertices.dtype[channel] == np.uint8 for channel in POINT_COLORS)
-    return points, colors / 255.0 if in_bytes else colors
-
-
-def _check_counts(file: Path) -> None:
-    """Refuse a PLY that announces more vertices than it has bytes, which plyfile would make room for first."""
-    size = file.stat().st_size
-    with file.open("rb") as stream:
-        header = stream.read(PLY_HEADER_BYTES).partition(b"end_header")[0]
-    for name, count in re.findall(rb"^element[ \t]+(\S+)[ \t]+(\S+)", header, re.MULTILINE):
-        if not re.fullmatch(rb"[0-9]{1,18}", count) or int(count) > size:
-            raise ValueError(
-                f"{count.decode(errors='replace'):.40} of element {name.decode(errors='replace'):.40} in {size} bytes"
-            )
-
-
-def _columns(vertices: NDArray[Any], names: Sequence[str]) -> NDArray[np.float64]:
-    """Properties of vertices, (n, len(names))."""
-    for name in names:
-        if vertices.dtype[name].kind not in "iuf":
-            raise ValueError(f"property {name} is a list, expected a number")
-    return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
+    vertices, channels = element.data, POINT_COLORS
+    lists = {prop.name for prop in element.properties} - scalar_names(element)
+    if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
+        raise SceneError(
+            f"{file}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number of "
+            "each point); export or remove it"
+        )
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if not set(channels) <= scalar_names(element):
+        return points, np.full_like(points, 0.5)
+    colors = np.stack([vertices[channel] for channel in channels], axis=1)
+    return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
 
 
 def _random_points(frames: list[Frame], radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

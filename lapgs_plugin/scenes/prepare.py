@@ -35,6 +35,7 @@ from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import check_image, read_image, write_image
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
+from lapgs_plugin.untrusted import read_json
 
 _T = TypeVar("_T")
 
@@ -227,7 +228,7 @@ def _open_work(job: _Job, single_camera: bool, overwrite: bool) -> None:
     }
     file = job.work / "settings.json"
     if file.is_file():
-        before = json.loads(file.read_text())
+        before = read_json(file, dict[str, Any], advice=f"delete {job.work} to start over")
         changed = [key for key in settings if before.get(key) != settings[key]]
         if not changed:
             return

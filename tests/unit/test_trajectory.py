@@ -167,10 +167,10 @@ def test_a_bad_file_is_one_line_that_names_the_frame(values: object, message: st
 
 
 def test_a_file_that_is_not_there_or_not_json(tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match="expected orbit, spline or a JSON file"):
+    with pytest.raises(UserInputError, match="give orbit, spline or a JSON file"):
         read_trajectory(tmp_path / "spiral")
     (tmp_path / "path.json").write_text("{")
-    with pytest.raises(UserInputError, match="not JSON"):
+    with pytest.raises(UserInputError, match="not readable as JSON"):
         read_trajectory(tmp_path / "path.json")
 
 
