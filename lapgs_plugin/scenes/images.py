@@ -245,8 +245,8 @@ def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
 def _open(path: Path) -> oiio.ImageInput:
     if (length := len(path.name.encode(errors="surrogatepass"))) > LONGEST_NAME:
         raise SceneError(
-            f"{path.parent}: the name of image {path.name[:32]}... has {length} bytes, expected at most {LONGEST_NAME}; "
-            "rename the photo and reconstruct or export again"
+            f"{path.parent}: the name of image {path.name[:32]}... has {length} bytes, expected at most "
+            f"{LONGEST_NAME}; rename the photo and reconstruct or export again"
         )
     if not is_file(path):
         raise SceneError(f"{path}: no such image; put it there or choose another folder with --images")
@@ -304,7 +304,7 @@ def _strips(
             if stored is not None:
                 pixels[:, columns] = stored[:, columns.start - left : columns.stop - left]
             stored = pixels
-        image = torch.from_numpy(_blend(stored, spec, channels, background)).permute(2, 0, 1)
+        image = torch.from_numpy(_blend(stored, channels, background)).permute(2, 0, 1)
         if is_float and not bool(torch.isfinite(image).all()):
             raise SceneError(f"{path}: the image holds NaN or inf, expected finite values; render or export it again")
         return first, image
@@ -340,29 +340,31 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
 
 
 class _Channels(NamedTuple):
-    """Which channels of a file are red, green and blue, and which is alpha; -1 for none."""
+    """Which channels of a file are red, green and blue, which is alpha (-1 for none), and whether colour is straight,
+    not yet multiplied by alpha."""
 
     colour: list[int]
     alpha: int
+    straight: bool
 
 
 def _channels(spec: oiio.ImageSpec) -> _Channels:
-    alpha = spec.alpha_channel
-    if alpha >= spec.nchannels:  # OpenImageIO's reader of GIF counts from one
-        alpha = spec.channelindex("A")
+    alpha, straight = spec.alpha_channel, bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
+    if alpha >= spec.nchannels:  # OpenImageIO's reader of GIF counts from one, and does not say that colour is straight
+        alpha, straight = spec.channelindex("A"), True
     colour = [channel for channel in range(spec.nchannels) if channel != alpha][:3]
-    return _Channels(colour if len(colour) == 3 else colour[:1] * 3, alpha)
+    return _Channels(colour if len(colour) == 3 else colour[:1] * 3, alpha, straight)
 
 
 def _blend(
-    pixels: NDArray[np.float32], spec: oiio.ImageSpec, channels: _Channels, background: tuple[float, float, float]
+    pixels: NDArray[np.float32], channels: _Channels, background: tuple[float, float, float]
 ) -> NDArray[np.float32]:
     """RGB (h, w, 3) over the background from (h, w, channels)."""
     colour = pixels[..., channels.colour]
     if channels.alpha < 0:
         return colour
     alpha = pixels[..., channels.alpha, None]
-    if spec.get_int_attribute("oiio:UnassociatedAlpha"):
+    if channels.straight:
         colour = colour * alpha
     return colour + (1.0 - alpha) * np.asarray(background, np.float32)
 
