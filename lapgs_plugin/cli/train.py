@@ -348,6 +348,7 @@ def _resume(
         The run, its scene, and its settings, of which `anew` gives those that may change.
     """
     from lapgs_plugin.archive import RunArchive
+    from lapgs_plugin.files import MANIFEST
     from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.settings import TrainSettings
@@ -362,7 +363,7 @@ def _resume(
                 f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
                 "start again with --overwrite"
             )
-        settings = TrainSettings.from_manifest(manifest)
+        settings = TrainSettings.from_manifest(manifest, str(archive.path(MANIFEST)))
         started_with = _options(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys()):
             if wanted[name] != started_with[name]:

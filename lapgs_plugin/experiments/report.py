@@ -33,6 +33,7 @@ from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.rendering.run import run_renderer
+from lapgs_plugin.untrusted import read_text, shortened
 
 TEMPLATE = "experiment.html.jinja"
 COLORS = 8
@@ -43,6 +44,9 @@ COUNTS = {
     "gaussians": "Gaussians to render",
 }
 """Columns that say how many Gaussians there were: the first that all rows have is charted."""
+
+NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
+"""Columns that every row has: text and numbers."""
 
 Row = Mapping[str, Any]
 
@@ -93,15 +97,22 @@ class Results:
         path = folder / CSV
         try:
             rows = read_csv(path)
-            missing = {"variant", "baseline", "run", "scene", "backbone", "train_seconds", "gaussians"} - set(
-                rows[0] if rows else ()
-            )
         except (OSError, ValueError) as error:
-            raise RunFolderError(f"{path} cannot be read ({error}); expected what `lapgs bench` writes") from error
-        if missing:
             raise RunFolderError(
-                f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
-            )
+                f"{path} cannot be read ({shortened(str(error))}); expected what `lapgs bench` writes"
+            ) from error
+        for row in rows or [{}]:
+            if missing := {*NAMES, *FIGURES} - row.keys():
+                raise RunFolderError(
+                    f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
+                )
+            for name, value in row.items():
+                if (name in FIGURES or name in COUNTS or name.endswith(("_seconds", "_ms"))) and isinstance(value, str):
+                    raise RunFolderError(
+                        f"{path}: {shortened(name)} is {shortened(value)}, expected a number; write it again with "
+                        "`lapgs bench` and --tables-only"
+                    )
+        rows = [{**row, **{name: str(row[name]) for name in NAMES}} for row in rows]
         return cls(folder, rows)
 
     @property
@@ -166,7 +177,8 @@ def _tables(path: Path) -> tuple[str, str]:
     """The experiment's title, and its tables as HTML."""
     if not path.is_file():
         return "", ""
-    first, _, rest = path.read_text(encoding="utf-8").partition("\n")
+    advice = "write it again with `lapgs bench` and --tables-only"
+    first, _, rest = read_text(path, error=RunFolderError, advice=advice).partition("\n")
     html = MarkdownIt("commonmark", {"html": False}).enable("table").render(rest)
     return first.removeprefix("# "), html.replace("<table>", '<div class="scroll"><table>').replace(
         "</table>", "</table></div>"

@@ -178,7 +178,7 @@ class TrainSettings:
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
     @classmethod
-    def from_manifest(cls, manifest: Manifest) -> TrainSettings:
+    def from_manifest(cls, manifest: Manifest, name: str = "the run's manifest") -> TrainSettings:
         """The settings a run was started with.
 
         Raises:
@@ -189,13 +189,13 @@ class TrainSettings:
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
-                f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
-                f"match); continue it with {manifest.created_by}"
+                f"{name}: the run was not started by `lapgs train` of this version (settings {', '.join(difference)} "
+                f"do not match); continue it with {manifest.created_by}"
             )
         settings: TrainSettings = checked(
             {**values, "split": list(split) if isinstance(split := values["split"], tuple) else split},
             cls,
-            "the run's settings in its manifest",
+            name,
             error=RunFolderError,
             advice="restore it or train again with --overwrite",
         )

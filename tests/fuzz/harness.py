@@ -287,7 +287,7 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
     """
     for action, name, *other in steps:
         path = folder / name
-        if not path.exists() or any((folder / each).resolve() == folder.resolve() for each in (name, *other)):
+        if not path.exists() or os.path.normpath(path) == os.path.normpath(folder):
             continue
         target = folder / other[0] if other else path
         if action == "copy" and not (path.is_file() and target.is_file()):

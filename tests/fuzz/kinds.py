@@ -86,7 +86,7 @@ TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
 
 def _scene(name: str, target: str, damage: Damage, also: tuple[str, ...] = ()) -> Kind:
     folder = target.split("/", maxsplit=1)[0]
-    resolutions = ("full", "full", "20", *(() if "exr" in name else ("3dgs:2",)))  # Pillow knows no EXR
+    resolutions = ("full", "full", "20", *(() if "exr" in name else ("3dgs:24",)))  # Pillow knows no EXR
     reads = [("read-scene", folder, resolution) for resolution in resolutions]
     return Kind(name, target, damage, reads, [("train", folder, *TRAIN)], also)
 
