@@ -17,7 +17,7 @@ from lapgs_plugin.camera import Camera
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out, is_folder
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out, is_file, is_folder
 
 MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -31,7 +31,7 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 def find_model(path: Path) -> Path | None:
     """The folder below `path` that holds a COLMAP model, complete or not; None if there is none."""
     for folder in (path / "sparse" / "0", path / "sparse"):
-        if any((folder / f"{name}.{suffix}").is_file() for name in MODEL_FILES for suffix in ("bin", "txt")):
+        if any(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES for suffix in ("bin", "txt")):
             return folder
     return None
 
@@ -73,7 +73,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
 
 def _read_model(model: Path) -> pycolmap.Reconstruction:
     suffix = next(
-        (s for s in ("bin", "txt") if all((model / f"{name}.{s}").is_file() for name in MODEL_FILES)),
+        (s for s in ("bin", "txt") if all(is_file(model / f"{name}.{s}") for name in MODEL_FILES)),
         None,
     )
     if suffix is None:

@@ -361,7 +361,7 @@ def test_binary_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
 def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
     path = make_scene(tmp_path, binary=False)
     (path / "sparse" / "0" / f"{name}.txt").write_text("these are not numbers\n\n" * 3)
-    with pytest.raises(SceneError, match="the sparse model cannot be read") as caught:
+    with pytest.raises(SceneError, match=rf"{name}\.txt: line 1 is 'these are not numbers', expected ") as caught:
         load(path)
     assert_one_line(caught)
 
@@ -435,7 +435,7 @@ def test_nan_pose(tmp_path: Path, value: float) -> None:
 def test_focal_length_that_is_no_positive_number(tmp_path: Path, value: float) -> None:
     path = make_scene(tmp_path)
     overwrite(path / "sparse" / "0" / "cameras.bin", 82.0, value)
-    with pytest.raises(SceneError, match=r"the camera of 00\.png|the sparse model cannot be read"):
+    with pytest.raises(SceneError, match=r"the camera of 0\d\.png"):
         load(path)
 
 
@@ -484,9 +484,8 @@ def test_names_that_no_file_can_have(tmp_path: Path) -> None:
 
 def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
-    for file in ("images.bin",):
-        model = path / "sparse" / "0" / file
-        model.write_bytes(model.read_bytes().replace(b"03.png", b"\xff\xfe.png"))
+    model = path / "sparse" / "0" / "images.bin"
+    model.write_bytes(model.read_bytes().replace(b"03.png", b"\xff\xfe.png"))
     with pytest.raises(SceneError, match=r"the name of image \d+ is b'\\xff\\xfe\.png.*', expected UTF-8") as caught:
         load(path)
     assert_one_line(caught)
