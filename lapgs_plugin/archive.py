@@ -308,7 +308,9 @@ class Manifest:
         finished = [record.level for record in self.records]
         expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
         if finished != expected:
-            raise UserInputError(f"finished levels {finished}, expected {expected} of {self.levels}, coarsest first")
+            raise UserInputError(
+                f"finished levels {shortened(finished)}, expected {shortened(expected)} of {self.levels}, coarsest first"
+            )
 
     @classmethod
     def of_loop(

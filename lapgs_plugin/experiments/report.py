@@ -98,9 +98,7 @@ class Results:
         try:
             rows = read_csv(path)
         except (OSError, ValueError) as error:
-            raise RunFolderError(
-                f"{path} cannot be read ({shortened(str(error))}); expected what `lapgs bench` writes"
-            ) from error
+            raise RunFolderError(f"{path} cannot be read ({error}); expected what `lapgs bench` writes") from error
         for row in rows or [{}]:
             if missing := {*NAMES, *FIGURES} - row.keys():
                 raise RunFolderError(
