@@ -309,7 +309,8 @@ class Manifest:
         expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
         if finished != expected:
             raise UserInputError(
-                f"finished levels {shortened(finished)}, expected {shortened(expected)} of {self.levels}, coarsest first"
+                f"finished levels {shortened(finished)}, expected {shortened(expected)} of {self.levels}, coarsest "
+                "first"
             )
 
     @classmethod

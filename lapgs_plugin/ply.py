@@ -97,4 +97,5 @@ def _row_bytes(element: PlyElement, is_text: bool) -> int:
 
 def _line(error: Exception) -> str:
     """What an error says, as one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 300 else f"{text[:297]}..."

@@ -373,7 +373,10 @@ def _resume(
                     "leave the option out to continue it, or start again with --overwrite"
                 )
         settings = replace(settings, **anew)
-        check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        try:
+            check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        except UserInputError as error:
+            raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:

@@ -198,9 +198,11 @@ def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...]
     table = tables[name]
     parent = table.get("extends")
     if parent in (name, *heirs):
-        raise PatchError(f"patches/{name}.toml: extends {parent!r}, which extends it; expected one without a circle")
+        raise PatchError(
+            f"patches/{name}.toml: extends {shortened(parent)}, which extends it; expected one without a circle"
+        )
     if parent is not None and parent not in tables:
-        raise PatchError(f"patches/{name}.toml: extends {parent!r}, expected one of {sorted(tables)}")
+        raise PatchError(f"patches/{name}.toml: extends {shortened(parent)}, expected one of {sorted(tables)}")
     base = _recipe(parent, tables, (name, *heirs)) if parent is not None else Recipe(name, "", (), (), "", (), ())
     try:
         return replace(

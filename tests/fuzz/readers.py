@@ -40,9 +40,8 @@ def misbehave(how: str) -> None:
 
     from lapgs_plugin.errors import UserInputError
 
-    messages = {"lines": "field.ply is\ndamaged", "escape": "field.ply \x1b[2J", "nameless": "it is damaged"}
-    if how in messages:
-        raise UserInputError(messages[how])
+    if how == "nameless":
+        raise UserInputError("it is damaged")
     if how == "quote":
         raise UserInputError(f"field.ply holds {'x' * 5000}")
     if how == "raise":

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from random import Random
 
 import pytest
 
-from tests.fuzz.harness import MOST_SECONDS, Case, Fuzzer, Kind
+from tests.fuzz.harness import MOST_SECONDS, Case, Fuzzer, Kind, judged
 from tests.fuzz.kinds import BY_NAME, KINDS
 from tests.fuzz.mutations import as_json, as_namespace, as_toml, damaged_tree
 
@@ -17,8 +18,6 @@ HOW = {
     "sleep": "took more than 1 s",
     "grow": "more than 1.5 GB",
     "ask": "more than 1.5 GB",
-    "lines": "no single line",
-    "escape": "no single line",
     "nameless": "names no file",
     "quote": "a line of more than",
 }
@@ -29,7 +28,15 @@ def misbehaving(how: str) -> Case:
     return Case(kind, b"ply", kind.commands[0])
 
 
-@pytest.mark.parametrize("how", ["raise", "exit", "lines", "escape", "nameless", "quote"])
+@pytest.mark.parametrize("message", ["field.ply is\ndamaged", "field.ply \x1b[2J", ""])
+def test_a_message_is_a_line_of_text(message: str) -> None:
+    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": ""}
+    problem = judged(answer, misbehaving("nothing"), Path("case"), Path("templates"))
+    assert problem is not None
+    assert problem.what == "no single line of text"
+
+
+@pytest.mark.parametrize("how", ["raise", "exit", "nameless", "quote"])
 def test_every_broken_rule_is_told(fuzzer: Fuzzer, how: str) -> None:
     problem = fuzzer.problem(misbehaving(how))
     assert problem is not None
