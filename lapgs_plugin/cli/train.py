@@ -376,6 +376,8 @@ def _resume(
         try:
             check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
         except UserInputError as error:
+            if anew:
+                raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
