@@ -126,7 +126,10 @@ def bench_experiment(
 
     console = Console(stderr=True)
     loaded = load_experiment(experiment, _option_names())
-    check_table(loaded)
+    try:
+        check_table(loaded)
+    except UserInputError as error:
+        raise UserInputError(f"{experiment}: {error}") from error
     selection = Selection(scene, backbone, variant, _seeds(seeds), iterations)
     planned, scenes = plan_runs(loaded, selection), scenes_of(loaded, selection)
     folder = Folder(Path("runs", "bench", loaded.name) if out is None else out)

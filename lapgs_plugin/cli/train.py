@@ -347,6 +347,7 @@ def _resume(
     Returns:
         The run, its scene, and its settings, of which `anew` gives those that may change.
     """
+    from lapgs_plugin.files import MANIFEST
     from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
@@ -362,7 +363,7 @@ def _resume(
                 f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
                 "start again with --overwrite"
             )
-        settings = TrainSettings.from_manifest(manifest)
+        settings = TrainSettings.from_manifest(manifest, str(archive.path(MANIFEST)))
         started_with = _options(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys()):
             if wanted[name] != started_with[name]:
@@ -372,7 +373,12 @@ def _resume(
                     "leave the option out to continue it, or start again with --overwrite"
                 )
         settings = replace(settings, **anew)
-        check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        try:
+            check_cache(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        except UserInputError as error:
+            if anew:
+                raise
+            raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import sys
 from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any, Literal
@@ -14,11 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, Hierarchy
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from lapgs_plugin.untrusted import read_toml, shortened
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
@@ -227,12 +222,7 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         UserInputError: it is not readable, not TOML, or says something that no experiment may say; names the key, and
             for an unknown one the nearest that is known.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserInputError(f"{path}: {error.strerror}; expected an experiment file such as smoke.toml") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserInputError(f"{path} is not TOML: {error}; expected an experiment file") from error
+    values = read_toml(path, advice="give an experiment file such as smoke.toml")
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:
@@ -266,7 +256,7 @@ def _first_problem(error: ValidationError) -> str:
         return f"{where} is missing; give it"
     message = re.sub(r"^Value error, ", "", str(problem["msg"]))
     received = problem["input"]
-    shown = "" if isinstance(received, (dict, BaseModel)) else f", received {received!r}"
+    shown = "" if isinstance(received, (dict, BaseModel)) else f", received {shortened(received)}"
     return f"{where}: {message}{shown}" if where else message
 
 

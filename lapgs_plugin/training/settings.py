@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.inheritance import check_inheritance
@@ -23,6 +25,7 @@ from lapgs_plugin.hierarchy.plan import (
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import joint_from, parse_supervision
 from lapgs_plugin.runs.archive import Manifest
+from lapgs_plugin.untrusted import STRICT, checked
 
 ADAM_EPS = 1e-15
 """Epsilon of Adam, 3DGS's."""
@@ -50,13 +53,15 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 class LearningRates:
     """Adam step sizes, as 3DGS publishes them. Positions are in units of the scene's extent."""
 
-    means_first: float = 1.6e-4
-    means_last: float = 1.6e-6
-    sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
-    residual_sh: float = 1e-2  # the same for residual fields, which start from zero colour and have fewer iterations
-    opacities: float = 5e-2
-    scales: float = 5e-3
-    quats: float = 1e-3
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    means_first: PositiveFloat = 1.6e-4
+    means_last: PositiveFloat = 1.6e-6
+    sh: PositiveFloat = 2.5e-3  # coefficients above degree 0 take a twentieth of it
+    residual_sh: PositiveFloat = 1e-2  # of residual fields, which start from zero colour and have fewer iterations
+    opacities: PositiveFloat = 5e-2
+    scales: PositiveFloat = 5e-3
+    quats: PositiveFloat = 1e-3
 
 
 @dataclass(frozen=True)
@@ -67,15 +72,17 @@ class Densification:
     "mcmc" the second is 25,000. `every` never shrinks: its statistics need about that many views.
     """
 
-    start: int | None = None
-    until: int | None = None
-    every: int = 100
-    reset_every: int | None = None  # 0: never
-    grow_grad2d: float = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    start: NonNegativeInt | None = None
+    until: NonNegativeInt | None = None
+    every: PositiveInt = 100
+    reset_every: NonNegativeInt | None = None  # 0: never
+    grow_grad2d: NonNegativeFloat = 2e-4  # threshold on the screen-space gradient, in normalised device coordinates
     coarse_threshold: float | None = None  # factor on it each time that images are halved; None: by the hierarchy
     strategy: str = "default"  # 3DGS's heuristics, or "mcmc" (Kheradmand et al. 2024)
     absgrad: bool = False  # threshold the sum of absolute gradients instead (AbsGS)
-    cap_max: int = 1_000_000  # most Gaussians of a field, for "mcmc"
+    cap_max: PositiveInt = 1_000_000  # most Gaussians of a field, for "mcmc"
     prune: float = 0.0  # share of what is seen that goes when densification ends, see `pruning`
 
 
@@ -83,7 +90,9 @@ class Densification:
 class TrainSettings:
     """Everything that decides the result of a run besides the scene."""
 
-    iterations: int = 30_000
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    iterations: PositiveInt = 30_000
     levels: int = 2
     hierarchy: str = DEFAULT_HIERARCHY.value
     split: tuple[str, ...] | None = None  # shares as text ("1/3"), so that the manifest keeps them exactly
@@ -94,7 +103,7 @@ class TrainSettings:
     joint: float = 0.0  # share of a residual stage, its last, in which finished fields are trained along
     gather: int = 8  # views whose gradients make one step late in a stage
     sh_degree: int = 3
-    sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
+    sh_every: PositiveInt | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
     seed: int = 0
     cache: str = AUTO
@@ -169,24 +178,28 @@ class TrainSettings:
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
     @classmethod
-    def from_manifest(cls, manifest: Manifest) -> TrainSettings:
+    def from_manifest(cls, manifest: Manifest, name: str = "the run's manifest") -> TrainSettings:
         """The settings a run was started with.
 
         Raises:
-            RunFolderError: they hold a key this version does not know or lack one.
+            RunFolderError: they hold a key this version does not know, lack one, or one has another type.
         """
         # Runs of the first weeks know nothing of what came with gsplat, of joint training, gathered views and nesting.
         later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"}
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
-                f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
-                f"match); continue it with {manifest.created_by}"
+                f"{name}: the run was not started by `lapgs train` of this version (settings {', '.join(difference)} "
+                f"do not match); continue it with {manifest.created_by}"
             )
-        values["learning_rates"] = LearningRates(**values["learning_rates"])
-        values["densification"] = Densification(**{"coarse_threshold": None, "prune": 0.0, **values["densification"]})
-        values["split"] = None if values["split"] is None else tuple(values["split"])
-        return cls(**values)
+        settings: TrainSettings = checked(
+            {**values, "split": list(split) if isinstance(split := values["split"], tuple) else split},
+            cls,
+            name,
+            error=RunFolderError,
+            advice="restore it or train again with --overwrite",
+        )
+        return settings
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.output import fresh_scene, write_model
@@ -24,6 +25,7 @@ from lapgs_plugin.scenes.sample.raycast import render
 from lapgs_plugin.scenes.sample.world import World, build_world
 
 MIN_SIDE = 16
+MAX_POINTS = 10_000_000
 MAX_VIEWS = 9999  # names have four digits, so that their order is that of the views
 
 
@@ -59,7 +61,8 @@ def make_sample_scene(
     """
     _check("--size", f"{width}x{height}", min(width, height) >= MIN_SIDE, f"at least {MIN_SIDE}x{MIN_SIDE}")
     _check("--views", views, 2 <= views <= MAX_VIEWS, f"2 to {MAX_VIEWS}")
-    _check("--points", points, points >= 1, "at least 1")
+    VIEW_PIXELS.check(width * height, f"--size {width}x{height}", "choose a smaller one")
+    _check("--points", points, 1 <= points <= MAX_POINTS, f"1 to {MAX_POINTS}")
     _check("--seed", seed, seed >= 0, "0 or more")
     with fresh_scene(out, overwrite) as folder:
         world = build_world(seed)
