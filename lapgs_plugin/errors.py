@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import ClassVar
+
+
+def printable(text: str) -> str:
+    r"""Make text safe for a terminal: names from files may hold escape sequences, newlines or reversed writing.
+
+    >>> printable("a\n\x1b[2J")
+    'a\\n\\x1b[2J'
+    """
+    return "".join(
+        char if char.isprintable() or unicodedata.category(char) == "Zs" else char.encode("unicode_escape").decode()
+        for char in text
+    )
 
 
 class LapgsError(Exception):
     """Something went wrong that one clear line explains; the command line prints it and exits with `exit_code`.
 
-    The message says what was wrong, the value received, what was expected and what to do next.
+    The message says what was wrong, the value received, what was expected and what to do next. It is one printable
+    line, whatever names it quotes.
     """
 
     exit_code: ClassVar[int] = 2
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
 
 
 class UserInputError(LapgsError, ValueError):
