@@ -297,7 +297,7 @@ class Manifest:
     rasterizer: Name
     seed: NonNegativeInt
     settings: Settings
-    records: tuple[LevelRecord, ...] = ()
+    records: Annotated[tuple[LevelRecord, ...], Field(max_length=MOST_LEVELS)] = ()
     created_by: Name = f"lapgs_plugin {__version__}"
     created: Name = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
     format_version: int = FORMAT_VERSION
@@ -852,10 +852,10 @@ def _is_run(folder: Path) -> bool:
         if not (folder / MANIFEST).is_file():
             return False
         try:
-            values = read_json(folder / MANIFEST)
+            values = read_json(folder / MANIFEST, dict[str, Any])
         except UserInputError:
             return (folder / HISTORY).is_file()
-    return isinstance(values, dict) and "lapgs_plugin" in str(values.get("created_by"))
+    return "lapgs_plugin" in str(values.get("created_by"))
 
 
 def _remove_results(folder: Path) -> None:

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 MIB = 2**20
 JSON_MIB = 32
-"""Largest JSON file that is read. A parsed one takes up to 25 times the memory of its text."""
+"""Largest JSON file that is read, where cameras or a history are in it. Others may have an eighth of it."""
+BYTES_A_VALUE = 16
+"""The fewest on average in the largest file: values, not bytes, are what takes memory and time."""
 JSON_MIB_VARIABLE = "LAPGS_JSON_MIB"
 """Environment variable that raises `JSON_MIB`."""
 TEXT_BYTES = MIB
@@ -74,8 +76,7 @@ def read_json(
     Raises:
         UserInputError: as `error`: the file cannot be read, is too large, is not JSON, or holds something else.
     """
-    limit = _json_bytes(error)
-    data = _read(path, limit, f"set {JSON_MIB_VARIABLE} to more than {limit // MIB} if it is right", error, advice)
+    data = _read_json_bytes(path, 1 if kind is Any else 8, error, advice)
     return parse_json(data, str(path), kind, error=error, advice=advice, finite=finite)
 
 
@@ -91,8 +92,7 @@ def read_json_lines(
     Args, Raises:
         As `read_json`; `kind` is of one line, and the message says which.
     """
-    limit = _json_bytes(error)
-    data = _read(path, limit, f"set {JSON_MIB_VARIABLE} to more than {limit // MIB} if it is right", error, "remove it")
+    data = _read_json_bytes(path, 1, error, "remove it")
     lines = data.split(b"\n")[:-1]
     return [
         parse_json(line, f"{path} line {number}", kind, error=error, advice=advice)
@@ -208,10 +208,21 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
+def _read_json_bytes(path: Path, part: int, error: type[UserInputError], advice: str) -> bytes:
+    """A whole JSON file of at most one `part` of the limit, with no more values than fit into that."""
+    whole = _json_bytes(error)
+    how_to_raise = f"set {JSON_MIB_VARIABLE} to more than {whole // MIB} if it is right"
+    data = _read(path, whole // part, how_to_raise, error, advice)
+    most = whole // part // BYTES_A_VALUE
+    if sum(data.count(mark) for mark in (b",", b"[", b"{")) > most:
+        raise error(f"{path} holds more than {most:,} values, the most that are read; {how_to_raise}, or {advice}")
+    return data
+
+
 def _json_bytes(error: type[UserInputError]) -> int:
     """The largest JSON file that is read."""
     text = os.environ.get(JSON_MIB_VARIABLE, str(JSON_MIB))
-    if not re.fullmatch("[0-9]{1,6}", text):
+    if not re.fullmatch("[1-9][0-9]{0,5}", text):
         raise error(f"{JSON_MIB_VARIABLE}={shortened(text)}: expected a number of MiB such as {4 * JSON_MIB}")
     return int(text) * MIB
 
@@ -228,33 +239,42 @@ def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError]
         reason = getattr(cause, "strerror", None) or cause
         raise error(f"{path} cannot be read: {reason}; expected a file that this user may read; {advice}") from cause
     if len(data) > limit:
-        raise error(f"{path} is larger than {limit // MIB} MiB, the most that is read; {how_to_raise}, or {advice}")
+        raise error(f"{path} is larger than {limit / MIB:g} MiB, the most that is read; {how_to_raise}, or {advice}")
     return bytes(data)
 
 
 def _require_plain(value: Any, name: str, error: type[UserInputError], advice: str, finite: bool) -> None:
     """Refuse deep nesting, numbers that nothing can be computed with, and other types than JSON's."""
-    waiting = [(value, 1)]
-    while waiting:
-        each, depth = waiting.pop()
-        if depth > DEPTH:
-            raise error(f"{name} is nested more than {DEPTH} deep, expected fewer levels; {advice}")
-        if isinstance(each, dict):
-            waiting.extend((inner, depth + 1) for pair in each.items() for inner in pair)
-        elif isinstance(each, list):
-            waiting.extend((inner, depth + 1) for inner in each)
-        elif isinstance(each, float):
-            if finite and not math.isfinite(each):
-                raise error(f"{name} holds the number {each}, expected finite numbers; {advice}")
-        elif isinstance(each, int):
-            if abs(each) > LARGEST_INTEGER:
-                raise error(f"{name} holds the number {_digits(each)}, expected 64 bits at most; {advice}")
-        elif isinstance(each, str):
-            if not each.isascii() and re.search("[\ud800-\udfff]", each):  # half a character
-                raise error(f"{name} holds the text {shortened(each)}, expected UTF-8; {advice}")
-        elif each is not None:
-            what = f"{type(each).__name__} {shortened(each)}"
-            raise error(f"{name} holds the {what}, expected text, numbers, lists and tables; {advice}")
+    layer = [value]
+    for _ in range(DEPTH):
+        inner: list[Any] = []
+        for each in layer:
+            if isinstance(each, dict):
+                inner.extend(each)
+                inner.extend(each.values())
+            elif isinstance(each, list):
+                inner.extend(each)
+            elif (unusable := _unusable(each, finite)) is not None:
+                raise error(f"{name} holds the {unusable}; {advice}")
+        layer = inner
+        if not layer:
+            return
+    raise error(f"{name} is nested more than {DEPTH} deep, expected fewer levels; {advice}")
+
+
+def _unusable(value: Any, finite: bool) -> str | None:
+    """What is wrong with a value that is no table and no list; None where nothing is."""
+    if isinstance(value, str):
+        # Half a character: of a file's name that is no UTF-8, or from an escape.
+        broken = not value.isascii() and re.search("[\ud800-\udfff]", value)
+        return f"text {shortened(value)}, expected UTF-8" if broken else None
+    if isinstance(value, float):
+        return f"number {value}, expected finite numbers" if finite and not math.isfinite(value) else None
+    if isinstance(value, int):
+        return f"number {_digits(value)}, expected 64 bits at most" if abs(value) > LARGEST_INTEGER else None
+    if value is None:
+        return None
+    return f"{type(value).__name__} {shortened(value)}, expected text, numbers, lists and tables"
 
 
 def _digits(value: int) -> str:

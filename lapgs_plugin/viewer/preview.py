@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
@@ -34,7 +34,7 @@ QUALITY = 85
 def read_preview(run: Path) -> Image.Image | None:
     """The picture in a run folder; None where there is none, it is damaged, or the run was trained on since."""
     try:
-        manifest = read_json(run / MANIFEST)
+        manifest = read_json(run / MANIFEST, dict[str, Any])
         image = Image.open(io.BytesIO((run / PREVIEW).read_bytes()), formats=("JPEG",))
         if image.info.get("comment") != _state(manifest["created"], len(manifest["records"])):
             return None

@@ -117,14 +117,15 @@ MANIFEST_DAMAGE: list[tuple[str, Any, str]] = [
 def test_values_of_a_manifest(run: Path, where: str, value: Any, message: str) -> None:
     change(run / MANIFEST, where, value)
     before = files_in(run)
-    tracemalloc.start()
-    try:
-        refused(message, "export", run)
-        refused(message, "train", run, "-o", run, "--resume")
-        assert tracemalloc.get_traced_memory()[1] < MEMORY
-    finally:
-        tracemalloc.stop()
-    assert files_in(run) == before | {".lock"}
+    refused(message, "export", run)
+    if where == "levels":
+        tracemalloc.start()
+        try:
+            refused(message, "train", run, "-o", run, "--resume")
+            assert tracemalloc.get_traced_memory()[1] < MEMORY
+        finally:
+            tracemalloc.stop()
+    assert files_in(run) | {".lock"} == before | {".lock"}
 
 
 WHOLE_FILES = [
