@@ -12,10 +12,12 @@ import pytest
 from PIL import Image
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
+from lapgs_plugin.experiments.worker import RunFailedError
 from lapgs_plugin.limits import FRAMES, PHOTO_PIXELS, PHOTO_SIDE, VIEW_PIXELS, Limit
 from lapgs_plugin.rendering.clip import parse_size
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.prepare import prepare_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.cli.run_folder import write_scene
 
@@ -99,6 +101,16 @@ def test_sizes_that_are_asked_for(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+def test_photos_are_prepared_at_a_size_that_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "photos").mkdir()
+    for name in ("a.png", "b.png"):
+        Image.new("RGB", (200, 100)).save(tmp_path / "photos" / name)
+    monkeypatch.setenv(VIEW_PIXELS.variable, "10000")
+    with pytest.raises(SceneError, match=r"a\.png: the photo has 200x100 pixels, .*; choose a smaller --max-size or"):
+        prepare_scene(tmp_path / "photos", tmp_path / "out", progress=False)
+    assert not (tmp_path / "out").exists()
+
+
 def added_memory(work: Callable[[], object]) -> float:
     """How much more memory this process has at most while it works, in MB."""
     Path("/proc/self/clear_refs").write_text("5")  # the peak becomes what there is now
@@ -128,6 +140,7 @@ def test_names_are_printed_without_what_they_do_to_a_terminal() -> None:
     assert printable("a\x1b[2J\n\r\x07\x9b1m\u202egnp\ud800") == r"a\x1b[2J\n\r\x07\x9b1m\u202egnp\ud800"
     ordinary = "Größe 写真\u3000é [bold] C:\\x ~ 🙂"
     assert printable(ordinary) == ordinary
+    assert str(RunFailedError("it ends with\n\x1b[1mone\ntwo")) == "it ends with\n\\x1b[1mone\ntwo"
     for kind in (LapgsError, SceneError, UserInputError):
         assert str(kind("photo \x1b]0;x\x07.png\nlapgs: all is well")) == r"photo \x1b]0;x\x07.png\nlapgs: all is well"
 
