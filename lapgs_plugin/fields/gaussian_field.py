@@ -16,8 +16,8 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError
+from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import atomic_write
-from lapgs_plugin.ply import read_ply, scalar_names
 
 SIGNED_COMMENT = "lapgs_signed 1"
 """PLY comment that marks a residual field. Viewers that do not know it show the field as an ordinary one."""

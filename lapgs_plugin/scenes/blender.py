@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.ply import read_ply, scalar_names
+from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.source import (
     LARGEST,

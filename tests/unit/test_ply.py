@@ -11,7 +11,7 @@ import pytest
 
 from lapgs_plugin.errors import FieldError, SceneError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
-from lapgs_plugin.ply import read_ply
+from lapgs_plugin.fields.ply import read_ply
 from lapgs_plugin.scenes import blender
 from tests.cli.run_folder import write_scene
 
