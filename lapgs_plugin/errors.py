@@ -5,6 +5,9 @@ from __future__ import annotations
 import unicodedata
 from typing import ClassVar
 
+LONGEST_LINE = 1_200
+"""Characters of a message; more than that are left out of its middle."""
+
 
 def printable(text: str) -> str:
     r"""Make text safe for a terminal: names from files may hold escape sequences, newlines or reversed writing.
@@ -28,7 +31,10 @@ class LapgsError(Exception):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(printable(message))
+        line = printable(message)
+        if len(line) > LONGEST_LINE:  # it quotes a long value; file and advice stand at its ends
+            line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
+        super().__init__(line)
 
 
 class UserInputError(LapgsError, ValueError):

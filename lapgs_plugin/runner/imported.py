@@ -228,7 +228,11 @@ def import_run(
     backbone = known[name]
     RunArchive.require_room(out, overwrite)
     manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
-    size = smallest_size(manifest.scene.path, resolution=manifest.scene.resolution, images=manifest.scene.images)
+    scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
+    try:
+        size = smallest_size(manifest.scene.path, **scene_options)
+    except UserInputError as error:  # of what cfg_args says, more often than of the scene
+        raise type(error)(f"{run.folder / CFG_ARGS}: {error}") from error
     fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0

@@ -183,7 +183,7 @@ def test_mistakes(experiment: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        (",1000.0,", ",many,", r"results.csv: \w+ is 'many', expected a number"),
+        (",1000.0,", ",many,", r"results.csv: '\w+' is 'many', expected a number"),
         (",bare,bare,", ",bare,", r"row 1 has more or fewer cells than the 20 of the first line"),
         (",bare,bare,", ",bare,bare,bare,", r"row 1 has more or fewer cells"),
         (",bare,bare,", ",,bare,", "results.csv lacks variant"),

@@ -42,8 +42,6 @@ def misbehave(how: str) -> None:
 
     if how == "nameless":
         raise UserInputError("it is damaged")
-    if how == "quote":
-        raise UserInputError(f"field.ply holds {'x' * 5000}")
     if how == "raise":
         raise KeyError("scale_0")
     if how == "abort":

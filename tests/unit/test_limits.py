@@ -143,3 +143,10 @@ def test_names_are_printed_without_what_they_do_to_a_terminal() -> None:
     assert str(RunFailedError("it ends with\n\x1b[1mone\ntwo")) == "it ends with\n\\x1b[1mone\ntwo"
     for kind in (LapgsError, SceneError, UserInputError):
         assert str(kind("photo \x1b]0;x\x07.png\nlapgs: all is well")) == r"photo \x1b]0;x\x07.png\nlapgs: all is well"
+
+
+def test_a_message_that_quotes_a_long_value_keeps_its_ends() -> None:
+    message = str(UserInputError(f"scene.json: fl_x is {'9' * 5000}, expected a number; export it again"))
+    assert message.startswith("scene.json: fl_x is 999")
+    assert message.endswith("999, expected a number; export it again")
+    assert len(message) < 1_250

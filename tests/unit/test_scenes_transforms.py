@@ -320,8 +320,8 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ),
         ({"cx": -1e300}, r"principal point \(-1e\+300, 29.5\), expected at most"),
         ({"w": 1e19, "h": 1e19, "fl_x": 1e19, "fl_y": 1e19}, "1e.19 pixels wide or high, expected at most 2147483648"),
-        ({"w": 10**300}, "focal length of 70 pixels for 1e.300 of the image"),
-        ({"w": 10**4000}, "intrinsics that are no numbers"),
+        ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
+        ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
         ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
     ],
 )
@@ -360,8 +360,8 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
         ({"file_path": "../../elsewhere.png"}, r"elsewhere\.png: no such image"),
         ({"file_path": "a\0b"}, r"a\\x00b: no such image"),
         ({"file_path": "\x1b[2Ja\nb\u202e.png"}, r"/\\x1b\[2Ja\\nb\\u202e\.png: no such image"),
-        ({"file_path": "\ud800.png"}, r"\\ud800\.png: no such image"),
-        ({"transform_matrix": [[10**400] * 4] * 4}, "frame 4 .* has no transform_matrix"),
+        ({"file_path": "\ud800.png"}, "not readable as JSON"),
+        ({"transform_matrix": [[10**400] * 4] * 4}, "holds the number of 1329 bits, expected 64 bits at most"),
         (
             {"transform_matrix": placed(1e300)},
             r"frame 4 .* has 1e\+300 in its transform_matrix, expected at most 1e\+12",
@@ -398,14 +398,20 @@ RGB = "".join(f"property {{0}} {channel}\n" for channel in ("red", "green", "blu
 def test_points_announced_that_cannot_be_there(tmp_path: Path, count: str, form: str) -> None:
     path = capture(tmp_path, 2)
     (path / "points3d.ply").write_text(PLY.format(form, count, "", "1 2 3\n" * 3))
-    refused(path, rf"points3d\.ply: not readable as a PLY of points \(({count} of element vertex|line 3)")
+    refused(
+        path, rf"points3d\.ply: not readable as a PLY of points \(.*(counts '{count}'|of {count} \(vertex\)|line 3)"
+    )
 
 
 @pytest.mark.parametrize(
     ("properties", "row", "message"),
     [
         ("property float x\n", "1 2 3 4", "two properties with same name"),
-        (RGB.format("list uchar float"), "1 2 3 1 .5 1 .5 1 .5", "property red is a list, expected a number"),
+        (
+            RGB.format("list uchar float"),
+            "1 2 3 1 .5 1 .5 1 .5",
+            "blue, green, red missing or a list, expected a number",
+        ),
         (RGB.format("uchar"), "1 2 3 300 1 1", "not readable as a PLY of points"),
         (RGB.format("float"), "1 2 3 nan .5 .5", "colours of the sparse points hold NaN or inf, expected 0 to 255"),
         (RGB.format("float"), "1 2 3 .5 inf .5", "colours of the sparse points hold NaN or inf"),
