@@ -43,7 +43,7 @@ def train(
     scene: Annotated[Path, typer.Argument(help="Folder of a COLMAP or Blender-style scene.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     iterations: Annotated[
-        int, typer.Option(min=1, help="Optimizer steps, all stages together. The 3DGS schedule shrinks with it.")
+        int, typer.Option(min=1, help="Views trained on, all stages together. The 3DGS schedule shrinks with it.")
     ] = 30_000,
     resolution: Annotated[
         str, typer.Option(help="1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4.")
@@ -94,6 +94,14 @@ def train(
             "densification has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         ),
     ] = 8,
+    views_per_step: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Training views of one optimizer step, rendered together on a GPU; step sizes grow with the root of "
+            "their number. auto: by the size of the images on a GPU, 1 on a CPU. Iterations count views.",
+        ),
+    ] = "1",
     densify_from: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, min=0, help="First densification. Default: 500 of 30000.")
     ] = None,
@@ -242,6 +250,7 @@ def train(
         inherit_ratio=ratio,
         joint=joint,
         gather=gather,
+        views_per_step=_views_per_step(views_per_step),
         sh_degree=sh_degree,
         seed=seed,
         cache=cache,
@@ -307,6 +316,16 @@ def _color(text: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def _views_per_step(text: str) -> int | None:
+    """--views-per-step as a number, None for auto."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError as error:
+        raise UserInputError(f"--views-per-step {text}: expected auto, or a number of views from 1 on") from error
+
+
 def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
     """What decides a run's result, by the name of its option."""
     densification = settings.densification
@@ -331,7 +350,7 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
             name: getattr(settings, name)
             for name in (
                 *("iterations", "levels", "hierarchy", "split", "supervision", "grid", "joint", "gather"),
-                *("sh_degree", "seed", "packed", "sparse_adam"),
+                *("views_per_step", "sh_degree", "seed", "packed", "sparse_adam"),
             )
         },
     }

@@ -37,14 +37,22 @@ class DensityControl(Protocol):
         """Whether `after_step` of that iteration wants to know more of a render than its image."""
         ...
 
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Add the statistics of a render that is not the last one of a step.
+
+        Args:
+            result: after `backward()` by the sum of its views' losses; of several views, with a leading dimension.
+            camera: it was rendered from, or any of those cameras.
+        """
+        ...
+
     def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
-        """Accumulate the statistics of one render and edit the field when the schedule says so.
+        """Accumulate the statistics of a step's last render and edit the field when the schedule says so.
 
         Args:
             model: edited in place; its parameters are new tensors afterwards when something changed.
-            iteration: counts from 1 within the stage.
-            result: the render, after `backward()`; it may be None where `looks_at` says so.
-            camera: it was rendered from.
+            iteration: of the step's last view, from 1 within the stage.
+            result, camera: as `accumulate` takes them; the result may be None where `looks_at` says so.
 
         Returns:
             Whether Gaussians were added, removed or reset.
@@ -95,7 +103,7 @@ class Densifier:
             info = self._info(result, camera)
             self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
         else:
-            self._accumulate(result, camera)
+            self.accumulate(result, camera)
         reset = iteration % self._schedule.reset_every == 0
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
@@ -104,23 +112,26 @@ class Densifier:
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
         """A render as gsplat's strategies look at it."""
-        means2d: Any = result.means2d.detach()[None]  # (1, n, 2)
-        means2d.grad = means2d.absgrad = self._gradient(result)[None]
+        n = result.means2d.shape[-2]
+        means2d: Any = result.means2d.detach().view(-1, n, 2)  # (b, n, 2)
+        means2d.grad = means2d.absgrad = self._gradient(result).view(-1, n, 2)
         return {
             "means2d": means2d,
-            "radii": result.radii[None, :, None].expand(1, -1, 2),  # (1, n, 2)
+            "radii": result.radii.view(-1, n, 1).expand(-1, -1, 2),  # (b, n, 2)
             "width": camera.width,
             "height": camera.height,
-            "n_cameras": 1,
+            "n_cameras": 1,  # what gsplat multiplies by, for the mean of the views' losses; ours is their sum
             "gaussian_ids": None,
         }
 
-    def _accumulate(self, result: RenderResult, camera: Camera) -> None:
-        """What gsplat's strategy does between two refinements, for all Gaussians: it selects visible ones, and to learn
-        how many there are the processor waits for a GPU."""
-        gradient = self._gradient(result)  # (n, 2)
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Add what gsplat's strategy adds between two refinements; see `DensityControl`.
+
+        For all Gaussians: gsplat selects visible ones, and to learn how many there are the processor waits for a GPU.
+        """
+        gradient = self._gradient(result)  # (n, 2) or (b, n, 2)
         if self.state["grad2d"] is None:
-            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
+            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
         given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
         if gradient.device.type == "cuda" and statistics_in_triton():
             from lapgs_plugin.training.densification_triton import add_statistics
@@ -130,7 +141,7 @@ class Densifier:
             _add_statistics(*given)
 
     def _gradient(self, result: RenderResult) -> Tensor:
-        """(n, 2), by the centres on the image, absolute where so asked."""
+        """(n, 2) or (b, n, 2), by the centres on the image, absolute where so asked."""
         gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
         assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
         return gradient
@@ -142,12 +153,12 @@ class Densifier:
 
 def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
     """`densification_triton.add_statistics` in PyTorch's operations."""
-    shown = radii > 0
-    scaled = gradient.clone()
-    scaled[:, 0] *= size[0] / 2.0
-    scaled[:, 1] *= size[1] / 2.0
-    norms += torch.where(shown, scaled.norm(dim=-1), 0.0)
-    counts += shown
+    scaled = gradient.clone().view(-1, len(norms), 2)
+    scaled[..., 0] *= size[0] / 2.0
+    scaled[..., 1] *= size[1] / 2.0
+    for of_view, shown in zip(scaled, (radii > 0).view(-1, len(norms)), strict=True):
+        norms += torch.where(shown, of_view.norm(dim=-1), 0.0)
+        counts += shown
 
 
 @lru_cache(maxsize=1)
@@ -157,8 +168,8 @@ def statistics_in_triton() -> bool:
     def difference() -> float:
         from lapgs_plugin.training.densification_triton import add_statistics
 
-        gradient = torch.linspace(-1, 1, 600, device="cuda").view(300, 2)
-        radii = torch.arange(300, dtype=torch.int32, device="cuda") % 3
+        gradient = torch.linspace(-1, 1, 1200, device="cuda").view(2, 300, 2)
+        radii = torch.arange(600, dtype=torch.int32, device="cuda").view(2, 300) % 7
         sums = [torch.ones(2, 300, device="cuda") for _ in range(2)]
         for add, both in zip((add_statistics, _add_statistics), sums, strict=True):
             add(gradient, radii, (8, 6), both[0], both[1])
@@ -193,11 +204,12 @@ class McmcDensifier:
         """Never: it goes by opacities."""
         return False
 
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Nothing: it looks at no render."""
+
     def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
         """See `DensityControl`."""
-        # Positions get their noise beside a step: none while gradients still wait for those of other views.
-        waits = model.params["means"].grad is not None
-        rate = 0.0 if waits else model.optimizers["means"].param_groups[0]["lr"]
+        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step that was taken, scaled for its views
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
         return iteration < self._schedule.densify_until and _refines(self._schedule, iteration)
 

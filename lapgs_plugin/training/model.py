@@ -13,7 +13,7 @@ from lapgs_plugin.field import GaussianField
 from lapgs_plugin.reference_raster.adam import FieldAdam
 from lapgs_plugin.splats import SPLAT_NAMES, field_from_splats, splats_from_field
 from lapgs_plugin.training.gpu_adam import GpuFieldAdam, adam_in_triton, step_together
-from lapgs_plugin.training.settings import ADAM_EPS, LearningRates
+from lapgs_plugin.training.settings import ADAM_EPS, ONE_VIEW, LearningRates, StepScale
 
 SH_REST_SCALE = 1 / 20
 """SH coefficients above degree 0 learn at a twentieth of the rate of degree 0, as in 3DGS."""
@@ -84,27 +84,51 @@ class TrainableField:
         """The current parameters, sharing their memory and gradients."""
         return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int | None = None) -> None:
+    def step(self, means_rate: float, active_coefficients: int | None = None, scale: StepScale = ONE_VIEW) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
-            means_rate: step size of the positions, already scaled by the extent.
+            means_rate: step size of the positions for one view, already scaled by the extent. The positions' optimizer
+                keeps it, scaled for this step.
             active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
+            scale: how the step differs from one for a single view.
         """
+        groups = [optimizer.param_groups[0] for optimizer in self.optimizers.values()]
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
+        rates = [group["lr"] for group in groups]
+        for group in groups:
+            group["lr"] *= scale.rate
+        self._step_scaled(active_coefficients, scale)
+        for (name, optimizer), rate in zip(self.optimizers.items(), rates, strict=True):
+            if name != "means":
+                optimizer.param_groups[0]["lr"] = rate
+        for param in self.params.values():
+            param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
+
+    def _step_scaled(self, active_coefficients: int | None, scale: StepScale) -> None:
+        """`step` with step sizes as the optimizers have them."""
         if isinstance(self.optimizers.get("sh"), FieldAdam):
             every = self.params["sh"].shape[1]
             self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
         optimizers = list(self.optimizers.values())
         if all(isinstance(optimizer, GpuFieldAdam) for optimizer in optimizers):
-            step_together(optimizers)
-        elif all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
-            fused_steps(optimizers)
-        else:
-            for optimizer in optimizers:
-                optimizer.step(*([self._touched] if self.sparse else []))
-        for param in self.params.values():
-            param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
+            step_together(optimizers, scale)
+            return
+        if scale.gradient != 1.0:
+            torch._foreach_mul_([p.grad for p in self.params.values() if p.grad is not None], scale.gradient)
+        if all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
+            fused_steps(optimizers, scale.views)
+            return
+        for optimizer in optimizers:
+            group = optimizer.param_groups[0]
+            if self.sparse:
+                betas = group["betas"]
+                group["betas"] = tuple(beta**scale.views for beta in betas)
+                optimizer.step(self._touched)
+                group["betas"] = betas
+            else:
+                group["views"] = scale.views
+                optimizer.step()
 
     @property
     def _touched(self) -> Tensor:
@@ -208,25 +232,31 @@ def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
 
 
 @torch.no_grad()
-def fused_steps(optimizers: Sequence[torch.optim.Adam]) -> None:
+def fused_steps(optimizers: Sequence[torch.optim.Adam], views: int = 1) -> None:
     """One step of each, with the bits of its own `step`, in an eighth of the time that the processor takes for those.
 
     Args:
         optimizers: as `gpu_adam` makes them: fused, of one tensor each.
+        views: of a `StepScale`.
     """
     started = []
     for optimizer in optimizers:
         group = optimizer.param_groups[0]
         param = group["params"][0]
-        if not optimizer.state[param]:
-            optimizer.step()  # makes the moments
-        elif param.grad is not None:
-            started.append((group, param, optimizer.state[param]))
+        if param.grad is None:
+            continue
+        state = optimizer.state[param]
+        if not state:  # as `step` makes them
+            state["step"] = torch.zeros((), device=param.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
+        started.append((group, param, state))
     if started:
-        torch._foreach_add_([state["step"] for _, _, state in started], 1)
+        torch._foreach_add_([state["step"] for _, _, state in started], views)
     for group, param, state in started:
-        beta1, beta2 = group["betas"]
+        beta1, beta2 = (beta**views for beta in group["betas"])
+        # The kernel takes these betas to the power of the count: of views, where it is to be one of steps.
+        count = state["step"] if views == 1 else state["step"] / views
         torch._fused_adam_(
-            [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+            [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [count],
             lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=0.0, eps=group["eps"], amsgrad=False, maximize=False,
         )  # fmt: skip

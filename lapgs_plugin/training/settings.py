@@ -29,6 +29,15 @@ ADAM_EPS = 1e-15
 LATE_SHARE = 0.25
 """Of a stage, its last, in which the gradients of some views make one step, once densification has ended. Positions
 hardly move any more, and what single views disagree about is noise; earlier, steps are what is short."""
+MOST_VIEWS = 8
+"""Of one step, where the size of the images decides how many."""
+PIXELS_OF_A_STEP = 1 << 20
+"""Of all its views together, where that decides: about what it takes to keep a GPU busy while it is given its work."""
+PIXELS_OF_A_LAUNCH = 1 << 22
+"""Of views that are rendered at once. More of them would take memory and no less time."""
+ROOT_SCALING = True
+"""Whether steps for several views are longer and remember less, see `StepScale`. False is for measurements: then
+gradients are averaged, and rates and moments are those of one view."""
 LEAST_STEPS = 40
 """In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views
 lost 0.08 dB, of one field 0.13."""
@@ -57,6 +66,37 @@ class LearningRates:
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
+
+
+@dataclass(frozen=True)
+class StepScale:
+    """How Adam's step for the summed gradients of several views differs from a step for one.
+
+    For v views this is the square-root scaling of Malladi et al. 2022, which Grendel-GS uses (Zhao et al. 2024): step
+    sizes times sqrt(v), betas to the power of v, epsilon over sqrt(v), with the mean of the gradients. Here the sum
+    over sqrt(v) takes the place of the mean, and epsilon stays as it is. That is the same step, and its moments have
+    the size of one view's, so v may change from step to step. Adam's count rises by v, so its bias correction is that
+    of beta to the power of all views so far.
+
+    Attributes:
+        views: how many views of progress the step is: the power of the betas, and by how much Adam's count rises.
+        gradient: factor on the sum of the views' gradients.
+        rate: factor on step sizes.
+    """
+
+    views: int = 1
+    gradient: float = 1.0
+    rate: float = 1.0
+
+    @classmethod
+    def of(cls, views: int) -> StepScale:
+        """For the sum of so many views' gradients."""
+        if not ROOT_SCALING:
+            return cls(gradient=1 / views)
+        return cls(views, 1 / math.sqrt(views), math.sqrt(views))
+
+
+ONE_VIEW = StepScale()
 
 
 @dataclass(frozen=True)
@@ -93,6 +133,7 @@ class TrainSettings:
     inherit_ratio: float = 1.0
     joint: float = 0.0  # share of a residual stage, its last, in which finished fields are trained along
     gather: int = 8  # views whose gradients make one step late in a stage
+    views_per_step: int | None = 1  # before that; None: by the size of the images, on a GPU
     sh_degree: int = 3
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
@@ -132,6 +173,8 @@ class TrainSettings:
         self._check_strategy()
         if self.gather < 1:
             raise UserInputError(f"--gather {self.gather}: expected at least 1, the views of one step")
+        if self.views_per_step is not None and self.views_per_step < 1:
+            raise UserInputError(f"--views-per-step {self.views_per_step}: expected auto, or at least 1")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -176,7 +219,8 @@ class TrainSettings:
             RunFolderError: they hold a key this version does not know or lack one.
         """
         # Runs of the first weeks know nothing of what came with gsplat, of joint training, gathered views and nesting.
-        later = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"}
+        later: dict[str, Any] = {"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "views_per_step": 1}
+        later["hierarchy"] = "laplacian"
         values = {**later, "raster": {}, **manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
@@ -189,13 +233,30 @@ class TrainSettings:
         return cls(**values)
 
 
+def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, batches: bool) -> int:
+    """How many views make a step of a stage.
+
+    Args:
+        settings: what the user asked for.
+        stage: by the size of whose images is decided what is left open.
+        training_views: how many there are, which no step exceeds.
+        batches: whether the rasterizer takes several views at once; where it does not, one is what is decided.
+    """
+    asked = settings.views_per_step
+    if asked is None:
+        pixels = stage.image_size[0] * stage.image_size[1]
+        asked = min(MOST_VIEWS, max(1, round(PIXELS_OF_A_STEP / pixels))) if batches else 1
+    return min(asked, training_views)
+
+
 @dataclass(frozen=True)
 class StageSchedule:
     """The schedule of one stage: an iteration in, small answers out, no state.
 
     Inside a stage of n of N iterations densification stops at `until` scaled by n/N and the position learning rate
     decays to its last value at n; the other constants stay as the user set them. Iterations count from 1 in each stage.
-    From `gather_from` on the gradients of `gather` views make one step.
+    From `gather_from` on the gradients of `gather` views make one step, before that those of `views`: fewer where
+    something is due before so many are through.
 
     A field that was trained before, in `before` iterations of coarser nested levels, keeps its SH degree and stops
     densifying earlier (`plan.nested_densify_until`). Its opacities are not reset unless the user says when: what
@@ -214,9 +275,10 @@ class StageSchedule:
     gather_from: int
     gather: int
     before: int
+    views: int = 1
 
     @classmethod
-    def create(cls, settings: TrainSettings, stage: Stage, before: int = 0) -> StageSchedule:
+    def create(cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1) -> StageSchedule:
         shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
         given = settings.densification
 
@@ -244,12 +306,30 @@ class StageSchedule:
             gather_from=stage.iterations - late + 1,
             gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
             before=before,
+            views=views,
         )
 
-    def steps(self, iteration: int) -> bool:
-        """Whether the optimizers step after this iteration."""
-        late = iteration - self.gather_from + 1
-        return late < 1 or late % self.gather == 0 or iteration == self.iterations
+    def gathers(self, iteration: int) -> bool:
+        """Whether the step that this iteration is part of is one of the late ones, with rates as they are."""
+        return self.gather > 1 and iteration >= self.gather_from
+
+    def views_of_step(self, done: int) -> int:
+        """How many views the step takes that comes after `done` iterations; at least 1."""
+        if self.gathers(done + 1):
+            within = (done + 1 - self.gather_from) % self.gather
+            return min(self.gather - within, self.iterations - done)
+        return min(self.views, self._next_due(done) - done)
+
+    def _next_due(self, done: int) -> int:
+        """The first iteration after `done` that ends a step: statistics begin or end with it, or the field changes."""
+        due = [self.iterations]
+        if done < self.densify_until:
+            # Of the iteration `densify_until` no statistics are taken any more, and pruning comes after it.
+            due += [(done // every + 1) * every for every in (self.densify_every, self.reset_every)]
+            due += [self.densify_until - 1, self.densify_until]
+        if self.gather > 1:
+            due.append(self.gather_from - 1)
+        return min(each for each in due if each > done)
 
     @property
     def prunes_after(self) -> int | None:

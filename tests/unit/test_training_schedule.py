@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.plan import Hierarchy, StagePlan, parse_split
-from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from lapgs_plugin.training.settings import (
+    ONE_VIEW,
+    Densification,
+    StageSchedule,
+    StepScale,
+    TrainSettings,
+    views_per_step,
+)
 from lapgs_plugin.training.views import view_index
 
 
@@ -22,6 +29,14 @@ def schedules(**values: Any) -> list[StageSchedule]:
     split = None if settings.split is None else parse_split(",".join(settings.split))
     plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, split, Hierarchy.LAPLACIAN)
     return [StageSchedule.create(settings, stage) for stage in plan]
+
+
+def steps(schedule: StageSchedule) -> list[int]:
+    """The iterations after which the optimizers step."""
+    found = [0]
+    while found[-1] < schedule.iterations:
+        found.append(found[-1] + schedule.views_of_step(found[-1]))
+    return found[1:]
 
 
 def test_a_single_stage_of_30000_has_the_published_constants() -> None:
@@ -55,7 +70,7 @@ def test_late_in_a_stage_eight_views_make_a_step() -> None:
     base, residual = schedules(iterations=30_000)
     for schedule in (base, residual):
         assert (schedule.gather_from, schedule.gather) == (11_251, 8)
-        stepping = [i for i in range(1, 15_001) if schedule.steps(i)]
+        stepping = steps(schedule)
         assert stepping[:11_250] == list(range(1, 11_251))
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
@@ -94,14 +109,63 @@ def test_every_seed_orders_views(seed: int, level: int, epoch: int) -> None:
 def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, begins: int) -> None:
     """A refinement in between would throw the gradients away that wait for those of other views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
-    assert next(i for i in range(1, 30_001) if not schedule.steps(i)) == begins
+    stepping = steps(schedule)
+    assert stepping[: begins - 1] == list(range(1, begins))
+    assert stepping[begins - 1] == begins + 7
+    assert [schedule.gathers(i) for i in (begins - 1, begins)] == [False, True]
 
 
 @pytest.mark.parametrize("until", [29_681, 30_000, 40_000])
 def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
     """What is left is too short for 40 steps of 8 views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
-    assert all(schedule.steps(i) for i in range(1, 30_001))
+    assert steps(schedule) == list(range(1, 30_001))
+
+
+@pytest.mark.parametrize("views", [2, 3, 8, 250])
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_steps_for_several_views_end_where_something_is_due(views: int, strategy: str) -> None:
+    density = Densification(until=3333, every=70, reset_every=None if strategy == "mcmc" else 1100, strategy=strategy)
+    settings = TrainSettings(iterations=6000, densification=density, gather=5)
+    (stage,) = StagePlan.create((1600, 1066), 6000, 1)
+    schedule = StageSchedule.create(settings, stage, views=views)
+    stepping = steps(schedule)
+    lengths = [end - begin for begin, end in zip([0, *stepping], stepping, strict=False)]
+    early = [length for end, length in zip(stepping, lengths, strict=True) if end <= 4500]
+    assert max(early) == views, "at 250 after densification alone"
+    assert len(early) < 1.5 * 4500 / views or views > 70
+    due = {*range(70, 3333, 70), 3332, 3333, 4500, 6000}
+    due |= {1100, 2200, 3300} if strategy == "default" else set()
+    assert due <= set(stepping)
+    assert all(length == 5 for end, length in zip(stepping, lengths, strict=True) if end > 4500)
+    # A resumed run takes the steps that an uninterrupted one takes: they are a function of where one ended.
+    assert all(schedule.views_of_step(end - length) == length for end, length in zip(stepping, lengths, strict=True))
+
+
+def test_how_many_views_a_step_takes() -> None:
+    plan = StagePlan.create((978, 545), 30_000, 2)
+
+    def views(asked: int | None, training: int = 219, batches: bool = True) -> list[int]:
+        return [views_per_step(TrainSettings(views_per_step=asked), stage, training, batches) for stage in plan]
+
+    assert views(1) == [1, 1]
+    assert views(3) == [3, 3]
+    assert views(300) == [219, 219]
+    assert views(None) == [8, 2]  # 133k and 533k pixels of a million
+    assert views(None, training=5) == [5, 2]
+    assert views(None, batches=False) == [1, 1]
+    (large,) = StagePlan.create((3429, 3390), 30_000, 1)
+    assert views_per_step(TrainSettings(views_per_step=None), large, 45, batches=True) == 1
+
+
+@pytest.mark.parametrize("views", [1, 2, 8])
+def test_the_root_of_the_views_scales_steps(views: int) -> None:
+    scale = StepScale.of(views)
+    assert scale.rate == pytest.approx(math.sqrt(views))
+    assert scale.gradient == pytest.approx(1 / math.sqrt(views))
+    assert scale.views == views
+    if views == 1:
+        assert scale == ONE_VIEW
 
 
 def test_opacities_are_never_reset_where_that_is_asked_for() -> None:
@@ -138,6 +202,7 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
         ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
         ({"inherit": "most"}, "--inherit most: expected geometry"),
+        ({"views_per_step": 0}, "--views-per-step 0: expected auto, or at least 1"),
         ({"seed": -1}, "--seed -1: expected 0 to 4294967295"),
         ({"seed": 2**32}, "--seed 4294967296"),
     ],
