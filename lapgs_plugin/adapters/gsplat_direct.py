@@ -12,6 +12,7 @@ import logging
 import math
 import weakref
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -264,13 +265,19 @@ def works() -> bool:
 
 
 def _largest_difference(device: torch.device) -> float:
-    """From gsplat's way to render, relative to the largest value, of images, gradients and what densification sees."""
+    """From gsplat's way to render, relative to the largest value, of images, gradients and what densification sees.
+
+    Of one camera, and of two at once.
+    """
     from lapgs_plugin.adapters.gsplat import GsplatRasterizer
     from lapgs_plugin.camera import Camera
 
     generator = torch.Generator().manual_seed(0)
     count = 500
     camera = Camera(70, 45, 60.0, 61.0, 34.0, 23.0, torch.eye(4))
+    aside = torch.eye(4)
+    aside[0, 3], aside[2, 3] = 0.4, 1.0
+    other = replace(camera, world_to_camera=aside)
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     differences = []
     for signed, degree in ((False, 3), (True, 2)):
@@ -282,19 +289,22 @@ def _largest_difference(device: torch.device) -> float:
             torch.randn(count, generator=generator),
             torch.randn(count, 16, 3, generator=generator) * 0.3,
         )
-        weights = torch.randn(3, camera.height, camera.width, generator=generator).to(device)
+        weights = torch.randn(2, 3, camera.height, camera.width, generator=generator).to(device)
         found = []
         for direct in (False, True):
             leaves = [value.to(device).requires_grad_() for value in values]
             gaussians = GaussianField(leaves[0], leaves[1], leaves[2], leaves[3], leaves[4], signed)
             rasterizer = GsplatRasterizer(device, own_radii=True, direct=direct)
-            result = rasterizer(gaussians, camera, background=background, sh_degree=degree)
-            (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            if signed:
+                result = rasterizer.render_batch(gaussians, [camera, other], background=background, sh_degree=degree)
+            else:
+                result = rasterizer(gaussians, camera, background=background, sh_degree=degree)
+            (result.image * weights[: len(weights) if signed else 1]).sum().backward()  # type: ignore[no-untyped-call]  # torch's
             assert result.absgrad2d is not None
             assert result.means2d.grad is not None
             shown = (result.radii > 0).float()
             found.append(
                 [result.image, shown, result.means2d, result.means2d.grad, result.absgrad2d, *(x.grad for x in leaves)]
             )
-        differences += [(one - other).abs() / other.abs().max() for other, one in zip(*found, strict=True)]
+        differences += [(one - theirs).abs() / theirs.abs().max() for theirs, one in zip(*found, strict=True)]
     return largest(differences)

@@ -75,12 +75,16 @@ def largest_difference(device: torch.device) -> float:
     theirs += [torch.nn.Parameter(part.clone()) for part in (starts[4][:, :1], starts[4][:, 1:])]
     groups = [{"params": [param], "lr": rate} for param, rate in zip(theirs, [*rates, 0.05 * 5e-2], strict=True)]
     adam = torch.optim.Adam(groups, eps=ADAM_EPS)
-    for scale in (ONE_VIEW, ONE_VIEW, StepScale.of(4)):
+    for scale in (ONE_VIEW, ONE_VIEW, StepScale(views=4, gradient=0.5)):
         gradients = [torch.randn(shape, generator=generator).to(device) for shape in shapes]
         for param, gradient in zip(ours, gradients, strict=True):
             param.grad = gradient.clone()
         for param, gradient in zip(theirs, [*gradients[:4], gradients[4][:, :1], gradients[4][:, 1:]], strict=True):
-            param.grad = gradient.contiguous()
+            param.grad = scale.gradient * gradient.contiguous()
+        if scale.views > 1:  # its betas to the power of a count of steps are to be ours to that of all views
+            for group in adam.param_groups:
+                group["betas"] = tuple(beta**scale.views for beta in group["betas"])
+                adam.state[group["params"][0]]["step"] /= scale.views
         step_together(optimizers, scale)
         adam.step()
     expected = [param.detach() for param in theirs[:4]]

@@ -172,8 +172,8 @@ def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: b
         for found, expected in pairs:
             torch.testing.assert_close(found[row], expected, rtol=1e-4, atol=1e-4)
     for name, value in together.parameters.items():
-        # Sums in another order: worst seen 3e-7 of the largest. gsplat's gradient by depth departs from the oracle's beyond
-        # the Jacobian's limit, which one Gaussian is: worst seen 9e-4, of the others 2e-6.
+        # Sums in another order: worst seen 3e-7 of the largest. Beyond the Jacobian's limit, where a Gaussian or two
+        # are, gsplat's gradient by depth is not the oracle's: worst seen 9e-4, of the others 2e-6.
         for other, tolerance in ((alone, 1e-5), (by_the_oracle, 1e-2)):
             expected = other.parameters[name].grad
             assert expected is not None
