@@ -51,14 +51,15 @@ class JointFields:
         camera = level_camera(self.cameras[name], min(self.models) - 1)
         return raised(self.pyramid, composed, (camera.height, camera.width))
 
-    def step(self, means_rate: float) -> None:
+    def step(self, means_rate: float, sh_rest_factor: float = 1.0) -> None:
         """One Adam step on every field, after backward passes through what `predict` gave.
 
         Args:
             means_rate: step size of the positions, in world units.
+            sh_rest_factor: on the step size of SH above degree 0.
         """
         for model in self.models.values():
-            model.step(means_rate)
+            model.step(means_rate, sh_rest_factor=sh_rest_factor)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

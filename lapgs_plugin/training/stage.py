@@ -20,9 +20,11 @@ from lapgs_plugin.plan import Stage
 from lapgs_plugin.pruning import blended_pixels, least_blended
 from lapgs_plugin.raster import Rasterizer, RenderResult, render_image
 from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.supervision import photometric_loss
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
 from lapgs_plugin.training.settings import StageSchedule, TrainSettings
 from lapgs_plugin.training.views import LevelImages, LevelView, view_index
 
@@ -177,9 +179,10 @@ class StageRun:
         self.breakdown.mark("optimizer")
         if self.schedule.steps(iteration):
             means_rate = self.schedule.means_learning_rate(iteration) * self.extent
-            self.model.step(means_rate, (degree + 1) ** 2)
+            rest = self.schedule.sh_rest_factor_at(iteration)
+            self.model.step(means_rate, (degree + 1) ** 2, rest)
             if self.joint is not None:
-                self.joint.step(means_rate)
+                self.joint.step(means_rate, rest)
         self.breakdown.mark("densification")
         self._densify(context, result, view)
         self.breakdown.mark("other")
@@ -215,7 +218,8 @@ class StageRun:
             self.accumulated.announce(name)
 
     def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
-        changed = self.densifier.after_step(self.model, context.iteration, result, view.camera)
+        scores = self._scores(context.iteration) if self.densifier.scored_at(context.iteration) else None
+        changed = self.densifier.after_step(self.model, context.iteration, result, view.camera, scores)
         if (share := self.settings.densification.prune) and context.iteration == self.schedule.prunes_after:
             self._prune(share)
             changed = True
@@ -223,11 +227,36 @@ class StageRun:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _prune(self, share: float) -> None:
-        """Remove what training views hardly see."""
+    def _scores(self, iteration: int) -> ViewScores:
+        """What some training views say about each Gaussian; the same views whenever a run comes here."""
+        place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
+        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
+        degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
+
+        def asked(view: LevelView) -> ScoredView:
+            with torch.no_grad():
+                field = self.model.field.detach()
+                image = render_image(self.rasterizer, field, view.camera, self.background, degree)
+                below, (target, _) = self._prediction(view), self.images.get(view.name)
+                self.breakdown.mark("densification")
+                whole = image if below is None else image + below
+                loss = photometric_loss(whole, target, self.settings.ssim_weight)
+            return ScoredView(
+                render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
+            )
+
+        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        return view_scores(views, grey, self.settings.densification.error_threshold)
+
+    def _grey(self) -> tuple[GaussianField, Tensor]:
+        """The field with all colours zero, and the coefficients (n, 1, 3) that say so, with gradients."""
         seen = self.model.field.detach()
         grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
-        plain = replace(seen, sh=grey, signed=True)
+        return replace(seen, sh=grey, signed=True), grey
+
+    def _prune(self, share: float) -> None:
+        """Remove what training views hardly see."""
+        plain, grey = self._grey()
         images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
         pixels = blended_pixels(images, grey)
         remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))

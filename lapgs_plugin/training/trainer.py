@@ -210,14 +210,14 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
                 return model
             if not stage.signed:
-                points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
+                degree = self.settings.sh_degree_of(stage)
+                points = field_from_points(self.scene.points, self.scene.colors, degree)
                 if self.settings.densification.strategy == "mcmc":
                     points = mcmc_start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
-            field, kept = inherit(
-                self.archive.field(stage.level + 1), self.settings.inherit, self.settings.inherit_ratio, generator
-            )
+            mode, ratio = self.settings.inherit, self.settings.inherit_ratio
+            field, kept = inherit(self.archive.field(stage.level + 1), mode, ratio, generator, self.settings.sh_degree)
             model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
             if self.settings.inherit == "full":
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
