@@ -88,7 +88,7 @@ class Densification:
     base_cap_max: int | None = None  # of the base; None: the same
     split_absgrad2d: float = ABSGRAD_THRESHOLD  # threshold for splits, on absolute gradients, for "multiview"
     error_threshold: float = 0.1  # of a view's largest error: a pixel above it is badly shown, for "multiview"
-    error_pixels: float = 1.0  # that a Gaussian must make up in a view, on average, to be cloned or split
+    error_pixels: float = 0.25  # that a Gaussian must make up in a view, on average, to be cloned or split
     prune: float = 0.0  # share of what is seen that goes when densification ends, see `pruning`
 
 
