@@ -197,7 +197,7 @@ def train(
             help="Badly shown pixels of a view that a Gaussian must make up to be cloned or split, for --strategy "
             "multiview.",
         ),
-    ] = 0.25,
+    ] = 0.1,
     cap_max: Annotated[
         int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Most Gaussians of a level, for --strategy mcmc.")
     ] = 1_000_000,

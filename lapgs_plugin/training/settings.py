@@ -88,7 +88,7 @@ class Densification:
     base_cap_max: int | None = None  # of the base; None: the same
     split_absgrad2d: float = ABSGRAD_THRESHOLD  # threshold for splits, on absolute gradients, for "multiview"
     error_threshold: float = 0.1  # of a view's largest error: a pixel above it is badly shown, for "multiview"
-    error_pixels: float = 0.25  # that a Gaussian must make up in a view, on average, to be cloned or split
+    error_pixels: float = 0.1  # that a Gaussian must make up in a view, on average, to be cloned or split
     prune: float = 0.0  # share of what is seen that goes when densification ends, see `pruning`
 
 
@@ -123,7 +123,9 @@ class TrainSettings:
         parse_supervision(self.supervision)
         Pyramid(self.grid)
         if self.densification.strategy not in STRATEGIES:
-            raise UserInputError(f"--strategy {self.densification.strategy}: expected {' or '.join(STRATEGIES)}")
+            raise UserInputError(
+                f"--strategy {self.densification.strategy}: expected {', '.join(STRATEGIES[:-1])} or {STRATEGIES[-1]}"
+            )
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
         self._check_base_sh_degree()
@@ -196,13 +198,13 @@ class TrainSettings:
                 if value != left_out:
                     raise UserInputError(f"{option} {value}: only --strategy mcmc has a limit; leave it out")
         if given.strategy != "multiview":
-            for option, value, left_out in (
+            for option, setting, default in (
                 ("--split-threshold", given.split_absgrad2d, Densification.split_absgrad2d),
                 ("--error-threshold", given.error_threshold, Densification.error_threshold),
                 ("--error-pixels", given.error_pixels, Densification.error_pixels),
             ):
-                if value != left_out:
-                    raise UserInputError(f"{option} {value}: only --strategy multiview looks at it; leave it out")
+                if setting != default:
+                    raise UserInputError(f"{option} {setting}: only --strategy multiview looks at it; leave it out")
         elif not 0.0 <= given.error_threshold < 1.0:
             raise UserInputError(
                 f"--error-threshold {given.error_threshold}: expected a share of a view's largest error from 0 to "
@@ -369,7 +371,8 @@ class StageSchedule:
         if not self.sh_rest_decay:
             return self.sh_rest_factor
         left: float = 1.0 - min(iteration / self.iterations, 1.0)
-        return self.sh_rest_factor**left
+        factor: float = self.sh_rest_factor**left
+        return factor
 
     @property
     def late_prunes(self) -> frozenset[int]:

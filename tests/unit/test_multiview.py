@@ -123,7 +123,7 @@ def with_sizes(size: float) -> Callable[[GaussianField], GaussianField]:
     return edit
 
 
-BAD = ViewScores(torch.tensor([0.3, 0.2] * 4), torch.zeros(8))
+BAD = ViewScores(torch.tensor([0.3, 0.05] * 4), torch.zeros(8))
 
 
 def test_small_ones_are_cloned_by_gradient_and_large_ones_split_by_absolute_gradient_where_badly_shown() -> None:
