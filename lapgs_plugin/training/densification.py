@@ -1,10 +1,10 @@
-"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC."""
+"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC. A third is `multiview`'s."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
@@ -17,6 +17,9 @@ from lapgs_plugin.kernel_check import is_right
 from lapgs_plugin.raster import RenderResult
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
+
+if TYPE_CHECKING:
+    from lapgs_plugin.training.multiview import ViewScores
 
 MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
 """Of a base field that starts from points: a tenth of the size and half opaque, as MCMC's authors start it."""
@@ -37,6 +40,10 @@ class DensityControl(Protocol):
         """Whether `after_step` of that iteration wants to know more of a render than its image."""
         ...
 
+    def scored_at(self, iteration: int) -> bool:
+        """Whether `after_step` of that iteration wants the scores of several views."""
+        ...
+
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of a render that is not the last one of a step.
 
@@ -46,13 +53,21 @@ class DensityControl(Protocol):
         """
         ...
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
         """Accumulate the statistics of a step's last render and edit the field when the schedule says so.
 
         Args:
             model: edited in place; its parameters are new tensors afterwards when something changed.
             iteration: of the step's last view, from 1 within the stage.
             result, camera: as `accumulate` takes them; the result may be None where `looks_at` says so.
+            scores: of the field before the edit; None except where `scored_at` says so.
 
         Returns:
             Whether Gaussians were added, removed or reset.
@@ -66,7 +81,10 @@ class DensityControl(Protocol):
 
 def density_control(schedule: StageSchedule, settings: Densification, extent: float) -> DensityControl:
     """The strategy that the settings name; arguments as `Densifier` takes them."""
-    return (McmcDensifier if settings.strategy == "mcmc" else Densifier)(schedule, settings, extent)
+    from lapgs_plugin.training.multiview import MultiviewDensifier
+
+    kinds: dict[str, type[Densifier] | type[McmcDensifier]] = {"mcmc": McmcDensifier, "multiview": MultiviewDensifier}
+    return kinds.get(settings.strategy, Densifier)(schedule, settings, extent)
 
 
 class Densifier:
@@ -94,12 +112,23 @@ class Densifier:
         """See `DensityControl`."""
         return iteration < self._schedule.densify_until
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+    def scored_at(self, iteration: int) -> bool:
+        """See `DensityControl`."""
+        return False
+
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
         """See `DensityControl`."""
         if not self.looks_at(iteration):
             return False
         assert result is not None, "looked at in this iteration"
-        if _refines(self._schedule, iteration):
+        if refines(self._schedule, iteration):
             info = self._info(result, camera)
             self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
         else:
@@ -108,7 +137,7 @@ class Densifier:
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
             reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
-        return reset or _refines(self._schedule, iteration)
+        return reset or refines(self._schedule, iteration)
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
         """A render as gsplat's strategies look at it."""
@@ -132,13 +161,8 @@ class Densifier:
         gradient = self._gradient(result)  # (n, 2) or (b, n, 2)
         if self.state["grad2d"] is None:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
-        given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
-        if gradient.device.type == "cuda" and statistics_in_triton():
-            from lapgs_plugin.training.densification_triton import add_statistics
-
-            add_statistics(*given)
-        else:
-            _add_statistics(*given)
+        size = camera.width, camera.height
+        add_up(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
 
     def _gradient(self, result: RenderResult) -> Tensor:
         """(n, 2) or (b, n, 2), by the centres on the image, absolute where so asked."""
@@ -149,6 +173,23 @@ class Densifier:
     def regularization(self, field: GaussianField) -> Tensor | None:
         """None: nothing is added to the loss."""
         return None
+
+
+def add_up(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
+    """Add the norms of gradients by centres, in normalised device coordinates, and 1 where a Gaussian is shown.
+
+    Args:
+        gradient: (n, 2) in loss per pixel; of several views (b, n, 2).
+        radii: (n,) or (b, n), 0 where it is not shown.
+        size: (width, height) of the image.
+        norms, counts: (n,) what is added to.
+    """
+    if gradient.device.type == "cuda" and statistics_in_triton():
+        from lapgs_plugin.training.densification_triton import add_statistics
+
+        add_statistics(gradient, radii, size, norms, counts)
+    else:
+        _add_statistics(gradient, radii, size, norms, counts)
 
 
 def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
@@ -204,14 +245,25 @@ class McmcDensifier:
         """Never: it goes by opacities."""
         return False
 
+    def scored_at(self, iteration: int) -> bool:
+        """See `DensityControl`."""
+        return False
+
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Nothing: it looks at no render."""
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
         """See `DensityControl`."""
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step that was taken, scaled for its views
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
-        return iteration < self._schedule.densify_until and _refines(self._schedule, iteration)
+        return iteration < self._schedule.densify_until and refines(self._schedule, iteration)
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """What drives Gaussians that are not needed towards transparent and small."""
@@ -229,5 +281,5 @@ def mcmc_start(field: GaussianField) -> GaussianField:
     )
 
 
-def _refines(schedule: StageSchedule, iteration: int) -> bool:
+def refines(schedule: StageSchedule, iteration: int) -> bool:
     return iteration > schedule.densify_start and iteration % schedule.densify_every == 0

@@ -77,15 +77,16 @@ class JointFields:
             self._level_cameras[name, level] = level_camera(self.cameras[name], level)
         return self._level_cameras[name, level]
 
-    def step(self, means_rate: float, scale: StepScale = ONE_VIEW) -> None:
+    def step(self, means_rate: float, sh_rest_factor: float = 1.0, scale: StepScale = ONE_VIEW) -> None:
         """One Adam step on every field, after backward passes through what `predict` gave.
 
         Args:
             means_rate: step size of the positions for one view, in world units.
+            sh_rest_factor: on the step size of SH above degree 0.
             scale: how the step differs from one for a single view.
         """
         for model in self.models.values():
-            model.step(means_rate, scale=scale)
+            model.step(means_rate, sh_rest_factor=sh_rest_factor, scale=scale)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

@@ -30,12 +30,14 @@ class TrainableField:
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
         sparse: whether a step moves those Gaussians alone that have a gradient.
+        sh_rest_rate: step size of SH above degree 0 before a step's factor.
     """
 
     params: dict[str, torch.nn.Parameter]
     optimizers: dict[str, Any]
     signed: bool
     sparse: bool = False
+    sh_rest_rate: float = 0.0
 
     @classmethod
     def create(
@@ -62,7 +64,7 @@ class TrainableField:
         optimizers = {
             name: make(param, rate[name], SH_REST_SCALE if name == "sh" else 1.0) for name, param in params.items()
         }
-        return cls(params, optimizers, field.signed)
+        return cls(params, optimizers, field.signed, sh_rest_rate=rate["sh"] * SH_REST_SCALE)
 
     @classmethod
     def _in_two(cls, field: GaussianField, rates: LearningRates, extent: float, sparse: bool) -> TrainableField:
@@ -74,7 +76,7 @@ class TrainableField:
         rate = _rates(field, rates, extent)
         rate |= {"sh0": rate["sh"], "shN": rate["sh"] * SH_REST_SCALE}
         optimizers = {name: gpu_adam(param, rate[name], sparse) for name, param in params.items()}
-        return cls(params, optimizers, field.signed, sparse)
+        return cls(params, optimizers, field.signed, sparse, rate["shN"])
 
     def __len__(self) -> int:
         return int(self.params["means"].shape[0])
@@ -84,17 +86,25 @@ class TrainableField:
         """The current parameters, sharing their memory and gradients."""
         return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int | None = None, scale: StepScale = ONE_VIEW) -> None:
+    def step(
+        self,
+        means_rate: float,
+        active_coefficients: int | None = None,
+        sh_rest_factor: float = 1.0,
+        scale: StepScale = ONE_VIEW,
+    ) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
             means_rate: step size of the positions for one view, already scaled by the extent. The positions' optimizer
                 keeps it, scaled for this step.
             active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
+            sh_rest_factor: on the step size of SH above degree 0.
             scale: how the step differs from one for a single view.
         """
         groups = [optimizer.param_groups[0] for optimizer in self.optimizers.values()]
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
+        self._scale_rest_of_sh(sh_rest_factor)
         rates = [group["lr"] for group in groups]
         for group in groups:
             group["lr"] *= scale.rate
@@ -129,6 +139,17 @@ class TrainableField:
             else:
                 group["views"] = scale.views
                 optimizer.step()
+
+    def _scale_rest_of_sh(self, factor: float) -> None:
+        """Let SH above degree 0 learn at their own rate times `factor`."""
+        if "shN" in self.optimizers:
+            self.optimizers["shN"].param_groups[0]["lr"] = self.sh_rest_rate * factor
+            return
+        optimizer, scale = self.optimizers["sh"], SH_REST_SCALE * factor
+        if isinstance(optimizer, GpuFieldAdam):
+            optimizer.param_groups[0]["rest_scale"] = scale
+        elif isinstance(optimizer, FieldAdam):
+            optimizer.param_groups[0]["column_scale"][1:] = scale
 
     @property
     def _touched(self) -> Tensor:

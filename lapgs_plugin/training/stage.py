@@ -23,9 +23,11 @@ from lapgs_plugin.plan import Stage
 from lapgs_plugin.pruning import blended_pixels, least_blended
 from lapgs_plugin.raster import BatchRasterizer, Rasterizer, RenderResult, render_image
 from lapgs_plugin.rendering.raised_images import RaisedImages
+from lapgs_plugin.supervision import photometric_loss
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
 from lapgs_plugin.training.settings import ONE_VIEW, PIXELS_OF_A_LAUNCH, StageSchedule, StepScale, TrainSettings
 from lapgs_plugin.training.views import LevelImages, LevelView, view_index
 
@@ -218,11 +220,11 @@ class StageRun:
         assert context is not None
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
-        means_rate = self.schedule.means_learning_rate(last) * self.extent
+        means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
-        self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, scale)
+        self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.joint is not None:
-            self.joint.step(means_rate, scale)
+            self.joint.step(means_rate, rest, scale)
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -370,7 +372,8 @@ class StageRun:
                 self.accumulated.announce(name)
 
     def _densify(self, context: StageContext, iteration: int, launch: _Launch) -> None:
-        changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera)
+        scores = self._scores(iteration) if self.densifier.scored_at(iteration) else None
+        changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
         if (share := self.settings.densification.prune) and iteration == self.schedule.prunes_after:
             self._prune(share)
             changed = True
@@ -378,11 +381,36 @@ class StageRun:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _prune(self, share: float) -> None:
-        """Remove what training views hardly see."""
+    def _scores(self, iteration: int) -> ViewScores:
+        """What some training views say about each Gaussian; the same views whenever a run comes here."""
+        place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
+        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
+        degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
+
+        def asked(view: LevelView) -> ScoredView:
+            with torch.no_grad():
+                field = self.model.field.detach()
+                image = render_image(self.rasterizer, field, view.camera, self.background, degree)
+                below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
+                self.breakdown.mark("densification")
+                whole = image if below is None else image + below
+                loss = photometric_loss(whole, target, self.settings.ssim_weight)
+            return ScoredView(
+                render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
+            )
+
+        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        return view_scores(views, grey, self.settings.densification.error_threshold)
+
+    def _grey(self) -> tuple[GaussianField, Tensor]:
+        """The field with all colours zero, and the coefficients (n, 1, 3) that say so, with gradients."""
         seen = self.model.field.detach()
         grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
-        plain = replace(seen, sh=grey, signed=True)
+        return replace(seen, sh=grey, signed=True), grey
+
+    def _prune(self, share: float) -> None:
+        """Remove what training views hardly see."""
+        plain, grey = self._grey()
         images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
         pixels = blended_pixels(images, grey)
         remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))

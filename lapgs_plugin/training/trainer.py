@@ -93,7 +93,7 @@ def warm_up(
     if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch:
         images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
         photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
-        model.step(0.0, 1, StepScale.of(2))
+        model.step(0.0, 1, scale=StepScale.of(2))
     if torch.device(device).type == "cuda":
         statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
@@ -214,14 +214,14 @@ class Trainer:
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
                 return model
             if not stage.signed:
-                points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
+                degree = self.settings.sh_degree_of(stage)
+                points = field_from_points(self.scene.points, self.scene.colors, degree)
                 if self.settings.densification.strategy == "mcmc":
                     points = mcmc_start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
-            field, kept = inherit(
-                self.archive.field(stage.level + 1), self.settings.inherit, self.settings.inherit_ratio, generator
-            )
+            mode, ratio = self.settings.inherit, self.settings.inherit_ratio
+            field, kept = inherit(self.archive.field(stage.level + 1), mode, ratio, generator, self.settings.sh_degree)
             model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
             if self.settings.inherit == "full":
                 model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)

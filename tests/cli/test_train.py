@@ -70,7 +70,7 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
-        (("--strategy", "luck"), "expected default or mcmc"),
+        (("--strategy", "luck"), "expected default, mcmc or multiview"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),
         (("--cache", "gpu", "--rasterizer", "cpu"), "--cache gpu: expected memory or disk"),
         (("--cache", "tape"), "--cache tape: expected auto, gpu, memory, disk"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from lapgs_plugin.plan import Hierarchy, StagePlan, parse_split
 from lapgs_plugin.training.settings import (
     ONE_VIEW,
     Densification,
+    LearningRates,
     StageSchedule,
     StepScale,
     TrainSettings,
@@ -52,8 +54,9 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
     base, residual = schedules(levels=2, split=("1/3", "2/3"))
     assert (base.densify_until, residual.densify_until) == (5000, 10_000)
+    assert base.reset_every == 3000
     for schedule in (base, residual):
-        assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
+        assert (schedule.densify_start, schedule.densify_every) == (500, 100)
         assert schedule.means_learning_rate(schedule.iterations) == pytest.approx(1.6e-6)
 
 
@@ -173,6 +176,50 @@ def test_opacities_are_never_reset_where_that_is_asked_for() -> None:
         assert not any(i % schedule.reset_every == 0 for i in range(1, schedule.iterations + 1))
 
 
+@pytest.mark.parametrize(("given", "resets"), [(None, []), (0, []), (4000, [4000, 8000, 12_000])])
+def test_a_residual_resets_no_opacities_unless_told_otherwise(given: int | None, resets: list[int]) -> None:
+    base, residual = schedules(densification=Densification(reset_every=given))
+    assert [i for i in range(1, residual.iterations + 1) if i % residual.reset_every == 0] == resets
+    assert [i for i in range(1, 5000) if i % base.reset_every == 0] == ([] if given == 0 else [given or 3000])
+
+
+def test_the_rate_of_higher_harmonics_may_decay_to_what_it_is_otherwise() -> None:
+    plain, kept, fading = (
+        schedules(learning_rates=rates)[1]
+        for rates in (
+            LearningRates(),
+            LearningRates(sh_rest_factor=8.0),
+            LearningRates(sh_rest_factor=8.0, sh_rest_decay=True),
+        )
+    )
+    assert {plain.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
+    assert {kept.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {8.0}
+    assert fading.sh_rest_factor_at(7500) == pytest.approx(8**0.5)  # half way: the geometric mean
+    assert (fading.sh_rest_factor_at(0), fading.sh_rest_factor_at(15_000)) == (8.0, 1.0)
+
+
+def test_a_base_may_densify_longer() -> None:
+    for share, until in ((None, 7500), (0.8, 12_000), (0.0, 0)):
+        base, residual = schedules(densification=Densification(base_share=share))
+        assert (base.densify_until, residual.densify_until) == (until, 7500)
+
+
+def test_a_base_may_have_fewer_harmonics() -> None:
+    base, residual = schedules(base_sh_degree=1)
+    assert [schedule.active_sh_degree(9000) for schedule in (base, residual)] == [1, 3]
+
+
+def test_thresholds_and_limits_of_stages() -> None:
+    density = Densification(residual_threshold=1.5, strategy="multiview")
+    settings = TrainSettings(levels=3, hierarchy="laplacian", densification=density)
+    plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
+    found = [settings.densification_of(stage) for stage in plan]
+    assert [one.grow_grad2d for one in found] == pytest.approx([2e-4, 3e-4, 3e-4])
+    assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
+    capped = replace(settings, densification=Densification(strategy="mcmc", cap_max=9, base_cap_max=5))
+    assert [capped.densification_of(stage).cap_max for stage in plan] == [5, 9, 9]
+
+
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
     def order(seed: int, level: int, epoch: int) -> list[int]:
         return [view_index(epoch * 50 + i + 1, 50, seed, level) for i in range(50)]
@@ -200,6 +247,31 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             "--absgrad, --coarse-threshold with --strategy mcmc",
         ),
         ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
+        ({"densification": Densification(base_cap_max=7)}, "--base-cap-max 7: only --strategy mcmc"),
+        ({"densification": Densification(error_pixels=7.0)}, "--error-pixels 7.0: only --strategy multiview"),
+        (
+            {"densification": Densification(error_threshold=1.0, strategy="multiview")},
+            "--error-threshold 1.0: expected a share",
+        ),
+        (
+            {"densification": Densification(absgrad=True, strategy="multiview")},
+            "--absgrad with --strategy multiview",
+        ),
+        (
+            {"hierarchy": "laplacian", "densification": Densification(residual_threshold=2.0, strategy="mcmc")},
+            "--residual-threshold with --strategy mcmc",
+        ),
+        ({"hierarchy": "laplacian", "densification": Densification(residual_threshold=0.0)}, "--residual-threshold 0"),
+        ({"densification": Densification(residual_threshold=2.0)}, "--residual-threshold 2.0: is about residuals"),
+        ({"densification": Densification(grow_grad2d=-1.0)}, "--densify-threshold -1.0: expected a positive gradient"),
+        ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
+        ({"densification": Densification(base_share=0.5), "levels": 1}, "one level has no base"),
+        ({"learning_rates": LearningRates(sh_rest_factor=math.inf)}, "--sh-rate-factor inf"),
+        ({"learning_rates": LearningRates(sh_rest_decay=True)}, "--sh-rate-decay: there is nothing to decay from"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 4}, "--base-sh-degree 4: expected 0 to --sh-degree, 3"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 1, "inherit": "full"}, "with --inherit full"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 1, "levels": 1}, "one level has no base"),
+        ({"base_sh_degree": 1}, "--base-sh-degree 1: is about residuals"),
         ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
         ({"inherit": "most"}, "--inherit most: expected geometry"),
         ({"views_per_step": 0}, "--views-per-step 0: expected auto, or at least 1"),

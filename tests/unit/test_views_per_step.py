@@ -273,7 +273,7 @@ def test_steps_for_several_views_are_adams_with_scaled_rates(in_two: bool) -> No
                 weights = torch.randn(param.shape, generator=generator)
                 (param * weights).sum().backward()
                 sums[name] += weights
-        model.step(1e-3, 4, StepScale.of(views))
+        model.step(1e-3, 4, scale=StepScale.of(views))
         seen += views
         for name, value in expected.items():
             mean = sums[name].double() / views
