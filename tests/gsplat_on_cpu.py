@@ -138,7 +138,10 @@ def _back(kernel: Callable[..., Any], given: list[Any], outputs: list[int], grad
         )
     wanted = [each for each in leaves if isinstance(each, Tensor) and each.requires_grad]
     found_gradients = torch.autograd.grad(total, wanted, allow_unused=True)
-    return [torch.zeros_like(x) if g is None else g.nan_to_num() for x, g in zip(wanted, found_gradients, strict=True)]
+    filled = (
+        torch.zeros_like(x) if g is None else g.nan_to_num() for x, g in zip(wanted, found_gradients, strict=True)
+    )
+    return [each.contiguous() for each in filled]
 
 
 def _spherical_harmonics_back(
