@@ -349,11 +349,10 @@ class _Shots:
     def of_several(self, cameras: Sequence[Camera], like: Tensor) -> gsplat_direct.Shot:
         """Cameras of one size beside `like`, put together in one launch."""
         shots, count = [self.of(camera, like) for camera in cameras], len(cameras)
-        kinds = ([getattr(shot, kind).view(-1) for shot in shots] for kind in ("centre", "pose", "intrinsics"))
         # Centres first: Triton compiles anew for what does not begin at a multiple of 16 bytes.
-        centres, poses, intrinsics = torch.cat([part for kind in kinds for part in kind]).split(
-            [3 * count, 16 * count, 9 * count]
-        )
+        parts = [getattr(shot, kind).view(-1) for kind in ("centre", "pose", "intrinsics") for shot in shots]
+        numbers = torch.cat(parts)
+        centres, poses, intrinsics = numbers[: 3 * count], numbers[3 * count : 19 * count], numbers[19 * count :]
         return gsplat_direct.Shot(
             poses.view(-1, 4, 4), intrinsics.view(-1, 3, 3), centres.view(-1, 3), shots[0].width, shots[0].height
         )

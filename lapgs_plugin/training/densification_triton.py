@@ -14,7 +14,7 @@ BLOCK = 512
 @triton.jit(do_not_specialize=("half_width", "half_height", "n", "views"))  # type: ignore[untyped-decorator]  # no types
 def _kernel(
     gradient: tl.tensor, radii: tl.tensor, norms: tl.tensor, counts: tl.tensor,
-    half_width: float, half_height: float, n: int, views: int, block: tl.constexpr,
+    half_width: float, half_height: float, n: tl.tensor, views: int, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here = rows < n
