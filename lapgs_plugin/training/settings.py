@@ -337,14 +337,14 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
     Args:
         settings: what the user asked for.
         stage: by the size of whose images is decided what is left open.
-        training_views: how many there are, which no step exceeds.
+        training_views: how many there are, which what is decided here does not exceed.
         batches: whether the rasterizer takes several views at once; where it does not, one is what is decided.
     """
     asked = settings.views_per_step
     if asked is None:
         pixels = stage.image_size[0] * stage.image_size[1]
-        asked = min(MOST_VIEWS, max(1, round(PIXELS_OF_A_STEP / pixels))) if batches else 1
-    return min(asked, training_views)
+        asked = min(MOST_VIEWS, training_views, max(1, round(PIXELS_OF_A_STEP / pixels))) if batches else 1
+    return asked
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,12 @@ def make_plan(scene: Scene, settings: TrainSettings) -> StagePlan:
     """The stages of a run on this scene.
 
     Raises:
-        UserInputError: levels, split and image size do not go together.
+        UserInputError: levels, split and image size do not go together, or a step takes more views than there are.
     """
+    if (views := settings.views_per_step or 1) > len(scene.train):
+        raise UserInputError(
+            f"--views-per-step {views}: the scene has {len(scene.train)} training views; give at most as many, or auto"
+        )
     split = None if settings.split is None else parse_split(",".join(settings.split))
     hierarchy = parse_hierarchy(settings.hierarchy)
     return StagePlan.create(scene.smallest_size, settings.iterations, settings.levels, split, hierarchy)

@@ -153,7 +153,6 @@ def test_how_many_views_a_step_takes() -> None:
 
     assert views(1) == [1, 1]
     assert views(3) == [3, 3]
-    assert views(300) == [219, 219]
     assert views(None) == [8, 2]  # 133k and 533k pixels of a million
     assert views(None, training=5) == [5, 2]
     assert views(None, batches=False) == [1, 1]
