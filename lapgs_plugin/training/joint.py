@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from typing import Any
+from typing import Any, cast
 
 from torch import Tensor
 
@@ -50,8 +50,7 @@ class JointFields:
 
     def predict_batch(self, names: Sequence[str]) -> Tensor:
         """(b, 3, h, w) `predict` of two views or more of one size, each field's in one set of launches."""
-        rasterizer = self.rasterizer
-        assert isinstance(rasterizer, BatchRasterizer)
+        rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
 
         def render(field: GaussianField, cameras: Sequence[Camera], background: Tensor) -> Tensor:
             return rasterizer.render_batch(field, cameras, background=background, describes=False).image

@@ -423,7 +423,7 @@ class StageSchedule:
         if self.gathers(done + 1):
             within = (done + 1 - self.gather_from) % self.gather
             return min(self.gather - within, self.iterations - done)
-        return min(self.views, self._next_due(done) - done)
+        return 1 if self.views == 1 else min(self.views, self._next_due(done) - done)
 
     def _next_due(self, done: int) -> int:
         """The first iteration after `done` that ends a step: statistics begin or end with it, or the field changes."""

@@ -184,9 +184,9 @@ class StageRun:
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
     @cached_property
-    def _batches(self) -> bool:
-        """Whether several views are rendered at once."""
-        return isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+    def _batching(self) -> BatchRasterizer | None:
+        """What renders several views at once; None where nothing does. Asking a protocol in each step takes long."""
+        return self.rasterizer if isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch else None
 
     def _next(self, done: int) -> range:
         """The iterations of the step that comes after `done` ones."""
@@ -194,7 +194,7 @@ class StageRun:
 
     def _launches(self, iterations: range) -> list[list[int]]:
         """The iterations of a step by what is rendered together: one size, one degree of SH, no more than fit."""
-        if not self._batches:
+        if self._batching is None or len(iterations) == 1:
             return [[iteration] for iteration in iterations]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for iteration in iterations:
@@ -336,8 +336,8 @@ class StageRun:
         """The image, or images of several cameras, and what else is known of the render where somebody looks at it."""
         looks, degree = self.densifier.looks_at(iteration), self.schedule.active_sh_degree(iteration)
         if len(cameras) > 1:
-            assert isinstance(self.rasterizer, BatchRasterizer)
-            result = self.rasterizer.render_batch(
+            assert self._batching is not None
+            result = self._batching.render_batch(
                 gaussians, cameras, background=self.background, sh_degree=degree, describes=looks
             )
             return result.image, result if looks else None
