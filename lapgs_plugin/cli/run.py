@@ -102,6 +102,15 @@ def run(
             help=f"Factor on the SH learning rates of residual stages. Default: {RESIDUAL_COLOR_RATE:g}.",
         ),
     ] = None,
+    residual_resets: Annotated[
+        bool,
+        typer.Option(
+            "--residual-resets",
+            rich_help_panel=HIERARCHY,
+            help="Let the backbone reset opacities in residual stages, too, as in the paper; without it the base's "
+            "alone.",
+        ),
+    ] = False,
     coarse_threshold: Annotated[
         float | None,
         typer.Option(
@@ -191,7 +200,14 @@ def run(
         )
     if record and not off:
         raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
-    check_residual_options(hierarchy, {"--inherit": inherit, "--residual-color-rate": residual_color_rate})
+    check_residual_options(
+        hierarchy,
+        {
+            "--inherit": inherit,
+            "--residual-color-rate": residual_color_rate,
+            "--residual-resets": residual_resets or None,
+        },
+    )
     mode, ratio = parse_inheritance(DEFAULT_INHERITANCE if inherit is None else inherit)
     options = HierarchyOptions(
         hierarchy=hierarchy,
@@ -203,6 +219,7 @@ def run(
         inherit_ratio=ratio,
         joint=joint,
         residual_color_rate=RESIDUAL_COLOR_RATE if residual_color_rate is None else residual_color_rate,
+        residual_resets=residual_resets,
         coarse_threshold=coarse_threshold,
         prune=prune,
         images_on=images_on,

@@ -43,7 +43,7 @@ def train(
     scene: Annotated[Path, typer.Argument(help="Folder of a COLMAP or Blender-style scene.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     iterations: Annotated[
-        int, typer.Option(min=1, help="Optimizer steps, all stages together. The 3DGS schedule shrinks with it.")
+        int, typer.Option(min=1, help="Views trained on, all stages together. The 3DGS schedule shrinks with it.")
     ] = 30_000,
     resolution: Annotated[
         str, typer.Option(help="1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4.")
@@ -85,6 +85,29 @@ def train(
     ] = 0.0,
     grid: GridOption = "camera",
     sh_degree: Annotated[int, typer.Option(rich_help_panel=SCHEDULE, help="Highest SH degree, 0 to 3.")] = 3,
+    base_sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Of residuals: highest SH degree of the base, at most --sh-degree, which is the default.",
+        ),
+    ] = None,
+    sh_rate_factor: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in every "
+            "field. 8 suits scenes with hundreds of views, 1 those with few.",
+        ),
+    ] = 1.0,
+    sh_rate_decay: Annotated[
+        bool,
+        typer.Option(
+            "--sh-rate-decay",
+            rich_help_panel=SCHEDULE,
+            help="Let that factor go exponentially to 1 within each stage.",
+        ),
+    ] = False,
     gather: Annotated[
         int,
         typer.Option(
@@ -94,6 +117,14 @@ def train(
             "densification has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         ),
     ] = 8,
+    views_per_step: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Training views of one optimizer step, rendered together on a GPU; step sizes grow with the root of "
+            "their number. auto: by the size of the images on a GPU, 1 on a CPU. Iterations count views.",
+        ),
+    ] = "1",
     densify_from: Annotated[
         int | None, typer.Option(rich_help_panel=SCHEDULE, min=0, help="First densification. Default: 500 of 30000.")
     ] = None,
@@ -105,6 +136,21 @@ def train(
             help="Last one, of the whole run; stages scale it. Default: 15000 of 30000.",
         ),
     ] = None,
+    base_densify_share: Annotated[
+        float | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Share of the coarsest level's iterations in which it densifies, from 0 to 1. Default: as all stages, "
+            "half.",
+        ),
+    ] = None,
+    densify_threshold: Annotated[
+        float | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Gradient above which a Gaussian is cloned or split. Default: 0.0002, and 0.0008 with --absgrad.",
+        ),
+    ] = None,
     coarse_threshold: Annotated[
         float | None,
         typer.Option(
@@ -113,6 +159,10 @@ def train(
             f"gives coarse levels fewer Gaussians. Default: {NESTED_COARSE_THRESHOLD:g}, and 1 for residuals.",
         ),
     ] = None,
+    residual_threshold: Annotated[
+        float,
+        typer.Option(rich_help_panel=SCHEDULE, help="Of residuals: factor on the gradient threshold in their stages."),
+    ] = 1.0,
     densify_every: Annotated[
         int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Iterations between two densifications.")
     ] = 100,
@@ -122,17 +172,47 @@ def train(
         typer.Option(
             rich_help_panel=SCHEDULE,
             min=0,
-            help="Iterations between two resets of all opacities; 0 never resets. Default: 3000 of 30000, and of "
-            "nested levels in the base alone.",
+            help="Iterations between two resets of all opacities; 0 never resets. Default: 3000 of 30000, in the "
+            "coarsest level alone.",
         ),
     ] = None,
     strategy: Annotated[
         str,
-        typer.Option(rich_help_panel=SCHEDULE, help="Density control: default (3DGS's heuristics) or mcmc (gsplat)."),
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Density control: default (3DGS's heuristics), mcmc (gsplat), or multiview (only where several views "
+            "are badly shown).",
+        ),
     ] = "default",
+    split_threshold: Annotated[
+        float | None,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Absolute gradient above which --strategy multiview splits a large Gaussian. Default: 0.0008.",
+        ),
+    ] = None,
+    error_threshold: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Share of a view's largest error above which a pixel is badly shown, for --strategy multiview.",
+        ),
+    ] = 0.1,
+    error_pixels: Annotated[
+        float,
+        typer.Option(
+            rich_help_panel=SCHEDULE,
+            help="Badly shown pixels of a view that a Gaussian must make up to be cloned or split, for --strategy "
+            "multiview.",
+        ),
+    ] = 0.1,
     cap_max: Annotated[
         int, typer.Option(rich_help_panel=SCHEDULE, min=1, help="Most Gaussians of a level, for --strategy mcmc.")
     ] = 1_000_000,
+    base_cap_max: Annotated[
+        int | None,
+        typer.Option(rich_help_panel=SCHEDULE, min=1, help="Most Gaussians of the coarsest level. Default: --cap-max."),
+    ] = None,
     absgrad: Annotated[
         bool,
         typer.Option("--absgrad", rich_help_panel=SCHEDULE, help="Densify by absolute gradients (AbsGS)."),
@@ -224,7 +304,7 @@ def train(
     from lapgs_plugin.hierarchy.inheritance import parse_inheritance
     from lapgs_plugin.runs.archive import SceneReference
     from lapgs_plugin.training.backend import ANTIALIASING, AUTO, choose_rasterizer
-    from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, TrainSettings
+    from lapgs_plugin.training.settings import ABSGRAD_THRESHOLD, Densification, LearningRates, TrainSettings
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
@@ -242,10 +322,13 @@ def train(
         inherit_ratio=ratio,
         joint=joint,
         gather=gather,
+        views_per_step=_views_per_step(views_per_step),
         sh_degree=sh_degree,
+        base_sh_degree=base_sh_degree,
         seed=seed,
         cache=cache,
         cache_precision=cache_precision,
+        learning_rates=LearningRates(sh_rest_factor=sh_rate_factor, sh_rest_decay=sh_rate_decay),
         densification=Densification(
             densify_from,
             densify_until,
@@ -254,9 +337,17 @@ def train(
             strategy=strategy,
             absgrad=absgrad,
             cap_max=cap_max,
+            base_cap_max=base_cap_max,
             coarse_threshold=coarse_threshold,
+            residual_threshold=residual_threshold,
+            base_share=base_densify_share,
             prune=prune,
-            **({"grow_grad2d": ABSGRAD_THRESHOLD} if absgrad else {}),
+            error_threshold=error_threshold,
+            error_pixels=error_pixels,
+            split_absgrad2d=ABSGRAD_THRESHOLD if split_threshold is None else split_threshold,
+            grow_grad2d=(ABSGRAD_THRESHOLD if absgrad else Densification.grow_grad2d)
+            if densify_threshold is None
+            else densify_threshold,
         ),
         packed=packed,
         sparse_adam=sparse_adam,
@@ -307,6 +398,16 @@ def _color(text: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def _views_per_step(text: str) -> int | None:
+    """--views-per-step as a number, None for auto."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError as error:
+        raise UserInputError(f"--views-per-step {text}: expected auto, or a number of views from 1 on") from error
+
+
 def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
     """What decides a run's result, by the name of its option."""
     densification = settings.densification
@@ -320,18 +421,27 @@ def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str
         "densify_from": densification.start,
         "densify_until": densification.until,
         "densify_every": densification.every,
+        "base_densify_share": densification.base_share,
+        "densify_threshold": densification.grow_grad2d,
         "coarse_threshold": densification.coarse_threshold,
+        "residual_threshold": densification.residual_threshold,
         "prune": densification.prune,
         "opacity_reset_every": densification.reset_every,
         "strategy": densification.strategy,
+        "split_threshold": densification.split_absgrad2d,
+        "error_threshold": densification.error_threshold,
+        "error_pixels": densification.error_pixels,
         "cap_max": densification.cap_max,
+        "base_cap_max": densification.base_cap_max,
         "absgrad": densification.absgrad,
         "antialiased": bool(settings.raster),
+        "sh_rate_factor": settings.learning_rates.sh_rest_factor,
+        "sh_rate_decay": settings.learning_rates.sh_rest_decay,
         **{
             name: getattr(settings, name)
             for name in (
                 *("iterations", "levels", "hierarchy", "split", "supervision", "grid", "joint", "gather"),
-                *("sh_degree", "seed", "packed", "sparse_adam"),
+                *("views_per_step", "sh_degree", "base_sh_degree", "seed", "packed", "sparse_adam"),
             )
         },
     }

@@ -62,13 +62,13 @@ def supervised_pair(
 
     Args:
         supervision: which of the three.
-        image: (3, h, w) composed prediction I_hat^l.
+        image: (3, h, w) composed prediction I_hat^l; all of several views have one more dimension, (b, 3, h, w).
         target: (3, h, w) ground truth I^l.
         accumulated: (3, h, w) Up(I_hat^(l+1)), None for the base field, which is always compared with its target.
         coarse_target: (3, h, w) Up(I^(l+1)), looked at by GT_LAPLACIAN alone.
 
     Returns:
-        Prediction and target, both (3, h, w); for the residual supervisions both are signed.
+        Prediction and target, shaped as given; for the residual supervisions both are signed.
     """
     if accumulated is None or supervision is Supervision.RECONSTRUCTED:
         return image, target
@@ -85,15 +85,18 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     where that is installed, else from plain PyTorch.
 
     Args:
-        prediction, target: (3, h, w), the target without gradient.
+        prediction, target: (3, h, w), or (b, 3, h, w) of several views; the target without gradient.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
-        The loss, a scalar.
+        The loss, a scalar: of several views the mean of theirs.
     """
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
+        if prediction.ndim == 4:
+            each = zip(prediction.unbind(), target.unbind(), strict=True)
+            return torch.stack([photometric_loss_cpu(*pair, ssim_weight) for pair in each]).mean()
         return photometric_loss_cpu(prediction, target, ssim_weight)
     fused = fused_ssim()
     if fused is None or prediction.dtype != torch.float32:
@@ -103,9 +106,14 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
 
         # Numbers that only scale others cost a launch each, and another on the way back.
         rest = weighted_l1(prediction.contiguous(), target.contiguous(), 1.0 - ssim_weight, ssim_weight)
-        return torch.sub(rest, fused(prediction[None], target[None]), alpha=ssim_weight)
+        return torch.sub(rest, fused(*_batches(prediction, target)), alpha=ssim_weight)
     l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(prediction[None], target[None]))
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(*_batches(prediction, target)))
+
+
+def _batches(*images: Tensor) -> tuple[Tensor, ...]:
+    """Each (3, h, w) or (b, 3, h, w) as (b, 3, h, w)."""
+    return tuple(image if image.ndim == 4 else image[None] for image in images)
 
 
 @lru_cache(maxsize=1)
@@ -146,11 +154,12 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     clamped (Wang et al. 2004, equation 13).
 
     Args:
-        prediction, target: (3, h, w), any float type.
+        prediction, target: (3, h, w), any float type; or (b, 3, h, w), whose mean is that of all images.
     """
+    prediction, target = (image.reshape(-1, *image.shape[-2:]) for image in (prediction, target))  # (3 b, h, w)
     products = torch.stack(
         [prediction, target, prediction * prediction, target * target, prediction * target]
-    )  # (5, 3, h, w)
+    )  # (5, 3 b, h, w)
     mean_p, mean_t, mean_pp, mean_tt, mean_pt = _window_mean(products)
     var_p, var_t, covariance = mean_pp - mean_p**2, mean_tt - mean_t**2, mean_pt - mean_p * mean_t
     luminance = (2 * mean_p * mean_t + SSIM_C1) / (mean_p**2 + mean_t**2 + SSIM_C1)

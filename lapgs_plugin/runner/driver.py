@@ -394,5 +394,11 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     settings.pop("images_on", None)
-    # Runs of the first weeks do not say what all of them were.
-    return {"hierarchy": Hierarchy.LAPLACIAN.value, "prune": 0.0, **values, **settings, **backbone}
+    # Earlier runs do not say what all of them were.
+    residuals = Hierarchy.LAPLACIAN.value
+    before = {
+        "hierarchy": residuals,
+        "prune": 0.0,
+        "residual_resets": settings.get("hierarchy", residuals) == residuals,
+    }
+    return {**before, **values, **settings, **backbone}

@@ -60,6 +60,7 @@ class HierarchyOptions:
         joint: share of each residual stage, its last, in which the finished fields are trained along, 0 to 1. Ablations
             that supervise residuals alone have no use for it: nothing is composed there. None: by the hierarchy.
         residual_color_rate: factor on the SH learning rates of residual stages, above 0.
+        residual_resets: let the backbone reset opacities in residual stages as well as in the base's.
         coarse_threshold: factor on densification thresholds for each time that a level's images are halved, above 0.
             None: by the hierarchy.
         prune: share of what is seen whose Gaussians are removed when a stage's densification ends, see `pruning`; 0 for
@@ -82,6 +83,7 @@ class HierarchyOptions:
     inherit_ratio: float = 1.0
     joint: float | None = None
     residual_color_rate: float = RESIDUAL_COLOR_RATE
+    residual_resets: bool = False
     coarse_threshold: float | None = None
     prune: float = 0.0
     images_on: str = "auto"
@@ -117,6 +119,7 @@ class HierarchyOptions:
                     "--inherit": (f"{self.inherit}:{self.inherit_ratio:g}", "geometry:1"),
                     "--joint": (self.joint_share, 0.0),
                     "--residual-color-rate": (self.residual_color_rate, RESIDUAL_COLOR_RATE),
+                    "--residual-resets": (self.residual_resets, False),
                 }
             )
 
