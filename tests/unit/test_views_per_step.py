@@ -312,7 +312,7 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_pat
 
 
 def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(scene: Scene, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, joint=0.25)
+    settings = replace(SETTINGS, joint=0.25, split="1/2,1/2")
     whole = train(tmp_path / "whole", scene, settings, CpuRasterizer(), test_every=1)
     ends = [entry["iteration"] for entry in whole.history() if entry["level"] == 1]
     assert ends[:4] == [4, 8, 10, 14]
