@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
     from lapgs_plugin.hierarchy.pyramid import Pyramid
     from lapgs_plugin.ops.photometric_loss import photometric_loss
-    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
     from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
     from lapgs_plugin.runs.image_store import ImageStore
 
@@ -55,7 +55,7 @@ _MODULES = {
     "hierarchy.inheritance": ("field_from_points", "inherit"),
     "hierarchy.plan": ("Stage", "StagePlan", "level_size"),
     "hierarchy.pyramid": ("Pyramid",),
-    "rendering.compose": ("HierarchyRenderer",),
+    "rendering.hierarchy_renderer": ("HierarchyRenderer",),
     "fields.splats": ("field_from_splats", "splats_from_field"),
     "ops.photometric_loss": ("photometric_loss",),
 }

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lapgs_plugin.fields.camera import Camera
-    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
     from lapgs_plugin.scenes import Scene, View
 
 SPLITS = ("test", "train", "all")

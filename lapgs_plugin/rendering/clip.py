@@ -16,8 +16,9 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.trajectory import with_size
 from lapgs_plugin.rendering.video import FrameSink, video_writer

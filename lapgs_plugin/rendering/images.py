@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from lapgs_plugin.rendering.compose import Composition
+from lapgs_plugin.ops.composition import Composition
 
 if TYPE_CHECKING:
     from lapgs_plugin.scenes.scene import View

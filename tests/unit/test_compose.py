@@ -17,9 +17,11 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
 BACKGROUND = (0.2, 0.5, 0.9)
 CAMERA = Camera(45, 30, fx=40.0, fy=41.0, cx=21.0, cy=16.0, world_to_camera=torch.eye(4))
@@ -266,11 +268,11 @@ def test_fields_come_to_the_device_when_they_are_rendered(monkeypatch: pytest.Mo
             return super().__call__(fields[int(not field.signed)], camera, background=torch.zeros(3))
 
     there = torch.device("meta")
-    monkeypatch.setattr(HierarchyRenderer, "behind", lambda renderer, level: torch.zeros(3))
+    monkeypatch.setattr(FieldRenderer, "background_of", lambda renderer, level: torch.zeros(3))
     for keep in (True, False):
         asked.clear()
-        residence = FieldOffload(there, keep)
-        renderer = HierarchyRenderer(fields, 2, Pyramid(), Elsewhere(), residence=residence)
+        offload = FieldOffload(there, keep)
+        renderer = HierarchyRenderer(fields, 2, Pyramid(), Elsewhere(), offload=offload)
         assert renderer.device == there
         renderer.render(CAMERA, level=1)
         assert [field.signed for field in asked] == [False], "the other one has not been needed"
@@ -350,8 +352,8 @@ def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pyte
     rasterizer, streams = ConstantImages(), Streams()
     renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
     expected = renderer.render(CAMERA)
-    monkeypatch.setattr(HierarchyRenderer, "device", torch.device("cuda"))
-    monkeypatch.setattr(HierarchyRenderer, "_colored", torch.tensor(BACKGROUND))
+    monkeypatch.setattr(FieldRenderer, "device", torch.device("cuda"))
+    monkeypatch.setattr(FieldRenderer, "_colored", torch.tensor(BACKGROUND))
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: streams.log.append(("synchronize",)))
     monkeypatch.setattr(torch.cuda, "Stream", streams.make)
     monkeypatch.setattr(torch.cuda, "stream", streams.inside)

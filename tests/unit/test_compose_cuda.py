@@ -15,10 +15,11 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.composition import Composition
 from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer, missing
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
 from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from tests.training_scene import blob_field, ring_camera
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(bool(missing()), reason=f"needs gsplat on a GPU: {missing()}")]
@@ -87,7 +88,7 @@ def test_fields_come_when_they_are_needed(renderer: HierarchyRenderer, keep: boo
         Pyramid(),
         GsplatRasterizer(),
         renderer.background,
-        residence=FieldOffload(torch.device("cuda"), keep),
+        offload=FieldOffload(torch.device("cuda"), keep),
     )
     gc.collect()
     before = torch.cuda.memory_allocated()
@@ -118,8 +119,8 @@ def test_a_frame_waits_once_a_field_inside_of_gsplat(
 
 def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
     """The same, of fields that are finished and may be copied to be rendered together, whatever the size."""
-    together = replace(renderer, residence=FieldOffload(torch.device("cuda")), at_once=10**9)
-    assert together.can_be_at_once
+    together = replace(renderer, offload=FieldOffload(torch.device("cuda")), stack_pixels=10**9)
+    assert together.by_field.can_stack
     return together
 
 
@@ -170,7 +171,7 @@ def test_a_frame_of_all_at_once_waits_once(renderer: HierarchyRenderer, waits: l
 def test_all_at_once_takes_the_place_of_the_fields(renderer: HierarchyRenderer) -> None:
     waiting = {level: replace(blob_field(200_000), signed=level < 1) for level in (0, 1)}
     size = sum(value.nbytes for field in waiting.values() for value in field.parameters.values())
-    far = HierarchyRenderer(waiting, 2, Pyramid(), GsplatRasterizer(), residence=FieldOffload(torch.device("cuda")))
+    far = HierarchyRenderer(waiting, 2, Pyramid(), GsplatRasterizer(), offload=FieldOffload(torch.device("cuda")))
     small = ring_camera(0.0, 64, 48)
     before = torch.cuda.memory_allocated()
     far.render(small)

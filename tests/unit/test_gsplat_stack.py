@@ -17,11 +17,12 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, StackingRasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.composition import Composition
 from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
 from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.gsplat_on_cpu import gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
@@ -79,13 +80,13 @@ def hierarchy(counts: Sequence[int], degrees: Sequence[int] = (1, 1, 1, 1)) -> d
 
 def at_once(fields: Mapping[int, GaussianField], rasterizer: OnCpu | None = None) -> HierarchyRenderer:
     return HierarchyRenderer(
-        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=FieldOffload(CPU)
+        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, offload=FieldOffload(CPU)
     )
 
 
 def by_the_oracle(renderer: HierarchyRenderer) -> HierarchyRenderer:
     """One field after the other."""
-    return replace(renderer, rasterizer=OracleRasterizer(three_sigma_cut=False), residence=None)
+    return replace(renderer, rasterizer=OracleRasterizer(three_sigma_cut=False), offload=None)
 
 
 def assert_same(found: Composition, expected: Composition) -> None:
@@ -164,10 +165,10 @@ def test_what_stays_field_by_field() -> None:
     expected = by_the_oracle(renderer)
     for other in (
         replace(renderer, concurrent=False),
-        replace(renderer, at_once=0),
-        replace(renderer, at_once=53 * 37 - 1),
-        replace(renderer, residence=None),
-        replace(renderer, residence=FieldOffload(CPU, keep=False)),
+        replace(renderer, stack_pixels=0),
+        replace(renderer, stack_pixels=53 * 37 - 1),
+        replace(renderer, offload=None),
+        replace(renderer, offload=FieldOffload(CPU, keep=False)),
     ):
         asked.clear()
         assert_same(other.render(CAMERA), expected.render(CAMERA))
@@ -177,7 +178,7 @@ def test_what_stays_field_by_field() -> None:
     renderer.render(CAMERA, gains={0: 0.0})
     assert asked == [2, 2, 1]
     assert rasterizer.stacked == []
-    assert_same(replace(renderer, at_once=53 * 37).render(CAMERA), expected.render(CAMERA))
+    assert_same(replace(renderer, stack_pixels=53 * 37).render(CAMERA), expected.render(CAMERA))
     assert rasterizer.stacked == [2]
 
 
@@ -248,7 +249,7 @@ def test_it_is_measured() -> None:
         patch.setattr(
             OnCpu, "render_images", lambda self, field, cameras, *, background: torch.zeros(1, 3, *_size(cameras))
         )
-        found = measure_speed(replace(at_once(hierarchy((30, 20))), at_once=0), [CAMERA], 0, rounds=1)
+        found = measure_speed(replace(at_once(hierarchy((30, 20))), stack_pixels=0), [CAMERA], 0, rounds=1)
         one = measure_speed(at_once(hierarchy((30,))), [CAMERA], 0, rounds=1)
     assert [(each.what, each.gaussians) for each in found[:2]] == [
         ("levels 1 to 0, one after the other", 50),
