@@ -11,7 +11,6 @@ import torch
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers import gsplat
 from lapgs_plugin.rasterizers.extensions import (
     CONSTANTS,
     SEMANTICS,
@@ -20,6 +19,7 @@ from lapgs_plugin.rasterizers.extensions import (
     import_extension,
     options_of,
 )
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.runs.archive import Manifest

@@ -16,7 +16,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import Composition
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer, missing
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer, missing
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer

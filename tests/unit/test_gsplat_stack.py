@@ -18,8 +18,8 @@ from lapgs_plugin.fields.rasterizer import FieldStack, StackingRasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import Composition
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer

@@ -19,10 +19,10 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
 from lapgs_plugin.fields.rasterizer import render_transmittance
-from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rasterizers.extensions import CudaExtension
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.reference_raster.standins import install, stand_ins
