@@ -94,7 +94,7 @@ def test_sizes_that_are_asked_for(tmp_path: Path) -> None:
     for text in ("9" * 5000 + "x720", "\u0661\u0662x720"):
         with pytest.raises(UserInputError, match="expected WIDTHxHEIGHT"):
             parse_size(text)
-    with pytest.raises(UserInputError, match="LAPGS_MAX_VIEW_PIXELS"):
+    with pytest.raises(UserInputError, match="expected at most 8192x8192"):
         make_sample_scene(tmp_path / "new", width=99999, height=99999)
     with pytest.raises(UserInputError, match="--points"):
         make_sample_scene(tmp_path / "new", points=10**9)
