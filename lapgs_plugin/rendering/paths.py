@@ -1,4 +1,4 @@
-"""The cameras of a path, as the command line names it."""
+"""Make the camera path that the command line names."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ PATHS = ("orbit", "spline")
 def path_cameras(
     archive: RunArchive, trajectory: str, frames: int | None, default: int, scene: Path | None
 ) -> list[Camera]:
-    """The cameras of a path, one a frame.
+    """Return the cameras of a path, one per frame.
 
     Args:
-        archive: of the run whose training cameras it goes around or through.
-        trajectory: "orbit", "spline" or a file, as `trajectory.read_trajectory` reads it.
-        frames: how many; None for `default`, or each camera of a file once.
+        archive: of the run whose training cameras the path surrounds or follows.
+        trajectory: "orbit", "spline" or a file for `trajectory.read_trajectory`.
+        frames: number of frames; None for `default`, or each camera of a file once.
         default: frames of an orbit or a spline.
-        scene: where the run's scene is now; None where it was trained.
+        scene: current folder of the run's scene; None if it is where the run was trained.
 
     Raises:
-        UserInputError: the file or one of its cameras is not usable, or there are more frames than `limits.FRAMES`.
-        RunFolderError, SceneError: the scene is not there or not the run's.
+        UserInputError: the file or one of its cameras cannot be used, or there are more frames than `limits.FRAMES`.
+        RunFolderError, SceneError: the scene is missing or not the run's.
     """
     if frames is not None:
         FRAMES.check(frames, f"--frames {frames}")

@@ -1,4 +1,4 @@
-"""A run folder put back together: its fields, its scene, and a rasterizer for them."""
+"""Load a run to render it: its fields, its scene, and a rasterizer."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 def run_renderer(
     archive: RunArchive, device: str = "auto", rasterizer: str = "auto", *, finest: int = 0
 ) -> HierarchyRenderer:
-    """A renderer of a run's finished levels.
+    """Return a renderer of a run's finished levels.
 
     Args:
         archive: the run.
-        device, rasterizer: as `rasterizer_for` takes them; what is left to it is the rasterizer of the training, or the
-            nearest that runs here.
-        finest: the finest level that is wanted; fields of finer ones are not read.
+        device, rasterizer: as `rasterizer_for` takes them.
+        finest: the finest level to read.
 
     Raises:
         RunFolderError: no level is finished, or a field is damaged.
@@ -33,13 +32,14 @@ def run_renderer(
 
 
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
-    """The scene a run was trained on, read as it was then.
+    """Load the scene of a run with the settings of the training.
 
     Args:
-        moved_to: where the scene is now; None when it is still where the manifest says.
+        archive: the run.
+        moved_to: current folder of the scene; None if it is where the manifest says.
 
     Raises:
-        RunFolderError: it is not there, or not the scene that the run was trained on.
+        RunFolderError: it is missing, or not the scene that the run was trained on.
         SceneError: it cannot be read.
     """
     reference, path = _scene_place(archive, moved_to)
@@ -55,7 +55,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
-    """The cameras a run was trained on and those held out, by view name, without reading their images.
+    """Load the training and held-out cameras of a run by view name, without reading images.
 
     Args, Raises:
         As `run_scene`.
@@ -69,7 +69,7 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
 
 
 def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
-    """How a run read its scene, and where that is now."""
+    """Return how a run read its scene, and the current folder of the scene."""
     reference = archive.manifest.scene
     path = Path(reference.path) if moved_to is None else moved_to
     if moved_to is None and not path.is_dir():
@@ -80,7 +80,7 @@ def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneRefer
 
 
 def require_same_scene(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
-    """Refuse a scene whose images are not of the size that was trained, before figures of it mislead.
+    """Check that a scene's images have the size that was trained, because metrics would be wrong otherwise.
 
     Args:
         archive: the run.

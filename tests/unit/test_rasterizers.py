@@ -77,7 +77,7 @@ def chosen(placed: PlacedRasterizer) -> tuple[str, str]:
 def test_without_cuda_the_fast_one_renders_and_says_what_it_cannot_honour(line: Any) -> None:
     placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == ("cpu", "cpu")
-    assert placed.lost == {"mult": 0.5}
+    assert placed.unsupported == {"mult": 0.5}
     assert line() == (
         f"rendering with cpu on the CPU: the fastest without a CUDA device; the run was trained with {FASTGS}, images "
         "may differ slightly; cpu cannot honour mult = 0.5 of the training "
@@ -94,8 +94,8 @@ def test_a_run_of_ours_is_rendered_as_it_was_trained(trained: str, line: Any) ->
 
 @pytest.mark.usefixtures("no_cuda")
 def test_settings_that_change_nothing_are_not_worth_a_word() -> None:
-    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=False)).lost == {}
-    assert rasterizer_for(manifest(FASTGS, mult=1.0)).lost == {}
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=False)).unsupported == {}
+    assert rasterizer_for(manifest(FASTGS, mult=1.0)).unsupported == {}
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -104,7 +104,7 @@ def test_settings_that_change_nothing_are_not_worth_a_word() -> None:
 def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: dict[str, Any], signed: bool) -> None:
     placed = rasterizer_for(manifest(name, **setting), device="cpu", rasterizer=name)
     assert chosen(placed) == (name, "cpu")
-    assert placed.lost == {}
+    assert placed.unsupported == {}
     case = scene(signed)
     with torch.no_grad():
         honoured, plain = case.render(placed.rasterizer).image, case.render(OracleRasterizer()).image
@@ -139,7 +139,7 @@ def test_with_cuda_the_rasterizer_of_the_training_renders_with_its_settings(line
     with install("fastgs"):
         placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == (FASTGS, "cuda")
-    assert placed.lost == {}
+    assert placed.unsupported == {}
     assert line() == f"rendering with {FASTGS} on A GPU: the one it was trained with"
 
 
@@ -148,7 +148,7 @@ def test_a_build_that_lacks_a_setting_says_so(line: Any) -> None:
     with install("taming"):
         placed = rasterizer_for(manifest(GRAPHDECO, antialiasing=True))
     assert chosen(placed) == (GRAPHDECO, "cuda")
-    assert placed.lost == {"antialiasing": True}
+    assert placed.unsupported == {"antialiasing": True}
     assert "cannot honour antialiasing = True" in line()
 
 
@@ -157,9 +157,9 @@ def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: 
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
     placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == ("gsplat", "cuda")
-    assert placed.lost == {"mult": 0.5}
+    assert placed.unsupported == {"mult": 0.5}
     assert f"rendering with gsplat on A GPU: {FASTGS} cannot be imported" in line()
-    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).lost == {}
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).unsupported == {}
 
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "gsplat is not installed")
     assert chosen(rasterizer_for(manifest(FASTGS))) == ("cpu", "cpu")

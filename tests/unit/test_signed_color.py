@@ -24,7 +24,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
 from lapgs_plugin.rasterizers import signed_color
-from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
     SignedColorRasterizer,
@@ -232,7 +232,7 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
 
 def test_screen_gradients_come_back_in_pixels() -> None:
     means2d, absolute = torch.zeros(3, 2, requires_grad=True), torch.zeros(3, 2)
-    points = _Screen.apply(means2d, 40, 20, 4, absolute)
+    points = _ScreenPoints.apply(means2d, 40, 20, 4, absolute)
     assert points.shape == (3, 4)
     points.backward(torch.tensor([[20.0, 10.0, 40.0, 30.0]]).expand(3, 4))
     assert means2d.grad is not None
