@@ -125,7 +125,7 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
             ("--trajectory", "orbit", "--size", "16384x16384"),
             "expected at most 128,000,000 pixels; ",
         ),
-        (("--trajectory", "helix"), "expected orbit, spline or a JSON file"),
+        (("--trajectory", "helix"), "give orbit, spline or a JSON file"),
         (("--trajectory", "orbit", "--level", 3), "level 3 cannot be rendered"),
     ],
 )

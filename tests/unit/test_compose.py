@@ -17,7 +17,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.ops.composition import to_full_size
+from lapgs_plugin.ops.composition import compose, to_full_size
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.rendering.field_offload import FieldOffload
 from lapgs_plugin.rendering.field_renderer import FieldRenderer
@@ -80,6 +80,28 @@ def test_three_levels_by_the_formula() -> None:
     torch.testing.assert_close(composition.composed, {2: base, 1: composed_1, 0: composed_0}, rtol=0, atol=1e-6)
     assert residual_0.abs().max() > 0.05  # the scene shows something
     assert residual_0.min() < 0
+
+
+def test_gradients_reach_every_composed_level() -> None:
+    generator = torch.Generator().manual_seed(3)
+    sides = {2: (8, 12), 1: (15, 23), 0: (30, 45)}
+    renders = {
+        level: torch.randn((3, *side), generator=generator, dtype=torch.float64, requires_grad=True)
+        for level, side in sides.items()
+    }
+    weights = torch.randn((3, *sides[0]), generator=generator, dtype=torch.float64)
+    pyramid = Pyramid("camera")
+    (compose(pyramid, renders.items(), gains={1: 0.5}).image * weights).sum().backward()
+    # The image is linear in each render, so the gradient times the render is that render's part of the weighted sum.
+    parts = {
+        0: renders[0],
+        1: 0.5 * pyramid.up(renders[1], sides[0]),
+        2: pyramid.up(pyramid.up(renders[2], sides[1]), sides[0]),
+    }
+    for level, render in renders.items():
+        assert render.grad is not None
+        expected = float((parts[level] * weights).sum().detach())
+        assert float((render.grad * render.detach()).sum()) == pytest.approx(expected, rel=1e-9)
 
 
 def test_one_level_is_the_plain_render() -> None:
