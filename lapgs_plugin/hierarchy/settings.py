@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, RESIDUAL_SPLIT, Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import option
 
@@ -39,6 +39,22 @@ ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate", "re
 """Settings that mean nothing for nested levels."""
 
 
+PROTOCOLS = ("default", "paper")
+PAPER: Mapping[str, object] = {
+    "hierarchy": Hierarchy.LAPLACIAN.value,
+    "supervision": RECONSTRUCTED,
+    "inherit": "xyz",
+    "joint": 0.0,
+    "residual_color_rate": 1.0,
+    "residual_threshold": 1.0,
+    "residual_resets": True,
+    "coarse_threshold": 1.0,
+    "prune": 0.0,
+}
+"""Settings of the paper's main tables, except the split of two levels. Other settings classes add their own."""
+PAPER_SPLIT = "1/3,2/3"
+
+
 @dataclass(frozen=True)
 class HierarchySettings:
     """Choose the levels of a run and how they are trained. None stands for the hierarchy's default.
@@ -49,9 +65,15 @@ class HierarchySettings:
 
     hierarchy: str = option(
         DEFAULT_HIERARCHY.value,
-        "Kind of hierarchy. nested: each level continues training the coarser level's field at the finer size; the "
-        "result is one ordinary field. laplacian: each level trains a signed residual, which is added to the upsampled "
-        "coarser image, as in the paper.",
+        "Kind of hierarchy. laplacian: each level trains a signed residual, which is added to the upsampled coarser "
+        "image, as in the paper. nested: each level continues training the coarser level's field at the finer size; "
+        "the result is one ordinary field.",
+        panel=PANEL,
+    )
+    protocol: str = option(
+        "default",
+        "default: the settings of this program. paper: exactly those of the paper's main tables; options that "
+        "contradict them are refused.",
         panel=PANEL,
     )
     levels: int = option(
@@ -61,8 +83,7 @@ class HierarchySettings:
     )
     split: str | None = option(
         None,
-        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2 "
-        "nested, 1/3,2/3 laplacian.",
+        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2.",
         panel=PANEL,
     )
     supervision: str = option(
@@ -130,6 +151,9 @@ class HierarchySettings:
     seed: int = option(0, "Seed of all random choices of lapgs.")
 
     def __post_init__(self) -> None:
+        _require("--protocol", self.protocol, PROTOCOLS)
+        if self.protocol == "paper":
+            self._follow_the_paper()
         kind = self.kind
         SUPERVISIONS[self.supervision]  # raises for an unknown name
         _require("--grid", self.grid, GRIDS)
@@ -159,6 +183,25 @@ class HierarchySettings:
                 raise UserInputError(f"{name} {factor}: expected a positive factor")
         if kind is Hierarchy.NESTED:
             self._refuse_residual_settings()
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """Values of `--protocol paper` by field."""
+        return {**PAPER, **({"split": PAPER_SPLIT} if self.levels == 2 else {})}
+
+    def _follow_the_paper(self) -> None:
+        """Set the paper's values.
+
+        Raises:
+            UserInputError: another value was given.
+        """
+        defaults = {each.name: each.default for each in fields(self)}
+        for name, value in self.paper_settings.items():
+            if (given := getattr(self, name)) not in (defaults[name], value):
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} {given} with --protocol paper: the paper has {value}; leave one out"
+                )
+            object.__setattr__(self, name, value)  # the dataclass is frozen
 
     def _refuse_residual_settings(self) -> None:
         idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0, "residual_threshold": 1.0}
@@ -215,8 +258,7 @@ class HierarchySettings:
         """Share of each stage in the iterations, coarsest first; None for the default of `StagePlan`."""
         if self.split is not None:
             return parse_split(self.split)
-        two_levels = self.levels == len(RESIDUAL_SPLIT)
-        return RESIDUAL_SPLIT if two_levels and not self.nested else DEFAULT_SPLITS.get(self.levels)
+        return DEFAULT_SPLITS.get(self.levels)
 
     def resolved(self) -> dict[str, Any]:
         """Return all fields for manifests, with the hierarchy's defaults filled in: these may change later."""
