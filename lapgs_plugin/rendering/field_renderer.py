@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -15,7 +15,36 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
 from lapgs_plugin.hierarchy.cameras import level_camera
-from lapgs_plugin.rendering.field_offload import FieldOffload
+
+
+@dataclass
+class FieldOffload:
+    """Keep fields in host memory and copy them to the device for rendering, once or for each frame.
+
+    Attributes:
+        device: that renders.
+        keep: keep a field there after the first copy. Otherwise it stays in page-locked memory and is copied for every
+            frame, in the stream that renders it, while other streams work.
+    """
+
+    device: torch.device
+    keep: bool = True
+    _ready: dict[int, GaussianField] = field(default_factory=dict, repr=False)
+
+    def bring(self, level: int, wanted: GaussianField) -> GaussianField:
+        """Return a level's field on `device`, for use in the current stream.
+
+        Args:
+            level: key of the kept copy.
+            wanted: the field, on any device.
+        """
+        if wanted.means.device.type == self.device.type == "cpu":
+            return wanted
+        if level not in self._ready:
+            self._ready[level] = wanted.to(self.device) if self.keep else _page_locked(wanted)
+            torch.cuda.synchronize(self.device)  # once: from now on every stream may use it
+        ready = self._ready[level]
+        return ready if self.keep else _copied(ready, self.device)
 
 
 @dataclass(frozen=True)
@@ -46,8 +75,8 @@ class FieldRenderer:
 
     def field(self, level: int) -> GaussianField:
         """Return a level's field on `device`."""
-        field = self.fields[level]
-        return field if self.offload is None else self.offload.bring(level, field)
+        wanted = self.fields[level]
+        return wanted if self.offload is None else self.offload.bring(level, wanted)
 
     def render(
         self, cameras: Sequence[Camera], levels: Sequence[int], omitted: Collection[int] = ()
@@ -189,3 +218,14 @@ class FieldRenderer:
                 f"the GPU has no memory left to render {which}, {count:,} Gaussians at {camera.width}x{camera.height}; "
                 "render a coarser --level, a smaller size, or with --device cpu"
             ) from error
+
+
+def _page_locked(wanted: GaussianField) -> GaussianField:
+    return wanted.with_parameters({name: value.cpu().pin_memory() for name, value in wanted.parameters.items()})
+
+
+def _copied(waiting: GaussianField, device: torch.device) -> GaussianField:
+    """Start copying a field to the device, without waiting for it."""
+    return waiting.with_parameters(
+        {name: value.to(device, non_blocking=True) for name, value in waiting.parameters.items()}
+    )

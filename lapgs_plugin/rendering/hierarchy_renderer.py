@@ -17,8 +17,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import AS_TRAINED, Composition, compose, scaled
-from lapgs_plugin.rendering.field_offload import FieldOffload
-from lapgs_plugin.rendering.field_renderer import FieldRenderer
+from lapgs_plugin.rendering.field_renderer import FieldOffload, FieldRenderer
 from lapgs_plugin.runs.archive import Manifest, RunArchive
 
 CLAMPED = "clamped"
@@ -142,15 +141,8 @@ class HierarchyRenderer:
     @cached_property
     def by_field(self) -> FieldRenderer:
         """Renders each field by itself."""
-        return FieldRenderer(
-            self.fields,
-            self.rasterizer,
-            self.background,
-            self.clamped,
-            self.concurrent,
-            self.stack_pixels,
-            self.offload,
-        )
+        options = self.clamped, self.concurrent, self.stack_pixels, self.offload
+        return FieldRenderer(self.fields, self.rasterizer, self.background, *options)
 
     @property
     def device(self) -> torch.device:

@@ -1,4 +1,4 @@
-"""Load a run to render it: its fields, its scene, and a rasterizer."""
+"""Load a run to render it: its fields, its scene, cameras of a path, and a rasterizer."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from pathlib import Path
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
 from lapgs_plugin.runs.archive import RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
+
+PATHS = ("orbit", "spline")
 
 
 def run_renderer(
@@ -42,7 +47,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         RunFolderError: it is missing, or not the scene that the run was trained on.
         SceneError: it cannot be read.
     """
-    reference, path = _scene_place(archive, moved_to)
+    reference, path = _scene_folder(archive, moved_to)
     scene = load_scene(
         path,
         resolution=reference.resolution,
@@ -60,7 +65,7 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     Args, Raises:
         As `run_scene`.
     """
-    reference, path = _scene_place(archive, moved_to)
+    reference, path = _scene_folder(archive, moved_to)
     train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     cameras = [*train.values(), *test.values()]
     smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
@@ -68,7 +73,33 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     return train, test
 
 
-def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
+def path_cameras(
+    archive: RunArchive, trajectory: str, frames: int | None, default: int, scene: Path | None
+) -> list[Camera]:
+    """Return the cameras of a path, one per frame.
+
+    Args:
+        archive: of the run whose training cameras the path surrounds or follows.
+        trajectory: "orbit", "spline" or a file for `trajectory.read_trajectory`.
+        frames: number of frames; None for `default`, or each camera of a file once.
+        default: frames of an orbit or a spline.
+        scene: current folder of the run's scene; None if it is where the run was trained.
+
+    Raises:
+        UserInputError: the file or one of its cameras cannot be used, or there are more frames than `limits.FRAMES`.
+        RunFolderError, SceneError: the scene is missing or not the run's.
+    """
+    if frames is not None:
+        FRAMES.check(frames, f"--frames {frames}")
+    if trajectory not in PATHS:
+        cameras = read_trajectory(Path(trajectory))
+        return cameras if frames is None else spline(cameras, frames)
+    train = list(run_cameras(archive, scene)[0].values())
+    count = default if frames is None else frames
+    return orbit(Rig.of(train), count) if trajectory == "orbit" else spline(walking_order(train), count)
+
+
+def _scene_folder(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
     """Return how a run read its scene, and the current folder of the scene."""
     reference = archive.manifest.scene
     path = Path(reference.path) if moved_to is None else moved_to

@@ -19,8 +19,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import compose, to_full_size
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.field_offload import FieldOffload
-from lapgs_plugin.rendering.field_renderer import FieldRenderer
+from lapgs_plugin.rendering.field_renderer import FieldOffload, FieldRenderer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
 BACKGROUND = (0.2, 0.5, 0.9)

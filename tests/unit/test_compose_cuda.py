@@ -18,7 +18,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import Composition
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer, missing
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from tests.training_scene import blob_field, ring_camera
 

@@ -83,17 +83,11 @@ def render(
 
 def render_images(field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int) -> Tensor:
     """Render images alone, (3, h, w) or (c, 3, h, w) of several; arguments as `render` takes them."""
-    return _render(field, cameras, background, degree, describes=False)[0]
+    return _render(field, cameras, background, degree, describes=False, absgrad=False)[0]
 
 
 def _render(
-    field: GaussianField,
-    cameras: DeviceCameras,
-    background: Tensor,
-    degree: int,
-    *,
-    describes: bool,
-    absgrad: bool = False,
+    field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int, *, describes: bool, absgrad: bool
 ) -> tuple[Tensor, Intermediates, GradientTargets]:
     """Render, and return a list to which the tensors that take gradients can be added.
 

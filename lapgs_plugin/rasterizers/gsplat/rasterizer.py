@@ -117,7 +117,7 @@ class GsplatRasterizer:
             raise UserInputError(
                 f"means is {means.dtype} on {means.device}, expected float32 on {self._device}; use .to()"
             )
-        return self._render(field, [camera], background, sh_degree, absgrad=self._absgrad)
+        return self._render(field, [camera], background, sh_degree, self._absgrad)
 
     @property
     def can_batch(self) -> bool:
@@ -134,8 +134,8 @@ class GsplatRasterizer:
         describes: bool = True,
     ) -> RenderResult:
         """Render several cameras in one set of launches; see `fields.rasterizer.BatchRasterizer`."""
-        if describes or len(field) == 0:
-            return self._render(field, cameras, background, sh_degree, absgrad=describes and self._absgrad)
+        if describes:
+            return self._render(field, cameras, background, sh_degree, self._absgrad)
         image = self._images(field, cameras, background, sh_degree)
         centres = field.means.new_zeros(len(cameras), 0, 2)
         return RenderResult(image, None, centres[..., 0].int(), centres)
@@ -144,18 +144,14 @@ class GsplatRasterizer:
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> Tensor:
         """Render the image without radii, centres and transmittance; see `fields.rasterizer.PlainRasterizer`."""
-        if len(field) == 0:
-            return self(field, camera, background=background, sh_degree=sh_degree).image
         return self._images(field, [camera], background, sh_degree)
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         """Render images of several cameras together; see `fields.rasterizer.ImageRasterizer`."""
-        if len(field) == 0:
-            shape = len(cameras), 3, cameras[0].height, cameras[0].width
-            return background.to(field.means)[:, None, None].expand(shape)
-        if self._direct and len(cameras) == 1:
-            return self._images(field, cameras, background, None)[None]
+        if len(field) == 0 or (self._direct and len(cameras) == 1):
+            images = self._images(field, cameras, background, None)
+            return images[None] if len(cameras) == 1 else images
         return self._stock.images(field, cameras, background, field.sh_degree)
 
     @property
@@ -176,13 +172,7 @@ class GsplatRasterizer:
         return self._may_be_direct and (self._must_be_direct or direct_works())
 
     def _render(
-        self,
-        field: GaussianField,
-        cameras: Sequence[Camera],
-        background: Tensor,
-        sh_degree: int | None,
-        *,
-        absgrad: bool,
+        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None, absgrad: bool
     ) -> RenderResult:
         """Render cameras of one size with radii and centres."""
         degree = field.sh_degree if sh_degree is None else sh_degree
@@ -196,8 +186,10 @@ class GsplatRasterizer:
     def _images(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
     ) -> Tensor:
-        """Render images alone, (3, h, w) of one camera and (b, 3, h, w) of several; at least one Gaussian."""
+        """Render images alone, (3, h, w) of one camera and (b, 3, h, w) of several."""
         degree = field.sh_degree if sh_degree is None else sh_degree
+        if len(field) == 0:
+            return _without_gaussians(field, cameras, background, absgrad=False).image
         if self._direct:
             return direct.render_images(field, self._cameras.get(cameras, field.means), background, degree)
         images = self._stock.images(field, cameras, background, degree)
