@@ -1,4 +1,4 @@
-"""`lapgs doctor` on this machine, and on one where everything is broken."""
+"""Run `lapgs doctor` on this machine, and on one where everything is broken."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Composition against the formula written out, and against constant images whose sum is known."""
+"""Compare compositions with the formula written out, and with constant images of known sum."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def blobs(seed: int, signed: bool) -> GaussianField:
 
 
 class Constant:
-    """Renders the first SH value of a field's first Gaussian everywhere, and remembers what it was asked."""
+    """Render the first SH value of a field's first Gaussian everywhere, and record the calls."""
 
     name = "constant"
 
@@ -334,14 +334,14 @@ def test_the_level_of_detail_is_the_coarsest_that_is_not_smaller(size: tuple[int
 
 
 class ConstantImages(Constant):
-    """The same of a rasterizer that works in the current stream."""
+    """The same as an `ImageRasterizer`, which works in the current stream."""
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         return torch.stack([self(field, camera, background=background).image for camera in cameras])
 
 
 class Streams:
-    """What `torch.cuda` offers for streams, writing down who waits for whom and who uses what."""
+    """Replace the streams of `torch.cuda`, and record which stream waits for which."""
 
     def __init__(self) -> None:
         self.log: list[tuple[str, ...]] = []

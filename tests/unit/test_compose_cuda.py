@@ -1,5 +1,4 @@
-"""Composition on a GPU with gsplat: streams, batches, streamed fields and all fields at once give the same images, and
-nothing waits."""
+"""Compose on a GPU with gsplat: streams, batches, offloaded and stacked fields give the same images without waiting."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ def renderer() -> HierarchyRenderer:
 
 @pytest.fixture
 def waits() -> Iterator[list[warnings.WarningMessage]]:
-    """What PyTorch says of waits for the GPU."""
+    """Collect PyTorch's warnings about waits for the GPU."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield caught
@@ -51,7 +50,7 @@ def images(renderer: HierarchyRenderer, cameras: list[Camera]) -> list[torch.Ten
 
 
 def assert_alike(found: torch.Tensor, expected: torch.Tensor) -> None:
-    """The same but for rounding, by which a Gaussian of 1/255 is left out in a pixel, or blending stops one earlier."""
+    """Compare up to rounding, by which a Gaussian of alpha 1/255 may be skipped or blending may stop one earlier."""
     apart = (found - expected).abs()
     assert float((apart > 2e-5).float().mean()) < 1e-4, float(apart.max())  # worst seen: 3 of 246,402
     assert float(apart.max()) < 1e-2  # worst seen 1.7e-3
@@ -118,7 +117,7 @@ def test_a_frame_waits_once_a_field_inside_of_gsplat(
 
 
 def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
-    """The same, of fields that are finished and may be copied to be rendered together, whatever the size."""
+    """Return the renderer with a stack of its fields, for images of any size."""
     together = replace(renderer, offload=FieldOffload(torch.device("cuda")), stack_pixels=10**9)
     assert together.by_field.can_stack
     return together

@@ -1,4 +1,4 @@
-"""What the doctor concludes from what its probes find; the probes themselves against broken modules."""
+"""Test the findings of `lapgs doctor` for given probes, and the probes with broken modules."""
 
 from __future__ import annotations
 

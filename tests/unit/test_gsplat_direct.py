@@ -1,4 +1,4 @@
-"""gsplat's kernels called directly, against `gsplat.rasterization`; on a GPU alone."""
+"""Compare direct calls of gsplat's kernels with `gsplat.rasterization`, on a GPU."""
 
 from __future__ import annotations
 

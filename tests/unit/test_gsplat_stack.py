@@ -1,4 +1,4 @@
-"""All fields of a view in one set of launches: the images are the oracle's, field by field and composed."""
+"""Compare stacked fields, rendered in one set of launches, with the oracle: field by field and composed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def kernels() -> Iterator[None]:
 
 
 class OnCpu(GsplatRasterizer):
-    """gsplat behind our interface on the CPU, where it can render fields at once and nothing else."""
+    """gsplat behind our interface on the CPU, where it can only render stacks."""
 
     def __init__(self) -> None:
         super().__init__(CPU)
@@ -63,7 +63,7 @@ class OnCpu(GsplatRasterizer):
 
 
 def field(count: int, signed: bool, degree: int = 1, seed: int = 0) -> GaussianField:
-    """Some of them outside of the view and near, where projection and culling depend on the size of the image."""
+    """Make Gaussians, some outside the view and near, where projection and culling depend on the image size."""
     generator = torch.Generator().manual_seed(seed)
     blobs = blob_field(count, seed)
     means = blobs.means * torch.tensor([3.0, 2.0, 3.0])
@@ -73,7 +73,7 @@ def field(count: int, signed: bool, degree: int = 1, seed: int = 0) -> GaussianF
 
 
 def hierarchy(counts: Sequence[int], degrees: Sequence[int] = (1, 1, 1, 1)) -> dict[int, GaussianField]:
-    """Of fields with `counts`, finest first."""
+    """Make fields with `counts` Gaussians, finest first."""
     top = len(counts) - 1
     return {level: field(counts[level], level < top, degrees[level], seed=level) for level in range(top, -1, -1)}
 
@@ -85,7 +85,7 @@ def at_once(fields: Mapping[int, GaussianField], rasterizer: OnCpu | None = None
 
 
 def by_the_oracle(renderer: HierarchyRenderer) -> HierarchyRenderer:
-    """One field after the other."""
+    """Return the renderer with the oracle, one field after the other."""
     return replace(renderer, rasterizer=OracleRasterizer(three_sigma_cut=False), offload=None)
 
 
@@ -115,7 +115,7 @@ def test_degrees_of_colour_may_differ() -> None:
 
 
 def test_a_coarse_field_is_culled_and_linearized_for_its_own_size() -> None:
-    """Rendered as an image of the finest size it would have more Gaussians in it, and others at its border."""
+    """Projected at the finest size, it would have more Gaussians, and others at its border."""
     fields = hierarchy((50, 400))
     asked: list[tuple[int, int]] = []
     projection = gsplat.fully_fused_projection
@@ -205,7 +205,7 @@ def test_from_1_6_0_on_it_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_antialiasing_dims_by_the_area_that_was_added() -> None:
-    """One Gaussian in the centre of a pixel: its opacity times the root of the quotient of the determinants."""
+    """A Gaussian in a pixel centre is dimmed by the root of the quotient of the determinants."""
     camera = Camera(17, 17, 20.0, 20.0, 8.5, 8.5, torch.eye(4))
     deviation, opacity = 0.04, 0.9
     small = GaussianField(

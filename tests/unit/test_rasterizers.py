@@ -1,4 +1,4 @@
-"""Which rasterizer renders a run, what it is told of the training, and that rendering pays for nothing else."""
+"""Test the choice of rasterizer, the settings it gets from the training, and gsplat behind our interface."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def scene(signed: bool = False) -> Case:
 
 @pytest.fixture
 def line(caplog: pytest.LogCaptureFixture) -> Iterator[Any]:
-    """The one line that was logged."""
+    """Return the only logged line."""
     caplog.set_level(logging.INFO, LOGGER)
 
     def only() -> str:
@@ -61,7 +61,7 @@ def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine that says it has a GPU; nothing is rendered on it."""
+    """Pretend to have a GPU; nothing is rendered on it."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "A GPU")
 
@@ -223,7 +223,7 @@ def test_settings_that_an_extension_does_not_have_are_refused() -> None:
 
 
 class WithoutCuda:
-    """`gsplat.rasterization` and `spherical_harmonics` by gsplat's own PyTorch code, and what is asked of them."""
+    """Compute `gsplat.rasterization` and `spherical_harmonics` by gsplat's PyTorch code, and record the arguments."""
 
     def __init__(self) -> None:
         self.asked: dict[str, Any] = {}
@@ -278,7 +278,7 @@ class WithoutCuda:
         return image, alpha, {**found, "gaussian_ids": None}
 
     def _packed(self, found: dict[str, Any], absgrad: bool) -> dict[str, Any]:
-        """What was found of the visible Gaussians alone; their centres have the gradients, as gsplat's have."""
+        """Return the results of visible Gaussians alone; gradients go to their centres, as in gsplat."""
         ids = (found["radii"][0] > 0).all(-1).nonzero()[:, 0]
         packed: Any = found["means2d"][0, ids]
         whole = found["means2d"]
@@ -305,7 +305,7 @@ def without_cuda(monkeypatch: pytest.MonkeyPatch) -> WithoutCuda:
 
 
 def faint(signed: bool) -> Case:
-    """Opacities whose alpha sinks under 1/255 well inside three sigma: no footprint is cut and no alpha capped."""
+    """Make Gaussians whose alpha is below 1/255 well inside three sigma: no footprint is cut and no alpha capped."""
     case = random_case(300, 70, 50, seed=3, background=(0.0, 0.0, 0.0)).to(torch.float32)
     opacities = 0.01 + 0.19 * torch.rand(300, generator=torch.Generator().manual_seed(4))
     field = case.field.with_parameters({"opacity_logits": torch.logit(opacities)})
@@ -386,7 +386,7 @@ def test_gsplat_without_gaussians_shows_the_background(without_cuda: WithoutCuda
 
 
 def test_what_a_backward_pass_needed_is_let_go_at_once(without_cuda: WithoutCuda) -> None:
-    """Not when Python next looks for circles of references: it sees small objects, not gigabytes behind them."""
+    """Memory is freed without the cycle collector, which sees small objects and not the gigabytes behind them."""
     case = faint(False).with_leaves()
     gc.collect()
     gc.disable()

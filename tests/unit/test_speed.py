@@ -1,4 +1,4 @@
-"""Which speeds are measured, of what, and from when to when."""
+"""Test which speeds are measured, of which fields, and for how long."""
 
 from __future__ import annotations
 
