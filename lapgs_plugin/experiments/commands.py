@@ -13,14 +13,13 @@ from typing import Any
 from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
+from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
 SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's own where `lapgs import-run` puts what `lapgs eval` reads."""
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that the schedules of 3DGS codebases are written for."""
 NEVER = "-1"
 NEGATIONS = {"fused-adam": ["--no-fused-adam"]}
 """How the options are switched off that are on by themselves."""
@@ -174,7 +173,7 @@ def _schedule(iterations: int) -> tuple[str, ...]:
     """The family's schedule for another number of iterations: all shrinks or grows but the intervals."""
     if iterations == REFERENCE_ITERATIONS:
         return ()
-    start = max(1, round(500 * min(1.0, iterations / REFERENCE_ITERATIONS)))
+    start = max(1, round(REFERENCE_DENSIFY_FROM * min(1.0, iterations / REFERENCE_ITERATIONS)))
     return (
         *("--iterations", str(iterations), "--position_lr_max_steps", str(iterations)),
         *("--densify_from_iter", str(start), "--densify_until_iter", str(iterations // 2)),

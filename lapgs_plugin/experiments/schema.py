@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, Hierarchy
+from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -24,8 +24,6 @@ T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without dashes in front and with underscores inside."""
-RESIDUAL_OPTIONS = {"supervision": "reconstructed", "inherit": None, "joint": 0.0, "residual_color_rate": None}
-"""Those that only residuals have, and what of them says no more than leaving them out; None where nothing does."""
 
 
 class _Part(BaseModel):
@@ -172,7 +170,7 @@ class Experiment(_Part):
 
     name: str = Field(pattern=NAME)
     title: str
-    iterations: int = Field(30_000, ge=1)
+    iterations: int = Field(REFERENCE_ITERATIONS, ge=1)
     seeds: list[int] = Field([0], min_length=1)
     scenes: list[Scenes] = Field(min_length=1)
     backbones: dict[str, Backbone] = Field(min_length=1)
@@ -308,44 +306,21 @@ def _wrong_value(where: str, problems: list[Any]) -> list[str]:
 
 
 def _option_problems(experiment: Experiment, option_names: Mapping[str, Set[str]]) -> list[str]:
-    """What is wrong with options: every one has to be of the command that it will be given to."""
-    found: dict[str, str] = {}  # by place: what several commands do not have is said once
-    residual: dict[str, None] = {}
+    """Find options that the command of their runs does not have."""
+    found: dict[str, str] = {}  # by key, so that a mistake that concerns several commands is reported once
 
-    def check(where: str, options: Mapping[str, Any], command: str) -> bool:
-        unknown = [name for name in options if name not in option_names[command]]
-        for name in unknown:
-            place = f"{where}.options.{name}"
+    def check(where: str, options: Mapping[str, Any], command: str) -> None:
+        for name in options.keys() - option_names[command]:
+            key = f"{where}.options.{name}"
             found.setdefault(
-                place,
-                f"{place} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
+                key,
+                f"{key} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
                 f"experiment sets itself; {nearest(name, option_names[command])}",
             )
-        return not unknown
 
     for key, backbone in experiment.backbones.items():
-        known = check(f"backbones.{key}", backbone.options, backbone.command)
+        check(f"backbones.{key}", backbone.options, backbone.command)
         for number, variant in enumerate(experiment.variants):
-            if variant.backbones and key not in variant.backbones:
-                continue
-            if (
+            if key in (variant.backbones or [key]):
                 check(f"variants.{number}", variant.options, backbone.command)
-                and known
-                and (variant.method != "bare" or backbone.checkout is None)
-            ):
-                options = {**backbone.options, **variant.options}
-                where = f"variants.{number}: variant {variant.name!r} on backbone {key!r}"
-                residual.update(dict.fromkeys(_residual_problems(where, options)))
-    return list(found.values()) or list(residual)
-
-
-def _residual_problems(where: str, options: Mapping[str, Any]) -> list[str]:
-    """What the command would refuse of options about residuals."""
-    if options.get("hierarchy", DEFAULT_HIERARCHY.value) != Hierarchy.NESTED.value:
-        return []
-    return [
-        f"{where} sets {name} = {options[name]!r:.80}, which is about residuals, and nested levels have none; leave it "
-        f'out, or add hierarchy = "{Hierarchy.LAPLACIAN.value}" to train residuals'
-        for name, idle in RESIDUAL_OPTIONS.items()
-        if options.get(name, idle) != idle
-    ]
+    return [found[key] for key in sorted(found)]

@@ -7,7 +7,13 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
+from lapgs_plugin.hierarchy.plan import (
+    REFERENCE_DENSIFY_FROM,
+    REFERENCE_ITERATIONS,
+    Hierarchy,
+    Stage,
+    nested_densify_until,
+)
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import option
 
@@ -20,8 +26,6 @@ hardly move any more, and what single views disagree about is noise; earlier, st
 LEAST_STEPS = 40
 """In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views
 lost 0.08 dB, of one field 0.13."""
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
 STRATEGIES = ("default", "mcmc")
 GROW_THRESHOLD = 2e-4
@@ -62,7 +66,11 @@ class Densification:
     """
 
     start: int | None = option(
-        None, "First densification. Default: 500 of 30000.", panel=SCHEDULE, names=("--densify-from",), least=0
+        None,
+        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        panel=SCHEDULE,
+        names=("--densify-from",),
+        least=0,
     )
     until: int | None = option(
         None,
@@ -96,7 +104,7 @@ class TrainSettings(HierarchySettings):
     """Everything that decides the result of a run besides the scene."""
 
     iterations: int = option(
-        30_000, "Optimizer steps, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS, "Optimizer steps, all stages together. The 3DGS schedule shrinks with it.", least=1
     )
     gather: int = option(
         8,
@@ -289,7 +297,7 @@ class StageSchedule:
         late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         return cls(
             iterations=stage.iterations,
-            densify_start=constant(given.start, 500, 1),
+            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
             densify_until=densify_until,
             densify_every=given.every,
             reset_every=resets,

@@ -53,6 +53,8 @@ SAMPLE = 'sample = { size = "64x48", views = 8, points = 100 }'
 PATH = 'path = "scene"'
 OURS = "densify_every = 50"
 THEIRS = "fused_adam = false"
+NESTED = 'hierarchy = "nested"'
+RESIDUAL = ("is about residuals", "add --hierarchy laplacian")
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +126,10 @@ MISTAKES = [
     ("levels = 2", 'hierarchy = "laplacian", joint = 2.0', ["variants.1.options.joint = 2.0", "from 0 to 1"]),
     ("levels = 2", 'hierarchy = "laplacian", inherit = "xyz:7"', ['options.inherit = "xyz:7"', "expected a ratio"]),
     ("levels = 2", r'split = "a\nb\u001b[31m"', [r"\n", r"\x1b", "expected fractions"]),
+    ("sh_degree = 1", f"{NESTED}, joint = 0.25", ["backbones.cpu.options.joint = 0.25", *RESIDUAL]),
+    ("sh_degree = 1", f'{NESTED}, inherit = "geometry"', ['backbones.cpu.options.inherit = "geometry"', *RESIDUAL]),
+    ("sh_degree = 1", f'{NESTED}, supervision = "gt_laplacian"', ["backbones.cpu.options.supervision", *RESIDUAL]),
+    (THEIRS, f"{NESTED}, residual_color_rate = 1.0", ["variants.3.options.residual_color_rate = 1.0", *RESIDUAL]),
     (OURS, "densify_every = 0", ["variants.2.options.densify_every = 0", "greater than or equal to 1"]),
     (OURS, "accumulate_views = -1", ["variants.2.options.accumulate_views = -1", "expected at least 1"]),
     (OURS, "sh_degree = 9", ["variants.2.options.sh_degree = 9", "expected 0, 1, 2 or 3"]),
@@ -258,6 +264,14 @@ def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.M
     monkeypatch.setattr(launchers, "find_spec", lambda name: object())
     (line,) = lines_about(GOOD, "--launcher", "ray", "--launcher-option", f"{name}={value}")
     assert line.startswith(f"--launcher-option {name}={value}: expected a number of a worker")
+
+
+def test_defaults_of_residual_options_are_accepted_for_nested_levels() -> None:
+    idle = f'{NESTED}, joint = 0.0, supervision = "reconstructed"'
+    Path("tiny.toml").write_text(GOOD.replace("sh_degree = 1", idle))
+    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
 
 
 def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,50 +86,6 @@ def test_a_mistake_is_one_line_that_names_it(tmp_path: Path, old: str, new: str,
         assert word in message
 
 
-RESIDUAL = """
-name = "x"
-title = "X"
-[[scenes]]
-name = "a"
-path = "a"
-[backbones.cpu]
-rasterizer = "cpu"
-options = { joint = 0.0, supervision = "reconstructed" }
-[backbones.fast]
-checkout = "fastgs"
-options = { residual_color_rate = 1.0 }
-[[variants]]
-name = "bare"
-method = "bare"
-[[variants]]
-name = "residuals"
-options = { hierarchy = "laplacian" }
-"""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ('{ hierarchy = "laplacian" }', "{ levels = 2 }", ("variant 'residuals' on backbone 'fast'", "residual_color")),
-        ('{ hierarchy = "laplacian" }', '{ hierarchy = "nested" }', ("backbone 'fast'", "residual_color_rate")),
-        ("joint = 0.0", "joint = 0.25", ("variant 'bare' on backbone 'cpu'", "joint")),
-        ("joint = 0.0", 'inherit = "geometry"', ("variant 'bare' on backbone 'cpu'", "inherit")),
-        ("reconstructed", "gt_laplacian", ("variant 'bare' on backbone 'cpu'", "supervision")),
-    ],
-)
-def test_options_of_residuals_are_refused_before_the_first_run(
-    tmp_path: Path, old: str, new: str, words: tuple[str, ...]
-) -> None:
-    assert old in RESIDUAL
-    load(tmp_path, RESIDUAL)
-    with pytest.raises(UserInputError) as caught:
-        load(tmp_path, RESIDUAL.replace(old, new))
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in ("x.toml", *words, "about residuals", 'add hierarchy = "laplacian"'):
-        assert word in message
-
-
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"none\.toml: No such file"):
         load_experiment(tmp_path / "none.toml", _option_names())
