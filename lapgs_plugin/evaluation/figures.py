@@ -12,13 +12,13 @@ from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
-from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import METRICS, LevelRecord, Manifest, RunArchive
+from lapgs_plugin.runs.training_figures import training_figures
 from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {

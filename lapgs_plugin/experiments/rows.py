@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runs.archive import LevelRecord, RunArchive
+from lapgs_plugin.runs.training_figures import training_figures
 
 NOTED = ("psnr", "ssim")
 """What training itself notes of its images."""
