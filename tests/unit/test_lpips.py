@@ -183,14 +183,14 @@ def test_the_smallest_image_is_measured_and_a_smaller_one_said(name: str, tmp_pa
 
 def damaged(folder: Path) -> dict[str, Path]:
     """Files that are no weights, by what is said of them."""
-    files = {name: folder / f"{index}.pth" for index, name in enumerate(("layers of none", "cannot be read", "a list"))}
-    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["layers of none"])
+    files = {name: folder / f"{index}.pth" for index, name in enumerate(("fits none", "cannot be read", "a list"))}
+    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["fits none"])
     files["cannot be read"].write_bytes(b"PK\x03\x04 cut short")
     torch.save([1, 2], files["a list"])
     return {**files, "No such file": folder / "nowhere.safetensors"}
 
 
-@pytest.mark.parametrize("said", ["layers of none", "cannot be read", "a list", "No such file"])
+@pytest.mark.parametrize("said", ["fits none", "cannot be read", "a list", "No such file"])
 def test_files_that_are_no_weights(said: str, tmp_path: Path) -> None:
     path = damaged(tmp_path)[said]
     with pytest.raises(UserInputError, match=said) as raised:
