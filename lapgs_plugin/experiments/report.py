@@ -18,7 +18,7 @@ from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import Bar, BarChart, Chart, Move, draw_bars, draw_moves
+from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import (
     MeasuredRun,
@@ -153,7 +153,7 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         tables=tables,
         variants={name: results.style(name) for name in results.variants},
         num_runs=len({row["run"] for row in results.rows}),
-        moves=_moves(results),
+        arrows=_time_arrows(results),
         breakdown=_breakdown(results),
         overhead=_overhead(results),
         parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
@@ -186,10 +186,10 @@ def _machines(results: Results) -> list[str]:
 # All scenes and backbones together.
 
 
-def _moves(results: Results) -> Chart | None:
+def _time_arrows(results: Results) -> Chart | None:
     """Time against Gaussians: arrows from every baseline to every other variant, means over the seeds."""
     column = next(name for name in COUNTS if all(name in row for row in results.rows))
-    moves = []
+    arrows = []
     for scene, backbone in results.pairs:
         base = results.baseline(backbone)
         start = _point(results.of(scene, backbone, base), column)
@@ -197,11 +197,11 @@ def _moves(results: Results) -> Chart | None:
             end = _point(results.of(scene, backbone, variant), column)
             if variant != base and start is not None and end is not None:
                 label = f"{results.title(scene, backbone)}: {base} to {variant}"
-                moves.append(Move(results.style(variant), label, start, end))
-    if not moves:
+                arrows.append(Arrow(results.style(variant), label, start, end))
+    if not arrows:
         return None
-    return draw_moves(
-        "Optimization (s) against Gaussians", COUNTS[column], moves, format_x=count_text, format_y=count_text
+    return draw_arrows(
+        "Optimization (s) against Gaussians", COUNTS[column], arrows, format_x=count_text, format_y=count_text
     )
 
 
@@ -225,7 +225,7 @@ def _overhead(results: Results) -> BarChart | None:
         for column in columns
         if column.startswith("overhead_") and column != "overhead_seconds"
     }
-    return _bars(results, "Beside the optimization", names, seconds_text)
+    return _bars(results, "Overhead", names, seconds_text)
 
 
 def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable[[float], str]) -> BarChart | None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
-from lapgs_plugin.reports.comparison import Cell, comparison_rows, unlike
+from lapgs_plugin.reports.comparison import Cell, comparison_rows, setup_differences
 from lapgs_plugin.runs.archive import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.runs.training_figures import training_figures
 from tests.training_scene import blob_field
@@ -101,6 +101,6 @@ def test_a_run_alone_has_one_cell_and_no_change() -> None:
 def test_unlike_runs_are_told_apart() -> None:
     scene = SceneReference("/data/fox", "1/4", True, (0.0, 0.0, 0.0), "colmap")
     run = Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, {"iterations": 3000})
-    assert unlike(run, replace(run, levels=1, seed=3)) == []
+    assert setup_differences(run, replace(run, levels=1, seed=3)) == []
     other = replace(run, scene=replace(scene, resolution="1/8"), settings={"iterations": 1000})
-    assert unlike(run, other) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]
+    assert setup_differences(run, other) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]
