@@ -102,7 +102,7 @@ def everything() -> set[str]:
 MISTAKES = [
     ("seeds = [0, 1]", "seeds = [0, -1]", ["seeds.1 = -1", "expected 0 to 4294967295"]),
     ("seeds = [0, 1]", "seeds = [4294967296]", ["seeds.0 = 4294967296", "expected 0 to 4294967295"]),
-    ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is there twice", "expected different seeds"]),
+    ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is listed twice", "expected different seeds"]),
     ("seeds = [0, 1]", 'seeds = ["one"]', ["seeds.0 = 'one'", "valid integer"]),
     ("levels = 2", "levels = 0", ["variants.1.options.levels = 0"]),
     ("levels = 2", "levels = -3", ["variants.1.options.levels = -3"]),
@@ -152,7 +152,7 @@ MISTAKES = [
     (THEIRS, "test_every = 0", ["variants.3.options.test_every = 0", "greater than or equal to 1"]),
     ("sh_degree = 1", "sh_degree = -1", ["backbones.cpu.options.sh_degree = -1", "expected 0, 1, 2 or 3"]),
     ('rasterizer = "cpu"', 'rasterizer = "gpu"', ['backbones.cpu.rasterizer = "gpu"', "expected auto, gsplat, cpu"]),
-    ('checkout = "fastgs"', 'checkout = "fast"', ["backbones.fast.checkout", "nothing says where it is"]),
+    ('checkout = "fastgs"', 'checkout = "fast"', ["backbones.fast.checkout", "its folder is not given"]),
     ('"--dense"', '"-m", "elsewhere", "--dense"', ["variants.1", "arguments '-m'", "other options of the script"]),
     ('"--dense"', '"--source_path=x", "--dense"', ["arguments '--source_path=x'", "other options of the script"]),
     ('resolution = "full"', 'resolution = "big"', ['scenes.0.resolution = "big"', "expected 1k, 2k, 4k"]),
@@ -236,7 +236,7 @@ def test_mistakes_of_the_file_itself_are_all_said_at_once() -> None:
         (("--workers", "-1"), "Invalid value for '--workers'"),
         (("--gpus", "0,,1"), "--gpus '0,,1': expected names separated by commas"),
         (("--launcher", "cloud"), "--launcher cloud: expected local, slurm, ray"),
-        (("--launcher", "slurm", "--gpus", "0"), "--gpus 0: slurm deals out GPUs itself"),
+        (("--launcher", "slurm", "--gpus", "0"), "--gpus 0: slurm assigns GPUs itself"),
         (("--launcher-option", "partition=gpu"), "--launcher-option partition: the local launcher has none"),
         (("--path", "fastgs=empty"), "backbones.fast.checkout: checkout fastgs: "),
         (("--path", "fastgs=file"), "file is not a folder"),
@@ -263,7 +263,7 @@ def test_mistakes_on_the_command_line_are_found_before_anything_is_written(
 def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launchers, "find_spec", lambda name: object())
     (line,) = lines_about(GOOD, "--launcher", "ray", "--launcher-option", f"{name}={value}")
-    assert line.startswith(f"--launcher-option {name}={value}: expected a number of a worker")
+    assert line.startswith(f"--launcher-option {name}={value}: expected a number for each worker")
 
 
 def test_defaults_of_residual_options_are_accepted_for_nested_levels() -> None:

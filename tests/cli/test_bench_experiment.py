@@ -129,7 +129,7 @@ def invoke(*words: str | Path) -> BaseException | None:
         (("--launcher", "slurm"), "no sbatch on this machine"),
         (("--launcher-option", "partition"), "--launcher-option partition: expected NAME=VALUE"),
         (("--launcher-option", "partition=gpu"), "the local launcher has none"),
-        (("--launcher", "slurm", "--gpus", "0"), "slurm deals out GPUs itself"),
+        (("--launcher", "slurm", "--gpus", "0"), "slurm assigns GPUs itself"),
         (("--path", "mine"), "--path mine: expected NAME=VALUE"),
         (("--path", "mine=nowhere"), "scene mine: nowhere is not a folder"),
         (("--scene", "yours"), "--scene yours: not in the experiment; "),
@@ -152,7 +152,7 @@ def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path
     os.environ.pop("LAPGS_FASTGS", None)
     error = invoke(experiment, "--out", experiment.parent / "out")
     assert isinstance(error, UserInputError)
-    assert "checkout fastgs: nothing says where it is; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
+    assert "checkout fastgs: its folder is not given; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
     assert not (experiment.parent / "out").exists()
 
 

@@ -65,14 +65,14 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         ('name = "one"', 'name = "one"\nmethod = "naked"', ("method", "'naked'")),
         ("levels = 1 }", 'levels = 1 }\n[[variants]]\nname = "one"', ("two variants are called 'one'",)),
         ('name = "x"', 'name = "x y"', ("name", "'x y'")),
-        ("[[variants]]", '[[scenes]]\nname = "a"\n[[variants]]', ("scene 'a' is there twice",)),
+        ("[[variants]]", '[[scenes]]\nname = "a"\n[[variants]]', ("scene 'a' is listed twice",)),
         ('name = "one"', 'name = "one"\nmethod = "bare"', ("bare, which is one level; leave levels out",)),
         (
             'name = "one"\noptions = { levels = 1 }',
             'name = "one"\nmethod = "bare"\nbackbones = ["fast"]\noptions = { inherit = "xyz" }',
-            ("options of `lapgs run` mean nothing",),
+            ("options of `lapgs run` have no effect",),
         ),
-        ('name = "one"', 'name = "one"\nbackbones = ["cpu"]\narguments = ["-x"]', ("no script of a checkout",)),
+        ('name = "one"', 'name = "one"\nbackbones = ["cpu"]\narguments = ["-x"]', ("no checkout whose script",)),
         ('name = "x"', "name = x", ("is not TOML",)),
     ],
 )

@@ -99,7 +99,7 @@ def test_a_missing_run_leaves_no_unfair_mean() -> None:
     records = {run.spec.run_id: record(run) for i, run in enumerate(planned) if i not in both}
     (group,) = make_table(experiment, planned, records).groups
     assert group.rows[0].cells["minutes"].values == (pytest.approx(5.05),), "bonsai alone, in every row"
-    assert "Means over bonsai, the scenes that every row has." in group.notes
+    assert "Means over bonsai: the scenes that every row has." in group.notes
 
 
 def test_figures_of_a_whole_data_set_are_said_to_be_such() -> None:
