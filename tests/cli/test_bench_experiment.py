@@ -164,10 +164,17 @@ def test_results_of_another_version_are_named(experiment: Path) -> None:
     claim = store.claim([planned[0].spec.run_id])
     assert claim is not None
     store.record(claim, {"psnr": 20.0, "train_seconds": 1.0, "lapgs_version": "0.0.9"})
-    result = CliRunner().invoke(bench_app, [str(experiment), "--out", str(out), "--tables-only"])
+    words = [str(experiment), "--out", str(out), "--tables-only"]
+    result = CliRunner().invoke(bench_app, words)
     assert result.exit_code == 0
     assert "some results were made by lapgs_plugin 0.0.9" in result.stderr
     assert "lapgs_plugin 0.0.9" in (out / "tables.md").read_text()
+    assert "| one field |" in result.stdout, "a pipe gets the Markdown"
+    assert result.stdout.rstrip().endswith(f"lapgs report {out} writes a page with curves and images")
+    shown = CliRunner().invoke(bench_app, words, env={"FORCE_COLOR": "1", "COLUMNS": "150"}).stdout
+    assert "one field" in shown
+    assert "20.00" in shown
+    assert "|" not in shown, "a terminal gets tables, not their source"
 
 
 def test_tables_of_nothing(experiment: Path) -> None:
