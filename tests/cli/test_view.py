@@ -22,7 +22,7 @@ from tests.viewer.pages import statuses
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
 from lapgs_plugin.viewer.page import free_port  # noqa: E402  # needs viser
-from lapgs_plugin.viewer.server import Viewer  # noqa: E402
+from lapgs_plugin.viewer.viewer import Viewer  # noqa: E402
 
 app = typer.Typer()
 app.command("view")(view)

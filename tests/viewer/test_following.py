@@ -21,7 +21,7 @@ from tests.cli.run_folder import write_run, write_scene
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
 from lapgs_plugin.viewer import following
-from lapgs_plugin.viewer.following import FollowedRun, Following
+from lapgs_plugin.viewer.following import FollowedRun, RunFollower
 from tests.waiting import wait_for
 
 
@@ -128,11 +128,11 @@ class FakeViewer:
         self.shown: list[Any] = []
         self.starts = 0
 
-    def begin_at(self, start: Any) -> None:
+    def set_initial_view(self, start: Any) -> None:
         self.starts += 1
 
-    def show(self, exhibit: Any) -> None:
-        self.shown.append(exhibit)
+    def show(self, content: Any) -> None:
+        self.shown.append(content)
 
 
 class FakePage:
@@ -142,11 +142,11 @@ class FakePage:
 def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_folder(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(following, "LOOK_SECONDS", 0.02)
+    monkeypatch.setattr(following, "POLL_SECONDS", 0.02)
     complete = write_run(tmp_path / "complete", scene)
     folder = write_run(tmp_path / "run", scene, finished=1)
     viewer, page, said = FakeViewer(), FakePage(), list[str]()
-    follow = Following(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
+    follow = RunFollower(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
     follow.begin()
     stop = threading.Event()
     thread = threading.Thread(target=follow.watch, args=(stop,))
@@ -160,7 +160,7 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
     finally:
         stop.set()
         thread.join()
-    assert [list(exhibit.run.counts) for exhibit in viewer.shown[:2]] == [[1], [1, 0]]
+    assert [list(content.run.counts) for content in viewer.shown[:2]] == [[1], [1, 0]]
     assert len(viewer.shown[0].cameras) == 10
     assert viewer.starts == 1
     assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]

@@ -17,7 +17,7 @@ viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 from websockets.exceptions import InvalidStatus  # noqa: E402  # needs viser
 from websockets.sync.client import connect  # noqa: E402
 
-from lapgs_plugin.viewer.guard import MOST_LINES, Guard, guarded_server  # noqa: E402
+from lapgs_plugin.viewer.guard import MAX_LOGGED, Guard, guarded_server  # noqa: E402
 from lapgs_plugin.viewer.page import Page  # noqa: E402
 from tests.viewer.wire import wire_client  # noqa: E402
 from tests.waiting import wait_for  # noqa: E402
@@ -200,7 +200,7 @@ def test_what_is_refused_is_a_line_each_and_not_without_end(caplog: pytest.LogCa
         for name in ("\x9bevil", "evil", "evil", *(f"evil{number}" for number in range(20))):
             assert get(page, Origin=f"http://{name}.example")[0] == 403
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == len(set(lines)) == MOST_LINES
+    assert len(lines) == len(set(lines)) == MAX_LOGGED
     assert lines[1].startswith("the viewer refused a browser: a page of 'http://evil.example' may not")
     assert re.fullmatch(r"[\x20-\x7e]*", "".join(lines))
 

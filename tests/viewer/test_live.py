@@ -24,7 +24,7 @@ pytest.importorskip("viser", reason="needs the extra 'viewer'")
 from lapgs_plugin.viewer import live
 from lapgs_plugin.viewer.live import LiveView
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.server import Viewer
+from lapgs_plugin.viewer.viewer import Viewer
 from tests.viewer.wire import WireClient, wire_client
 from tests.waiting import wait_for as wait_so_long
 
@@ -162,7 +162,7 @@ def ring_stage() -> Stage:
     return Stage(level=0, image_size=(56, 40), iterations=10, signed=False)
 
 
-@pytest.mark.parametrize("broken", ["draw_next", "show", "begin_at"])
+@pytest.mark.parametrize("broken", ["draw_next", "show", "set_initial_view"])
 def test_a_viewer_that_fails_ends_watching_not_training(
     page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
 ) -> None:
@@ -175,7 +175,7 @@ def test_a_viewer_that_fails_ends_watching_not_training(
     assert archive.manifest.complete
     assert watcher.looks <= 1
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert warnings == ["nobody can watch any more, training goes on: no more memory for pictures"]
+    assert warnings == ["the view has ended, training continues: no more memory for pictures"]
 
 
 @pytest.mark.parametrize("percent", [2.0, 10.0, 50.0])

@@ -18,8 +18,8 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.field_offload import FieldOffload
-from lapgs_plugin.viewer.navigation import Pose
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw, side_by_side
+from lapgs_plugin.viewer.poses import Pose
 from tests.training_scene import blob_field, ring_camera
 
 CAMERA = ring_camera(0.4, 64, 48)
