@@ -152,16 +152,16 @@ class CaseResult:
     def missed(self) -> list[str]:
         """One line for each requirement that is not met."""
         lines = [
-            f"{self.case.name}: {name} takes {self.ratios[name]:.1f} times as long, required {required:g}"
+            f"{self.case.name}: {name} takes {self.ratios[name]:.1f} times as long, expected at least {required:g}"
             for name, required in self.case.required.items()
             if name in self.ratios and self.ratios[name] < required
         ]
         if self.case.required and self.loss_share > MAX_LOSS_SHARE:
             lines.append(
-                f"{self.case.name}: the loss adds {self.loss_share:.0%}, required {MAX_LOSS_SHARE:.0%} at most"
+                f"{self.case.name}: the loss adds {self.loss_share:.0%}, expected at most {MAX_LOSS_SHARE:.0%}"
             )
         if self.case.required and self.peak_memory is not None and self.peak_memory > MAX_MEMORY:
-            lines.append(f"{self.case.name}: training takes {self.peak_memory / 1e9:.2f} GB, required 1.5 at most")
+            lines.append(f"{self.case.name}: training takes {self.peak_memory / 1e9:.2f} GB, expected at most 1.5")
         return lines
 
 

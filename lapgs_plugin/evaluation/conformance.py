@@ -302,7 +302,7 @@ def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance
     pixels = actual.image[:, mask.pixels]  # (3, p)
     outside = int(((pixels < low) | (pixels > high)).sum())
     if outside:
-        yield f"{outside} values in the band are beyond all colours of the scene"
+        yield f"{outside} values in the band are outside the range of the scene's colours"
 
 
 def _blended(expected: _Rendered) -> Tensor:

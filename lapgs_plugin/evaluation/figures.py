@@ -42,7 +42,7 @@ class ViewMetrics:
         psnr, ssim: of the composition at full resolution; PSNR in dB.
         lpips: the measured distances, by variant.
         level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at the
-                level's size.
+            level's size.
         upsampled_psnr: by level, PSNR in dB of I_hat^l upsampled to full resolution, against the photo: the quality
             without the finer levels.
     """

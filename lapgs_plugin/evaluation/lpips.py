@@ -263,7 +263,7 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
             continue
         weights = named.get(name) or _cached(name)
         if weights is None:
-            missing[variant] = f"no weights: name a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
+            missing[variant] = f"no weights: give a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
         elif smallest_side < NETWORKS[name].smallest:
             missing[variant] = f"images of {smallest_side} pixels are too small, expected {NETWORKS[name].smallest}"
         elif (complete := _with_learned(name, weights)) is None:

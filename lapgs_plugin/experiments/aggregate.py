@@ -29,7 +29,8 @@ class Column:
     Attributes:
         heading: heading as in the paper, without arrow.
         better: "lower", "higher" or "".
-        sources: columns of the rows; the first that a row has is used. One that ends with _level_ has a value a level.
+        sources: columns of the rows; the first that a row has is used. A source that ends with "_level_" stands for one
+            column for each level.
         scale: factor on the value.
         decimals: digits after the point.
     """

@@ -65,7 +65,7 @@ class RunSpec:
 
     @cached_property
     def run_id(self) -> str:
-        """Readable name, different for every difference. Variants with equal settings share their runs."""
+        """Name of the run, different for different settings. Variants with equal settings share their runs."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
         last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]

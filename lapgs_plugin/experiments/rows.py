@@ -1,12 +1,12 @@
 """Make the row of results of a finished run: flat, one value a column, units in the column's name.
 
-        run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    settings
-        psnr, ssim, lpips_*, fps            and every other number of metrics.json
-        measured_by                         "lapgs eval" or "training": origin of the image metrics
+    run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    settings
+    psnr, ssim, lpips_*, fps            and every other number of metrics.json
+    measured_by                         "lapgs eval" or "training": origin of the image metrics
     train_seconds, overhead_seconds, overhead_<what>_seconds, wall_seconds
-        gaussians, gaussians_level_<l>      of the archived fields; peak_gaussians, mean_gaussians during training
+    gaussians, gaussians_level_<l>      of the archived fields; peak_gaussians, mean_gaussians during training
     peak_memory_bytes, peak_memory_without_images_bytes    on a GPU
-        <part>_ms, iteration_ms             milliseconds an iteration, with --breakdown
+    <part>_ms, iteration_ms             milliseconds an iteration, with --breakdown
     lapgs_version, torch, gpu, processor, host, python, started, attempt, folder
 
 A row has no columns for values that were not measured.

@@ -1,4 +1,5 @@
 """Load standard data sets, backbones' published options for them, and the figures of the paper.
+
 All of them are files in data/: datasets.toml, presets.toml and paper/*.csv.
 """
 

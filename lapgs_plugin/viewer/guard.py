@@ -45,6 +45,7 @@ class Guard:
     - If other machines may connect: `host`, its addresses, and the names of this machine.
     - On all addresses: any address too. A numeric address cannot be a page's name, and a machine behind a router or in
       a container does not know its own.
+
     Args:
         host: address or name that the viewer listens on.
     """

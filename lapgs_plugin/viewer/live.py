@@ -64,7 +64,7 @@ class LiveView(Watcher):
         gui = page.server.gui
         with gui.add_folder("Training"):
             self._percent = gui.add_slider(
-                "percent of its time",
+                "percent of training time",
                 min=0.0,
                 max=MAX_PERCENT,
                 step=0.5,

@@ -114,7 +114,7 @@ class PictureSettings:
         band: the only level to show, residuals around mid-grey; None for the composition.
         level: finest level to add; None for `ShownRun.fitting_level`.
         divider: where the picture changes from one run to the other, as a share of its width; None shows only the
-                first run.
+            first run.
     """
 
     gains: Mapping[int, float] = field(default_factory=dict)
