@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.level_views import PrefetchingViews
-from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.inheritance import inherit
@@ -112,7 +112,9 @@ class ActiveStage:
 
     @property
     def resets_opacities(self) -> bool:
-        """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
+        """Whether the checkout may. What it is for, floaters near the cameras, was done in the base's stage."""
+        if self.stage.signed:
+            return self._options.residual_resets
         return not self.window.continues_field
 
     # What the replaced symbols ask for.
@@ -283,6 +285,11 @@ class ActiveStage:
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.path(f"level_{self.stage.level}", OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
+            if not all(isinstance(left.get(part), dict) for part in ("carried", "moments")):
+                raise RunFolderError(
+                    f"{self._archive.path(f'level_{self.stage.level}', OPTIMIZER)} holds {', '.join(map(str, left))}, "
+                    "expected carried and moments; start again with --overwrite"
+                )
         carried = {
             name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
             for name, value in left["carried"].items()

@@ -87,7 +87,7 @@ def test_a_mistake_is_one_line_that_names_it(tmp_path: Path, old: str, new: str,
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match=r"none\.toml: No such file"):
+    with pytest.raises(UserInputError, match=r"none\.toml cannot be read: No such file"):
         load_experiment(tmp_path / "none.toml", _option_names())
 
 
