@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.experiments.expansion import PlannedRun, Selection
-from lapgs_plugin.experiments.schema import Experiment, one_line
+from lapgs_plugin.experiments.schema import Experiment, ExperimentError
 
 
 class Mistakes:
@@ -26,7 +26,7 @@ class Mistakes:
 
     def add(self, key: str, message: str) -> None:
         """Add a mistake; a repeated one is kept once."""
-        self._lines[one_line(f"{self._file}: {key}: {message}")] = None
+        self._lines[f"{self._file}: {key}: {message}"] = None
 
     @contextmanager
     def at(self, key: str) -> Iterator[None]:
@@ -40,10 +40,10 @@ class Mistakes:
         """Raise all mistakes as one error.
 
         Raises:
-            UserInputError: there are mistakes.
+            ExperimentError: there are mistakes.
         """
         if self._lines:
-            raise UserInputError("\n".join(self._lines))
+            raise ExperimentError(self._lines)
 
 
 def scene_key(experiment: Experiment, name: str) -> str:

@@ -46,7 +46,7 @@ COUNTS = {
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
 
 NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
-"""Columns that every row has: text and numbers."""
+"""Columns with text and with numbers that every row has."""
 
 Row = Mapping[str, Any]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
@@ -19,6 +19,13 @@ T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without leading dashes and with underscores."""
+
+
+class ExperimentError(UserInputError):
+    """Mistakes in an experiment file, one line each."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        Exception.__init__(self, "\n".join(map(one_line, lines)))
 
 
 class _StrictModel(BaseModel):
@@ -234,7 +241,8 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         UserInputError: it cannot be read, is not TOML, or has mistakes: one line for each, which names the key, and for
             an unknown key the nearest known one.
     """
-    values = read_toml(path, advice="give an experiment file such as smoke.toml")
+    # The commands refuse numbers that are not finite, and name the option.
+    values = read_toml(path, advice="give an experiment file such as smoke.toml", finite=False)
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:
@@ -242,7 +250,7 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     else:
         problems = _option_problems(experiment, option_names)
     if problems:
-        raise UserInputError("\n".join(one_line(f"{path}: {problem}") for problem in problems))
+        raise ExperimentError(f"{path}: {problem}" for problem in problems)
     return experiment
 
 
@@ -259,7 +267,7 @@ def nearest(name: str, known: Set[str]) -> str:
 
 def one_line(text: str) -> str:
     """Return the text as one line of limited length, with control characters escaped."""
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    line = printable(text)
     return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
 
 

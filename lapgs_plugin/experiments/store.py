@@ -257,7 +257,7 @@ class ResultStore:
         ]
 
     def _row(self, run_id: str, text: str) -> dict[str, Any]:
-        """What is recorded of a run."""
+        """Parse the recorded row of a run."""
         name, advice = f"the record of {run_id} in {self._path}", "run the experiment again in another folder"
         row: dict[str, Any] = parse_json(text, name, dict[str, Any], error=RunFolderError, advice=advice)
         return row
