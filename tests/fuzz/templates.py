@@ -29,6 +29,7 @@ from plyfile import PlyData
 from lapgs_plugin import __version__
 from lapgs_plugin.experiments.commands import Places
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
 from lapgs_plugin.experiments.runner import Folder, prepare
 from lapgs_plugin.experiments.schema import load_experiment
@@ -244,7 +245,10 @@ def _write_experiment(folder: Path, reader: Reader) -> None:
     file.write_text(as_toml(values))
     experiment = load_experiment(file, {"train": {"levels"}, "run": {"levels"}})
     planned, scenes = plan_runs(experiment, Selection()), scenes_of(experiment, Selection())
-    jobs = prepare(planned, scenes, Places({}, bench), Folder(bench), [])
+    jobs, _ = prepare(
+        planned, scenes, Places({}, bench), Folder(bench), [], experiment, Selection(), mistakes := Mistakes(file)
+    )
+    mistakes.refuse()
     store = ResultStore.create(Folder(bench).store)
     store.plan(jobs)
     for job in jobs:
