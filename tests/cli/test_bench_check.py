@@ -1,4 +1,4 @@
-"""Experiments that cannot be run as they are: what can be known is refused before the first run, a line a mistake."""
+"""Test experiments that cannot run: all mistakes are refused before the first run, one line each."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def lines_about(text: str, *words: str) -> list[str]:
-    """What `lapgs bench` says of an experiment that it refuses; nothing may be written."""
+    """Return the lines by which `lapgs bench` refuses an experiment, and check that nothing is written."""
     Path("tiny.toml").write_text(text)
     before = everything()
     paths = () if any(word.startswith("fastgs=") for word in words) else ("--path", f"fastgs={CHECKOUTS / 'fastgs'}")
@@ -190,7 +190,7 @@ def test_a_mistake_is_one_line_that_names_file_key_value_and_what_was_expected(
     if "[table]" in new:
         text = GOOD + new.partition("\n")[2]
     lines = lines_about(text)
-    # Two commands may say it in words of their own, and of a scene it is said for each variant that cannot use it.
+    # Two commands may use their own words, and a scene is named for each variant that cannot use it.
     assert all(line.startswith("tiny.toml: ") and line.isprintable() for line in lines)
     (line, *_) = [each for each in lines if all(word in each for word in expected)] or [None]
     assert line is not None, lines
@@ -274,8 +274,8 @@ def test_defaults_of_residual_options_are_accepted_for_nested_levels() -> None:
     assert result.exit_code == 0, result.exception
 
 
-def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A login node has no GPU, and commands are printed anywhere."""
+def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Login nodes have no GPU, and commands are printed anywhere."""
     text = GOOD.replace('rasterizer = "cpu"', 'rasterizer = "gsplat"').replace(THEIRS, 'device = "cuda"')
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     refused = lines_about(text)
@@ -291,7 +291,7 @@ def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyP
 
 
 def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is left out on the way, but where a run elsewhere renders."""
+    """Every run is rehearsed."""
     checked = []
     real = bench_check._rehearse
 
@@ -308,7 +308,7 @@ def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytes
 
 
 def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each with a scene in place of the data sets', large enough for its levels."""
+    """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
     monkeypatch.setattr(bench_check._SceneSizes, "__call__", lambda self, resolution: (1600, 1066))
     for path in sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml")):
@@ -327,7 +327,7 @@ def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypat
 
 
 def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(place: Path) -> None:
-    """A script has its own way to read scenes."""
+    """Scripts have their own way to read scenes."""
     model = place / "scene" / "sparse" / "0" / "points3D.bin"
     whole = model.read_bytes()
     model.write_bytes(whole[:50])

@@ -1,4 +1,4 @@
-"""`lapgs bench EXPERIMENT.toml` as a user runs it: to the end, again, with mistakes, and side by side."""
+"""Test `lapgs bench EXPERIMENT.toml` as users run it: to the end, again, with mistakes, and in parallel."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experime
     torn = experiment.parent / "torn"
     make_sample_scene(torn, width=48, height=32, views=8, points=100, progress=False)
     whole = (torn / "images" / "0003.png").read_bytes()
-    (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # its header is whole: found by the run alone
+    (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # with a whole header, so only the run fails
     head, rest = EXPERIMENT.split("[backbones.cpu]")
     text = f'{head}[[scenes]]\nname = "torn"\npath = "torn"\n[backbones.cpu]{rest}'
     experiment.write_text(

@@ -1,4 +1,4 @@
-"""Experiment files: what is read is what was written, and every mistake is one line that names it."""
+"""Test that experiment files are read as written, and that every mistake is one line that names it."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         ('paper = "main_8k"', ("main_8k", "main_4k")),
     ],
 )
-def test_what_is_wrong_with_a_table(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
+def test_mistakes_in_a_table(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
     experiment = load(tmp_path, f"{GOOD}[table]\n{table}\n")
     with pytest.raises(UserInputError) as caught:
         check_table(experiment)

@@ -1,4 +1,4 @@
-"""The store: no run lost and none doubled, whoever dies, and whatever wrote the file before."""
+"""Test that the store neither loses nor repeats runs when workers die, and that it refuses damaged files."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
 
 
 def starts(folder: Path) -> Counter[str]:
-    """How often each run was started."""
+    """Count the starts of each run."""
     path = folder / "started"
     return Counter(without_attempt(name) for name in path.read_text().split()) if path.exists() else Counter()
 
 
 def without_attempt(name: str) -> str:
-    """A run's id from the name of the folder of one of its attempts."""
+    """Return a run's id from the folder name of an attempt."""
     return name.partition("-attempt")[0]
 
 

@@ -1,4 +1,4 @@
-"""Whatever workers do and in whatever order: one result a run, from the worker that last held it."""
+"""Test with random actions of workers: each run has one result, from the worker that last held it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RUNS = 3
 
 
 class Workers(RuleBasedStateMachine):
-    """Claims that are renewed, recorded, failed, given back, or forgotten until their lease is over."""
+    """Random claims that are renewed, recorded, failed, released, or expire."""
 
     claims = Bundle("claims")
 

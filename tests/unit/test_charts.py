@@ -1,4 +1,4 @@
-"""Charts: axes of round numbers that hold the data, and lines where the axes say."""
+"""Test charts: axes have round numbers and hold the data, and lines lie where the axes say."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def plotted(points: str) -> list[tuple[float, float]]:
 
 
 def in_data(point: tuple[float, float], right: float, bottom: float, top: float, frame: Frame) -> tuple[float, float]:
-    """From chart units back to data units."""
+    """Convert chart units back to data units."""
     x, y = point
     return (
         right * (x - frame.left) / (frame.width - frame.left - frame.right),

@@ -1,4 +1,4 @@
-"""The table of a run and its baseline."""
+"""Test the table of a run and its baseline."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_rows_of_a_run_and_its_baseline() -> None:
     assert rows["psnr"].label == "PSNR, held-out views (dB)"
 
 
-def test_what_only_one_of_two_runs_has_is_said_and_not_compared() -> None:
+def test_figures_of_only_one_run_are_shown_and_not_compared() -> None:
     ours = metrics(lpips_alex=0.2, peak_memory_bytes=3_500_000_000, lpips_missing={"vgg_3dgs": "no weights"})
     rows = {row.key: row for row in comparison_rows([ours, BASELINE])}
     assert rows["lpips_alex"].label == "LPIPS (AlexNet), held-out views"
@@ -98,7 +98,7 @@ def test_a_run_alone_has_one_cell_and_no_change() -> None:
     assert "training views" in comparison_rows([metrics(split="train")])[0].label
 
 
-def test_unlike_runs_are_told_apart() -> None:
+def test_differences_of_setup_are_listed() -> None:
     scene = SceneReference("/data/fox", "1/4", True, (0.0, 0.0, 0.0), "colmap")
     run = Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, {"iterations": 3000})
     assert setup_differences(run, replace(run, levels=1, seed=3)) == []

@@ -1,4 +1,4 @@
-"""A run that is looked at while it is written: what is read again, what is not, and what is said of damage."""
+"""Test runs that are viewed while they are written: what is read again, and how damage is reported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def finish(run: Path, of: Path) -> None:
-    """Give a run the next level of a complete one."""
+    """Add the next level of a complete run to a run."""
     complete = RunArchive.open(of)
     with RunArchive.open(run, resume=True) as archive:
         level = archive.manifest.next_level
@@ -43,7 +43,7 @@ def levels(run: FollowedRun) -> list[int]:
     return [] if run.shown is None else list(run.shown.counts)
 
 
-def test_what_is_rendered_to_load_a_rasterizer_is_a_hierarchy_and_fails_in_silence() -> None:
+def test_loading_a_rasterizer_renders_a_hierarchy_and_ignores_errors() -> None:
     class Recording(CpuRasterizer):
         def render_images(self, field: GaussianField, *args: Any, **kwargs: Any) -> torch.Tensor:
             rendered.append(field.signed)
@@ -83,7 +83,7 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     assert len(read) == before
 
 
-def test_a_level_that_is_mended_is_shown_again(scene: Path, tmp_path: Path) -> None:
+def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", scene)
     ply = folder / "level_0" / "point_cloud.ply"
     whole = ply.read_bytes()
@@ -122,7 +122,7 @@ def test_another_run_in_the_same_folder_is_another_field(scene: Path, tmp_path: 
 
 
 class FakeViewer:
-    """Notes what it is told to show."""
+    """Records the content that it should show."""
 
     def __init__(self) -> None:
         self.shown: list[Any] = []

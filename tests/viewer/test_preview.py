@@ -1,4 +1,4 @@
-"""The picture that stands on the page before anything can be rendered: whose it is, who gets it, and until when."""
+"""Test the preview: its content, who receives it, and when it ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PATIENCE = 20.0
 wait_for = partial(wait_so_long, seconds=PATIENCE)
 WINDOW = (320, 240)
 
-# Torch cannot be imported before a file is there.
+# Blocks the import of torch until a file exists.
 COMMAND = """
 import builtins, sys, time
 from pathlib import Path
@@ -54,7 +54,7 @@ def decoded(jpeg: bytes) -> NDArray[np.float64]:
     return np.asarray(Image.open(io.BytesIO(jpeg)), np.float64)
 
 
-def test_it_is_what_the_first_camera_of_the_scene_sees(scene: Path, tmp_path: Path) -> None:
+def test_the_preview_shows_the_first_camera_of_the_scene(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene, hold_out=False)  # all around, so that up is up in every image
     save_run_preview(run, "cpu")
     archive = RunArchive.open(run)
@@ -68,7 +68,7 @@ def test_it_is_what_the_first_camera_of_the_scene_sees(scene: Path, tmp_path: Pa
     assert np.abs(255 * seen.permute(1, 2, 0).numpy() - shown).mean() < 1.5
 
 
-def test_windows_get_its_middle_at_full_height() -> None:
+def test_the_preview_is_cropped_to_the_window() -> None:
     columns = np.tile(np.arange(200, dtype=np.uint8)[None, :, None], (100, 1, 3))
     image = Image.fromarray(columns)
     np.testing.assert_array_equal(np.asarray(crop_to_aspect(image, 1.5)), columns[:, 25:175])
@@ -78,7 +78,7 @@ def test_windows_get_its_middle_at_full_height() -> None:
     assert not wider[:, :50].any()
 
 
-def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -> None:
+def test_an_outdated_or_damaged_preview_is_not_read(run: Path, scene: Path, tmp_path: Path) -> None:
     save_run_preview(run, "cpu")
     kept, manifest = (run / PREVIEW).read_bytes(), json.loads((run / "manifest.json").read_text())
     assert read_preview(run) is not None
@@ -96,7 +96,7 @@ def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -
     assert read_preview(tmp_path / "nowhere") is None
 
 
-def test_what_cannot_be_kept_is_a_line_of_the_log(
+def test_a_preview_that_cannot_be_saved_is_logged(
     run: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (run / PREVIEW).mkdir()
@@ -111,7 +111,7 @@ def test_what_cannot_be_kept_is_a_line_of_the_log(
     assert "rendering.run" in caplog.messages[-1]
 
 
-def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
+def test_a_viewer_saves_a_preview_after_drawing(run: Path) -> None:
     stop = threading.Event()
     with Page("127.0.0.1", 8960, "run") as page:
         viewer = Viewer(page)
@@ -133,7 +133,7 @@ def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
     assert (run / PREVIEW).read_bytes() == kept
 
 
-def test_a_damaged_run_leaves_none(run: Path) -> None:
+def test_a_damaged_run_has_no_preview(run: Path) -> None:
     ply = run / "level_0" / "point_cloud.ply"
     ply.write_bytes(ply.read_bytes()[:-1000])
     with Page("127.0.0.1", 8965, "run") as page:
@@ -145,7 +145,7 @@ def test_a_damaged_run_leaves_none(run: Path) -> None:
 
 @pytest.fixture
 def gated(run: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
-    """The address of `lapgs view` in a process that cannot import torch yet, and the file that lets it."""
+    """Start `lapgs view` without torch; return its address and the file that lets torch be imported."""
     gate = tmp_path / "gate"
     command = [sys.executable, "-c", COMMAND, "view", str(run), "--device", "cpu", "--port", "8970", str(gate)]
     save_run_preview(run, "cpu")
@@ -158,7 +158,7 @@ def gated(run: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
         process.communicate()
 
 
-def test_it_comes_before_torch_and_goes_with_the_first_picture(run: Path, gated: tuple[str, Path]) -> None:
+def test_the_preview_precedes_torch_and_ends_with_the_first_picture(run: Path, gated: tuple[str, Path]) -> None:
     address, gate = gated
     with Image.open(run / PREVIEW) as stored:
         middle = np.asarray(stored, np.float64)[:, 200:1000]  # 4:3 of 1200x600
