@@ -29,6 +29,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
@@ -246,7 +247,7 @@ def _contenders(scene: BenchScene) -> dict[str, _Contender]:
     """Make all contenders that can run here, the fast one first."""
 
     def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
-        return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=1e-15)
+        return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=ADAM_EPS)
 
     found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if importlib.util.find_spec("gsplat") is not None and scene.target.dtype == torch.float32:
