@@ -89,8 +89,8 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
     for backbone in ("cpu", "fast"):
         specs = {run.variant: run.spec for run in planned if run.spec.backbone == backbone}
         found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
-        assert found == {"nested": "nested", "default": "nested", "residuals": "laplacian"}
-        assert specs["nested"].run_id == specs["default"].run_id != specs["residuals"].run_id
+        assert found == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
+        assert specs["residuals"].run_id == specs["default"].run_id != specs["nested"].run_id
 
 
 def test_only_selected_runs_are_planned() -> None:
