@@ -127,7 +127,7 @@ def bench_experiment(
 
     from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.aggregate import check_table
-    from lapgs_plugin.experiments.commands import Places
+    from lapgs_plugin.experiments.commands import Locations
     from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
     from lapgs_plugin.experiments.launchers import check_order, launch
     from lapgs_plugin.experiments.mistakes import Mistakes
@@ -152,7 +152,7 @@ def bench_experiment(
             _require_place(folder.path)
         if evaluate:
             _require_measuring(lpips_weights or ())
-        places = Places(
+        places = Locations(
             {name: _folder(name, value) for name, value in _pairs(path, "--path").items()}, experiment.parent
         )
         weights = [word for file in lpips_weights or () for word in ("--lpips-weights", str(file.absolute()))]

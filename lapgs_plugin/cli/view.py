@@ -68,7 +68,7 @@ def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, dev
     shown, other = (None if folder is None else FollowedRun(folder, device, rasterizer) for folder in (run, baseline))
     assert shown is not None, "it is a required argument"
     viewer, stop = Viewer(page), threading.Event()
-    following = RunFollower(viewer, page, shown, other, scene, say=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, scene, report=lambda line: print(line, flush=True))
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)

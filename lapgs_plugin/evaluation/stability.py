@@ -92,7 +92,7 @@ def measure_flicker(frames: Iterable[Frame]) -> tuple[dict[str, Flicker], float]
     compared = pixels = 0
     for frame in frames:
         if before is not None:
-            positions, seen = follow(frame, before)
+            positions, seen = reproject(frame, before)
             compared, pixels = compared + int(seen.sum()), pixels + seen.numel()
             for name, image in frame.images.items():
                 carried = _sample(before.images[name], positions)
@@ -101,7 +101,7 @@ def measure_flicker(frames: Iterable[Frame]) -> tuple[dict[str, Flicker], float]
     return flicker, compared / max(pixels, 1)
 
 
-def follow(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
+def reproject(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
     """Find the pixels of a frame in the frame before.
 
     Returns:

@@ -16,7 +16,7 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import PlannedRun
 from lapgs_plugin.experiments.schema import Experiment, nearest
-from lapgs_plugin.experiments.standard import DATASETS, PaperTable, Printed
+from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 
 Row = Mapping[str, Any]
 """Row of results, see `rows`."""
@@ -93,7 +93,7 @@ class Cell:
     values: tuple[float, ...] = ()
     deviation: float | None = None
     seeds: int = 0
-    paper: Printed | None = None
+    paper: PaperFigure | None = None
 
     @property
     def value(self) -> float | None:
@@ -305,9 +305,11 @@ class _GroupBuilder:
             [one[s] for s in self._common] for one in self._found[key].values() if {*self._common} <= one.keys()
         ]
         rows = complete if self._common else []
-        return {name: _cell(rows, COLUMNS[name], self._printed(key, name)) for name in self._experiment.table.columns}
+        return {
+            name: _cell(rows, COLUMNS[name], self._paper_figure(key, name)) for name in self._experiment.table.columns
+        }
 
-    def _printed(self, key: RowKey, column: str) -> Printed | None:
+    def _paper_figure(self, key: RowKey, column: str) -> PaperFigure | None:
         row = self._variants[key[1]].paper_row(key[0])
         if self._paper is None or not row:
             return None
@@ -350,7 +352,7 @@ TIMES = ("minutes", "train_seconds", "iteration_ms")
 """Columns for the speed-up; the first one in the table is used."""
 
 
-def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: Printed | None) -> Cell:
+def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: PaperFigure | None) -> Cell:
     """Compute a figure from the rows of all scenes, for each seed."""
     figures = [[_value(row, column) for row in scenes] for scenes in seeds]
     if not figures or any(not value for scenes in figures for value in scenes):

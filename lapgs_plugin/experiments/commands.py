@@ -43,7 +43,7 @@ class Step:
     cwd: str
 
 
-class Places:
+class Locations:
     """Folders of scenes, data sets and checkouts.
 
     Args:
@@ -66,7 +66,7 @@ class Places:
         if folder is None and scene.folder is not None:
             folder = self._base / scene.folder
         names = [scene.name, *([scene.dataset] if scene.dataset else [])]
-        folder = self._existing(f"scene {scene.name}", folder, names)
+        folder = self._require_folder(f"scene {scene.name}", folder, names)
         transforms = any(folder.glob("transforms*.json"))
         if not transforms and not _is_folder(folder / scene.images):
             raise UserInputError(
@@ -81,7 +81,7 @@ class Places:
         Raises:
             UserInputError: its folder is not given, or has no training script.
         """
-        folder = self._existing(f"checkout {name}", self._find(name), [name])
+        folder = self._require_folder(f"checkout {name}", self._find(name), [name])
         if not (folder / SCRIPT).is_file():
             raise UserInputError(
                 f"checkout {name}: {folder} has no {SCRIPT}; give its folder with --path {name}=FOLDER"
@@ -89,12 +89,12 @@ class Places:
         return folder
 
     def _find(self, name: str) -> Path | None:
-        variable = os.environ.get(_variable(name))
+        variable = os.environ.get(_environment_variable(name))
         return self._given.get(name, None if variable is None else Path(variable))
 
     @staticmethod
-    def _existing(what: str, folder: Path | None, names: Iterable[str]) -> Path:
-        ways = " or ".join(f"--path {name}=FOLDER ({_variable(name)})" for name in names)
+    def _require_folder(what: str, folder: Path | None, names: Iterable[str]) -> Path:
+        ways = " or ".join(f"--path {name}=FOLDER ({_environment_variable(name)})" for name in names)
         if folder is None:
             raise UserInputError(f"{what}: its folder is not given; give {ways}")
         if not _is_folder(folder):
@@ -106,7 +106,7 @@ def _is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises when a name is too long for the file system
 
 
-def _variable(name: str) -> str:
+def _environment_variable(name: str) -> str:
     """Return the environment variable that gives a folder."""
     return "LAPGS_" + name.upper().replace("-", "_").replace(".", "_")
 

@@ -67,7 +67,7 @@ class Launcher(ABC):
     def stop(self) -> None:
         """End all workers and wait for them; their runs are returned, or count as abandoned later."""
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         """Return failures of the workers themselves, one line each."""
         return []
 
@@ -128,7 +128,7 @@ class LocalLauncher(Launcher):
         for thread in self._threads:
             thread.join()
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         return self._errors
 
     def _work(self, order: WorkOrder, slot: Slot) -> None:
@@ -173,7 +173,7 @@ class SlurmLauncher(Launcher):
         for job in self._jobs:
             job.cancel(check=False)
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         failed = [job for job in self._jobs if job.done() and job.exception() is not None]
         return [f"job {job.job_id}: {str(job.exception()).strip().splitlines()[-1]}" for job in failed]
 
@@ -224,7 +224,7 @@ class RayLauncher(Launcher):
         if self._started:
             self._ray.shutdown()
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         done, _ = self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=0)
         lines = []
         for task in done:

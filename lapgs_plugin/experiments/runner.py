@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.commands import Places, run_steps
+from lapgs_plugin.experiments.commands import Locations, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec, Selection
 from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
@@ -19,8 +19,8 @@ from lapgs_plugin.files import FolderLock, one_line_errors
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
 MISSING = Path("SCENE")
 """Placeholder for a missing scene in commands that are only checked."""
-LOOK_EVERY = 0.5
-"""Seconds between two looks at the store."""
+POLL_SECONDS = 0.5
+"""Seconds between two checks of the store."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Folder:
 def prepare(
     planned: Sequence[PlannedRun],
     scenes: Sequence[SceneSpec],
-    places: Places,
+    places: Locations,
     folder: Folder,
     evaluate: Sequence[str] | None,
     experiment: Experiment,
@@ -66,7 +66,7 @@ def prepare(
     for scene in scenes:
         with mistakes.at(scene_key(experiment, scene.name)):
             _check_sample(scene)
-            where[scene.name] = (scene, _sample(scene, folder) if scene.sample else places.scene(scene))
+            where[scene.name] = (scene, _sample_folder(scene, folder) if scene.sample else places.scene(scene))
     checkouts: dict[str, Path] = {}
     for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
         with mistakes.at(f"backbones.{key}.checkout"):
@@ -106,7 +106,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
     Raises:
         RunFolderError: another process locks the folder for too long.
     """
-    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample(scene, folder).is_dir()]
+    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample_folder(scene, folder).is_dir()]
     if not missing:
         return
     from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs packages that read scenes
@@ -114,14 +114,14 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
     place = folder.path.absolute() / SCENES
     with one_line_errors(place):
         place.mkdir(parents=True, exist_ok=True)
-    lock = _waited_for(place)
+    lock = _wait_for_lock(place)
     try:
         for scene, sample in missing:
-            if _sample(scene, folder).is_dir():  # another process made it meanwhile
+            if _sample_folder(scene, folder).is_dir():  # another process made it meanwhile
                 continue
             width, height = parse_size(sample.size)
             make_sample_scene(
-                _sample(scene, folder),
+                _sample_folder(scene, folder),
                 width=width,
                 height=height,
                 views=sample.views,
@@ -132,7 +132,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
         lock.release()
 
 
-def _waited_for(place: Path) -> FolderLock:
+def _wait_for_lock(place: Path) -> FolderLock:
     """Wait for the lock of a folder."""
     end = time.monotonic() + LOCK_TIMEOUT
     while True:
@@ -141,15 +141,15 @@ def _waited_for(place: Path) -> FolderLock:
         except RunFolderError:
             if time.monotonic() > end:
                 raise
-        time.sleep(LOOK_EVERY)
+        time.sleep(POLL_SECONDS)
 
 
-def _sample(scene: SceneSpec, folder: Folder) -> Path:
+def _sample_folder(scene: SceneSpec, folder: Folder) -> Path:
     return folder.path.absolute() / SCENES / scene.name
 
 
 def execute(
-    store: ResultStore, run_ids: Sequence[str], start: Callable[[], Launcher], say: Callable[[Outcome], None]
+    store: ResultStore, run_ids: Sequence[str], start: Callable[[], Launcher], on_end: Callable[[Outcome], None]
 ) -> list[Outcome]:
     """Wait until all runs have ended, done by own workers or by others on the same store.
 
@@ -157,7 +157,7 @@ def execute(
         store: the store of the runs.
         run_ids: the runs.
         start: starts workers; called again when another process's worker died and left a run.
-        say: called for every run that ends.
+        on_end: called for every run that ends.
 
     Returns:
         All runs, each done or failed.
@@ -172,7 +172,7 @@ def execute(
         for outcome in outcomes:
             if _ended(outcome) and outcome.run_id not in known:
                 known.add(outcome.run_id)
-                say(outcome)
+                on_end(outcome)
         return outcomes
 
     while not all(_ended(outcome) for outcome in look()):
@@ -181,16 +181,16 @@ def execute(
             launcher = start()
             try:
                 while launcher.running():
-                    time.sleep(LOOK_EVERY)
+                    time.sleep(POLL_SECONDS)
                     look()
                 look()
-                if len(known) == before and (troubles := launcher.troubles()):
+                if len(known) == before and (failures := launcher.failures()):
                     raise UserInputError(
-                        f"workers end without finishing a run: {troubles[0]}; the runs wait in the store"
+                        f"workers end without finishing a run: {failures[0]}; the runs wait in the store"
                     )
             finally:
                 launcher.stop()
-        time.sleep(LOOK_EVERY)
+        time.sleep(POLL_SECONDS)
     return store.outcomes(run_ids)
 
 

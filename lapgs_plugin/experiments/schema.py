@@ -186,11 +186,11 @@ class Experiment(_StrictModel):
         return self
 
     def _repetitions(self) -> Iterator[str]:
-        if (twice := _twice([variant.name for variant in self.variants])) is not None:
+        if (twice := _first_duplicate([variant.name for variant in self.variants])) is not None:
             yield f"variants: two variants are called {twice!r:.80}; expected different names"
-        if (twice := _twice([name for entry in self.scenes for name in entry.names])) is not None:
+        if (twice := _first_duplicate([name for entry in self.scenes for name in entry.names])) is not None:
             yield f"scenes: scene {twice!r} is listed twice; a variant may have its own resolution instead"
-        if (seed := _twice(self.seeds)) is not None:
+        if (seed := _first_duplicate(self.seeds)) is not None:
             yield f"seeds: {seed} is listed twice, which would count its runs twice; expected different seeds"
 
     def _unknown_backbones(self) -> Iterator[str]:
@@ -254,7 +254,7 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     return experiment
 
 
-def _twice(names: Sequence[T]) -> T | None:
+def _first_duplicate(names: Sequence[T]) -> T | None:
     """Return the first item that occurs twice."""
     return next((name for name in names if names.count(name) > 1), None)
 

@@ -53,7 +53,7 @@ class Preset:
 
 
 @dataclass(frozen=True)
-class Printed:
+class PaperFigure:
     """A figure of the paper, or one for each level.
 
     Attributes:
@@ -97,7 +97,7 @@ class PaperTable:
         """Names of the rows."""
         return {row for _, _, row in self._figures}
 
-    def figure(self, dataset: str, scenes: Collection[str], row: str, column: str) -> Printed | None:
+    def figure(self, dataset: str, scenes: Collection[str], row: str, column: str) -> PaperFigure | None:
         """Return the figure for some scenes of a data set: their mean when they are printed one by one.
 
         Returns:
@@ -105,16 +105,16 @@ class PaperTable:
         """
         single = [self._figures.get((dataset, scene, row), {}).get(column) for scene in scenes]
         if len(single) == 1 and single[0] is not None:
-            return Printed(single[0], True)
+            return PaperFigure(single[0], True)
         whole = self._figures.get((dataset, "", row), {}).get(column)
         complete = dataset in DATASETS and set(scenes) == set(DATASETS[dataset].scenes)
         if whole is not None and complete:
-            return Printed(whole, True)
+            return PaperFigure(whole, True)
         values = [value for value in single if value is not None]
         if values and len(values) == len(scenes):
             levels = zip(*values, strict=True)
-            return Printed(tuple(math.fsum(level) / len(values) for level in levels), True)
-        return None if whole is None else Printed(whole, False)
+            return PaperFigure(tuple(math.fsum(level) / len(values) for level in levels), True)
+        return None if whole is None else PaperFigure(whole, False)
 
 
 def _figures(text: str) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ GROUPS_BESIDE = 3
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
 SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
-NOTHING = "-"
+NO_VALUE = "-"
 PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 2K and 4K"
 
 
@@ -79,13 +79,13 @@ def _ratios(row: TableRow) -> list[str]:
 
 
 def _ratio(ratio: Ratio, pattern: str) -> str:
-    measured = NOTHING if ratio.measured is None else pattern.format(ratio.measured)
+    measured = NO_VALUE if ratio.measured is None else pattern.format(ratio.measured)
     return measured if ratio.paper is None else f"{measured} [{pattern.format(ratio.paper)}]"
 
 
 def _text(cell: Cell, column: Column) -> str:
     """Format a cell: 0.71/0.87 ±0.01 [0.70/0.88]."""
-    measured = _number(cell.values, column) or NOTHING
+    measured = _number(cell.values, column) or NO_VALUE
     if cell.deviation is not None:
         measured += f" ±{cell.deviation:.{column.decimals}f}"
     return measured if cell.paper is None else f"{measured} [{_number(cell.paper.values, column)}]"

@@ -247,7 +247,7 @@ def draw_lines(
     y_ticks = _ticks(0.0 if from_zero else min(ys), highest * HEADROOM if from_zero else highest, count)
     inset = None if inset_until is None else _start(x_label, series, inset_until, format_x, format_y)
     if inset is not None:
-        y_ticks = _above_inset(series, right, y_ticks)
+        y_ticks = _clear_inset(series, right, y_ticks)
     bottom, top = y_ticks[0], y_ticks[-1]
     lines = []
     for line in series:
@@ -280,7 +280,7 @@ def _start(
     return draw_lines("the start", x_label, begins, from_zero=False, format_x=format_x, format_y=format_y, frame=INSET)
 
 
-def _above_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
+def _clear_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
     """Extend the y axis downwards until no line runs behind the inset."""
     begin = right * (INSET_AT[0] - WHOLE.left) / WHOLE.plot_width
     behind = [

@@ -111,7 +111,7 @@ def make_strip(view: View, why: str, figures: str, renderers: Sequence[Hierarchy
     """
     layers = _layers(view, renderers)
     cutouts = tuple(_cut_out(layers, place) for place in edge_squares(view.image, CUTOUTS))
-    return Strip(view.name, why, figures, tuple(_whole(layer) for layer in layers), cutouts)
+    return Strip(view.name, why, figures, tuple(_shrink(layer) for layer in layers), cutouts)
 
 
 def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
@@ -125,9 +125,9 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
 
     coarsest = renderer.levels - 1
     if composition.residuals:
-        layers.append(_Layer("Base", _of_level(coarsest, composition.base), whole(composition.base, coarsest)))
+        layers.append(_Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
     for level, residual in composition.residuals.items():
-        detail = f"{_of_level(level, residual)}, zero is grey"
+        detail = f"{_level_label(level, residual)}, zero is grey"
         layers.append(_Layer("Residual", detail, around_grey(whole(residual, level))))
     layers.append(_Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
     for baseline in renderers[1:]:
@@ -136,7 +136,7 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
     return layers
 
 
-def _of_level(level: int, image: Tensor) -> str:
+def _level_label(level: int, image: Tensor) -> str:
     height, width = image.shape[-2:]
     return f"level {level}, {width}x{height}"
 
@@ -176,7 +176,7 @@ def _cut_out(layers: Sequence[_Layer], square: tuple[int, int, int]) -> Cutout:
     )
 
 
-def _whole(layer: _Layer) -> Picture:
+def _shrink(layer: _Layer) -> Picture:
     height, width = layer.image.shape[-2:]
     scale = min(1.0, IMAGE_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))

@@ -304,7 +304,7 @@ def view_strips(
     Raises:
         RunFolderError: the scene is missing.
     """
-    shown = dict(list(_shown_views(run.metrics).items())[:most])
+    shown = dict(list(_select_views(run.metrics).items())[:most])
     figures = {view["name"]: f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}" for view in run.metrics["views"]}
     with one_pool():
         scene = run_scene(run.archive, moved_to)
@@ -321,7 +321,7 @@ def view_strips(
             ]
 
 
-def _shown_views(metrics: Metrics) -> dict[str, str]:
+def _select_views(metrics: Metrics) -> dict[str, str]:
     """Choose the views to show, and the reason of each."""
     ranked = [view["name"] for view in sorted(metrics["views"], key=lambda view: float(view["psnr"]))]
     chosen = {"worst": ranked[0], "median": ranked[(len(ranked) - 1) // 2], "best": ranked[-1]}

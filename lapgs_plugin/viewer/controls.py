@@ -64,7 +64,7 @@ class Controls:
         with self._folder("Figures"):
             self._figures = self._gui.add_markdown("")
         if before is not None:
-            self._choose_as(before)
+            self._copy_choices(before)
 
     def close(self) -> None:
         """Remove the panel from the page."""
@@ -119,7 +119,7 @@ class Controls:
         self._folders.append(folder)
         return folder
 
-    def _choose_as(self, before: Controls) -> None:
+    def _copy_choices(self, before: Controls) -> None:
         """Take over the choices of another panel, as far as this one has them."""
         for level, handles in self._bands.items():
             if level in before._bands:

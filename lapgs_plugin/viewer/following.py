@@ -144,7 +144,7 @@ class RunFollower:
         run: the run.
         other: the run to compare with, or None.
         scene: the scene's folder now; None when it did not move.
-        say: called with each new line of status.
+        report: called with each new line of status.
     """
 
     def __init__(
@@ -154,9 +154,9 @@ class RunFollower:
         run: FollowedRun,
         other: FollowedRun | None,
         scene: Path | None,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
-        self._viewer, self._page, self._say = viewer, page, say
+        self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
         self._scene = scene
         self._cameras: dict[str, Camera] = {}
@@ -175,7 +175,7 @@ class RunFollower:
         except (RunFolderError, SceneError) as error:
             if self._scene is not None:
                 raise
-            self._say(f"without the scene's cameras: {error}")
+            self._report(f"without the scene's cameras: {error}")
         else:
             self._cameras, self._rig = {**test, **train}, Rig.of(list(train.values()))
             for run in self._runs:
@@ -205,10 +205,10 @@ class RunFollower:
                 if any(changed):
                     self._show()
             except LapgsError as error:  # a run that is removed or restarted stays visible
-                self._tell(str(error))
+                self._set_status(str(error))
 
     def _show(self) -> None:
-        self._tell("; ".join(run.status() for run in self._runs))
+        self._set_status("; ".join(run.status() for run in self._runs))
         shown, *others = [run.shown for run in self._runs]
         if shown is None:
             return
@@ -222,11 +222,11 @@ class RunFollower:
             return InitialView.of_field(shown.renderer.fields[shown.renderer.levels - 1])
         return InitialView.of_camera(next(iter(self._cameras.values())), self._rig)
 
-    def _tell(self, line: str) -> None:
+    def _set_status(self, line: str) -> None:
         self._page.status = line
         if line not in self._said:
             self._said.add(line)
-            self._say(line)
+            self._report(line)
 
 
 def _stamp(path: Path) -> Stamp:

@@ -16,7 +16,7 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import commands
-from lapgs_plugin.experiments.commands import Places, run_steps
+from lapgs_plugin.experiments.commands import Locations, run_steps
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
 from lapgs_plugin.experiments.schema import Experiment
 from tests.experiments.examples import SMALL, run_spec
@@ -200,14 +200,14 @@ def test_folders_of_scenes_and_checkouts(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(
         UserInputError, match=r"scene garden.*--path garden=FOLDER \(LAPGS_GARDEN\) or --path mipnerf360"
     ):
-        Places({}, tmp_path).scene(garden)
+        Locations({}, tmp_path).scene(garden)
     (tmp_path / "360" / "garden").mkdir(parents=True)
     monkeypatch.setenv("LAPGS_MIPNERF360", str(tmp_path / "360"))
     with pytest.raises(UserInputError, match="garden has no image folder images"):
-        Places({}, tmp_path).scene(garden)
+        Locations({}, tmp_path).scene(garden)
     (tmp_path / "360" / "garden" / "images").mkdir()
-    assert Places({}, tmp_path).scene(garden) == tmp_path / "360" / "garden"
+    assert Locations({}, tmp_path).scene(garden) == tmp_path / "360" / "garden"
     with pytest.raises(UserInputError, match="nowhere is not a folder"):
-        Places({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
+        Locations({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
     with pytest.raises(UserInputError, match=r"has no train\.py"):
-        Places({"fastgs": tmp_path}, tmp_path).checkout("fastgs")
+        Locations({"fastgs": tmp_path}, tmp_path).checkout("fastgs")

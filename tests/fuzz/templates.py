@@ -27,7 +27,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from lapgs_plugin import __version__
-from lapgs_plugin.experiments.commands import Places
+from lapgs_plugin.experiments.commands import Locations
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
@@ -246,7 +246,7 @@ def _write_experiment(folder: Path, reader: Reader) -> None:
     experiment = load_experiment(file, {"train": {"levels"}, "run": {"levels"}})
     planned, scenes = plan_runs(experiment, Selection()), scenes_of(experiment, Selection())
     jobs, _ = prepare(
-        planned, scenes, Places({}, bench), Folder(bench), [], experiment, Selection(), mistakes := Mistakes(file)
+        planned, scenes, Locations({}, bench), Folder(bench), [], experiment, Selection(), mistakes := Mistakes(file)
     )
     mistakes.refuse()
     store = ResultStore.create(Folder(bench).store)
