@@ -154,7 +154,7 @@ def _write_colmap(folder: Path, binary: bool) -> None:
 def _write_runs(folder: Path, reader: Reader) -> None:
     scene = str(folder / "scene_json")
     options = ["--iterations", "6", "--levels", "2", "--rasterizer", "oracle", "--sh-degree", "1", "--split", "1/3,2/3"]
-    options += ["--resolution", "full"]
+    options += ["--resolution", "full", "--hierarchy", "nested"]
     part = folder / "run_part"
     _succeed(reader, folder, "train", scene, "-o", str(part), *options, "--checkpoint-every", "1")
     assert (part / "checkpoint.pt").exists(), "training was to be stopped before its end"
