@@ -54,13 +54,13 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         rasterizer = gsplat.GsplatRasterizer(
             antialiasing=settings.antialiased,
             packed=settings.packed,
-            absgrad=settings.densification.absgrad or settings.densification.strategy == "multiview",
+            absgrad=settings.densification.options.needs_absgrad,
             own_radii=True,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
     made = make_rasterizer(name)
     asked = {
-        "--strategy mcmc": settings.densification.strategy == "mcmc",
+        f"--strategy {settings.densification.strategy}": settings.densification.options.needs_gsplat,
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,

@@ -29,7 +29,8 @@ from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
-from lapgs_plugin.training.settings import PIXELS_OF_A_LAUNCH, StageSchedule, TrainSettings
+from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
+from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.views import LevelImages, LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
@@ -373,7 +374,8 @@ class StageRun:
                 self.accumulated.prefetch(name)
 
     def _densify(self, context: StageContext, iteration: int, launch: _Launch) -> None:
-        scores = self._scores(iteration) if self.densifier.scored_at(iteration) else None
+        threshold = self.densifier.score_threshold(iteration)
+        scores = None if threshold is None else self._scores(iteration, threshold)
         changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
         if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
             self._prune(share)
@@ -382,8 +384,8 @@ class StageRun:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _scores(self, iteration: int) -> ViewScores:
-        """What some training views say about each Gaussian; the same views whenever a run comes here."""
+    def _scores(self, iteration: int, threshold: float) -> ViewScores:
+        """Score Gaussians by some training views, which are a function of the seed and the iteration."""
         place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
         chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
         degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
@@ -401,7 +403,7 @@ class StageRun:
             )
 
         views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
-        return view_scores(views, grey, self.settings.densification.error_threshold)
+        return view_scores(views, grey, threshold)
 
     def _grey(self) -> tuple[GaussianField, Tensor]:
         """The field with all colours zero, and the coefficients (n, 1, 3) that say so, with gradients."""

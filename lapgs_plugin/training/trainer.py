@@ -37,11 +37,12 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
-from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
+from lapgs_plugin.training.densification import statistics_in_triton
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import StageSchedule, TrainSettings, views_per_step
+from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
 
@@ -241,8 +242,7 @@ class Trainer:
             if not stage.signed:
                 degree = self.settings.sh_degree_of(stage)
                 points = field_from_points(self.scene.points, self.scene.colors, degree)
-                if self.settings.densification.strategy == "mcmc":
-                    points = mcmc_start(points)
+                points = self.settings.densification.options.start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
             coarser = self.archive.field(stage.level + 1)
@@ -296,7 +296,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=density_control(schedule, self.settings.densification_of(stage), self.scene.extent),
+            densifier=self.settings.strategy_of(stage).density_control(schedule, self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),

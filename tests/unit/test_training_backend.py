@@ -31,6 +31,7 @@ from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.strategies import Default, Mcmc
 from lapgs_plugin.training.trainer import Trainer, check_storage
 from lapgs_plugin.training.views import LevelImages
 from tests.training_scene import blob_field, ring_scene
@@ -100,7 +101,7 @@ def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
 
 
 def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
-    strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500, reset_every=None)
+    strategy = Densification(start=3, until=45, every=5, strategy="mcmc", options=Mcmc(cap_max=500))
     settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
@@ -111,7 +112,7 @@ def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(sc
     for name in ("sh_rest_factor", "sh_rest_decay"):
         older["learning_rates"].pop(name)
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
-    density = replace(SETTINGS.densification, grow_grad2d=2e-4)  # as it was written then
+    density = replace(SETTINGS.densification, options=Default(grow_grad2d=2e-4))  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
     assert (found.hierarchy, TrainSettings().hierarchy) == ("laplacian", "nested"), (
         "which is no default of what is read"
@@ -161,7 +162,7 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
     """They do not cancel: at the same threshold more Gaussians are above it."""
     counts = []
     for absgrad in (False, True):
-        density = replace(SETTINGS.densification, absgrad=absgrad, grow_grad2d=2e-4, reset_every=1000)
+        density = replace(SETTINGS.densification, reset_every=1000, options=Default(grow_grad2d=2e-4, absgrad=absgrad))
         archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
         counts.append(archive.manifest.records[0].num_gaussians)
     assert counts[1] > counts[0]
@@ -353,7 +354,7 @@ def test_mcmc_moves_adds_and_stays_under_its_limit(
         return _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], None
 
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
-    density = Densification(start=3, until=55, every=5, strategy="mcmc", cap_max=120, base_cap_max=110)
+    density = Densification(start=3, until=55, every=5, strategy="mcmc", options=Mcmc(cap_max=120, base_cap_max=110))
     settings = replace(SETTINGS, hierarchy=hierarchy, densification=density)
     archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
     assert [record.num_gaussians for record in archive.manifest.records] == [110, 120]

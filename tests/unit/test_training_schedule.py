@@ -14,13 +14,9 @@ from hypothesis import strategies as st
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.training.settings import (
-    Densification,
-    LearningRates,
-    StageSchedule,
-    TrainSettings,
-    views_per_step,
-)
+from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import Default, Mcmc, Multiview
 from lapgs_plugin.training.views import view_index
 
 
@@ -217,12 +213,12 @@ def test_thresholds_and_limits_of_stages() -> None:
     density = Densification(strategy="multiview")
     settings = TrainSettings(levels=3, hierarchy="laplacian", residual_threshold=1.5, densification=density)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
-    found = [settings.densification_of(stage) for stage in plan]
+    found: Any = [settings.strategy_of(stage) for stage in plan]
     assert [one.grow_grad2d for one in found] == pytest.approx([2e-4, 3e-4, 3e-4])
     assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
-    mcmc = Densification(strategy="mcmc", cap_max=9, base_cap_max=5)
+    mcmc = Densification(strategy="mcmc", options=Mcmc(cap_max=9, base_cap_max=5))
     capped = replace(settings, residual_threshold=1.0, densification=mcmc)
-    assert [capped.densification_of(stage).cap_max for stage in plan] == [5, 9, 9]
+    assert [capped.strategy_of(stage) for stage in plan] == [Mcmc(cap, 5) for cap in (5, 9, 9)]
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
@@ -248,18 +244,20 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             "--opacity-reset-every with --strategy mcmc",
         ),
         (
-            {"coarse_threshold": 2.0, "densification": Densification(absgrad=True, strategy="mcmc")},
-            "--absgrad, --coarse-threshold with --strategy mcmc",
+            {"coarse_threshold": 2.0, "densification": Densification(reset_every=9, strategy="mcmc")},
+            "--coarse-threshold, --opacity-reset-every with --strategy mcmc",
         ),
-        ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
-        ({"densification": Densification(base_cap_max=7)}, "--base-cap-max 7: only --strategy mcmc"),
-        ({"densification": Densification(error_pixels=7.0)}, "--error-pixels 7.0: only --strategy multiview"),
+        ({"densification": Densification(options=Mcmc(cap_max=7))}, "--strategy default with options of Mcmc"),
         (
-            {"densification": Densification(error_threshold=1.0, strategy="multiview")},
+            {"densification": Densification(strategy="mcmc", options=Mcmc(cap_max=0))},
+            "--cap-max 0: expected at least 1",
+        ),
+        (
+            {"densification": Densification(strategy="multiview", options=Multiview(error_threshold=1.0))},
             "--error-threshold 1.0: expected a share",
         ),
         (
-            {"densification": Densification(absgrad=True, strategy="multiview")},
+            {"densification": Densification(strategy="multiview", options=Multiview(absgrad=True))},
             "--absgrad with --strategy multiview",
         ),
         (
@@ -268,7 +266,10 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ),
         ({"hierarchy": "laplacian", "residual_threshold": 0.0}, "--residual-threshold 0"),
         ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
-        ({"densification": Densification(grow_grad2d=-1.0)}, "--densify-threshold -1.0: expected a positive gradient"),
+        (
+            {"densification": Densification(options=Default(grow_grad2d=-1.0))},
+            "--densify-threshold -1.0: expected a positive gradient",
+        ),
         ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
         ({"densification": Densification(base_share=0.5), "levels": 1}, "one level has no base"),
         ({"learning_rates": LearningRates(sh_rest_factor=math.inf)}, "--sh-rate-factor inf"),
@@ -324,5 +325,5 @@ def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, u
 def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
     settings = TrainSettings(levels=3, hierarchy=hierarchy, coarse_threshold=given)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
-    found = [settings.densification_of(stage).grow_grad2d for stage in plan]
+    found = [settings.strategy_of(stage).grow_grad2d for stage in plan]
     assert found == pytest.approx([2e-4 * factor for factor in factors])

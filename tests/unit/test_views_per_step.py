@@ -32,7 +32,9 @@ from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.settings import Densification, LearningRates, StageSchedule, TrainSettings
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import Default
 from lapgs_plugin.training.trainer import Trainer
 from tests.convergence.test_training import StopAt, plys
 from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
@@ -205,7 +207,8 @@ def test_the_loss_of_several_views_is_their_mean() -> None:
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     """In two launches of three and one views, with the refinement that follows, against one after the other."""
-    density = Densification(start=2, until=60, every=4, reset_every=1000, grow_grad2d=2e-4, absgrad=absgrad)
+    density = Densification(start=2, until=60, every=4, reset_every=1000)
+    options = Default(grow_grad2d=2e-4, absgrad=absgrad)
     settings = TrainSettings(iterations=100, densification=density)
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)
@@ -226,7 +229,7 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     radii = torch.randint(0, 4, (b, n), generator=generator, dtype=torch.int32)
     gradients[radii == 0] = 0
     fields = [TrainableField.create(blob_field(n), settings.learning_rates, 2.0) for _ in range(2)]
-    ours, theirs = (Densifier(schedule, density, 2.0) for _ in range(2))
+    ours, theirs = (Densifier(schedule, options, 2.0) for _ in range(2))
     torch.manual_seed(7)
     ours.accumulate(result(slice(0, 3)), camera)
     assert ours.after_step(fields[0], 4, result(slice(3, 4)), camera)
@@ -236,7 +239,7 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     assert len(fields[0]) == len(fields[1]) != n
     for name, value in fields[0].params.items():
         assert torch.equal(value, fields[1].params[name]), name
-    again = Densifier(schedule, density, 2.0), Densifier(schedule, density, 2.0)
+    again = Densifier(schedule, options, 2.0), Densifier(schedule, options, 2.0)
     again[0].accumulate(result(slice(0, 4)), camera)
     for row in range(b):
         again[1].accumulate(result(slice(row, row + 1)), camera)
