@@ -65,9 +65,10 @@ def _parameters(kind: Any) -> Iterator[inspect.Parameter]:
 
 def _parameter(each: Field[Any], hint: Any, declared: Option, default: Any) -> inspect.Parameter:
     name = parameter_name(each.name, declared)
-    numeric = {"min": declared.least, "max": declared.most}
     names = declared.names or ((f"--{name.replace('_', '-')}",) if hint is bool else ())
-    asked = typer.Option(*names, help=declared.help, rich_help_panel=declared.panel or None, **numeric)
+    asked = typer.Option(
+        *names, help=declared.help, rich_help_panel=declared.panel or None, min=declared.least, max=declared.most
+    )
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, asked])
 
 

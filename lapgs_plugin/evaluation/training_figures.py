@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lapgs_plugin.runs.archive import LevelRecord
+from lapgs_plugin.runs.manifest import LevelRecord
 
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
 
     Keys:
         train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
-        breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
+        breakdown_seconds: of the optimization by part (`profiling.PARTS`); empty unless all levels were broken down.
         num_gaussians: by level, of the fields that the finest picture is rendered from: of nested levels the last.
         peak_gaussians: the most that were optimized at once.
         weighted_gaussians: those of every level weighted by its iterations, as the paper's plot of time against count.

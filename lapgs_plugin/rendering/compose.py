@@ -20,7 +20,8 @@ from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rendering.field_offload import FieldOffload
-from lapgs_plugin.runs.archive import Manifest, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""

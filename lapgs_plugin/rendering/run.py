@@ -9,7 +9,8 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.runs.archive import RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 
 

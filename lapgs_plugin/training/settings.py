@@ -19,7 +19,7 @@ else:  # pydantic cannot read the older TypedDict of `typing`
     from typing_extensions import TypedDict
 
 if TYPE_CHECKING:
-    from lapgs_plugin.runs.archive import Manifest
+    from lapgs_plugin.runs.manifest import Manifest
 
 ANTIALIASING = "antialiasing"
 """Key of `TrainSettings.raster`, as rasterizers and manifests call it."""

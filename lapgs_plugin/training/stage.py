@@ -22,8 +22,8 @@ from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.runs.image_store import AHEAD
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields

@@ -28,13 +28,12 @@ from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
-from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, LevelRecord, RunArchive
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
 from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
-from lapgs_plugin.runs.overhead import Overhead
-from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
 from lapgs_plugin.training.densification import statistics_in_triton

@@ -17,8 +17,9 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
-from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings

@@ -22,7 +22,8 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.interrupt import stop_request
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings

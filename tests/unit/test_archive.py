@@ -19,14 +19,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runs.archive import (
-    FORMAT_VERSION,
-    MANIFEST,
-    LevelRecord,
-    Manifest,
-    RunArchive,
-    SceneReference,
-)
+from lapgs_plugin.runs.archive import MANIFEST, RunArchive
+from lapgs_plugin.runs.manifest import FORMAT_VERSION, LevelRecord, Manifest, SceneReference
 from tests.mishaps import FailingWrites, Killed, disk_full
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
@@ -627,7 +621,7 @@ def test_optimizer_state_waits_for_the_next_level(tmp_path: Path) -> None:
         assert torch.equal(archive.optimizer_state(2)["means"]["exp_avg"], moments["means"]["exp_avg"])
         finish(archive, 1)
         for level in (2, 1):
-            with pytest.raises(RunFolderError, match=r"does not exist, and the next level goes on with it"):
+            with pytest.raises(RunFolderError, match=r"does not exist, and the next level continues from it"):
                 archive.optimizer_state(level)
         assert_level_is_whole(archive, 2)
 

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.runs.breakdown import (
+from lapgs_plugin.runs.profiling import (
     PARTS,
     UNREAD_EVENTS,
     Breakdown,
@@ -170,7 +170,7 @@ def test_a_gpu_is_timed_without_waiting_for_it(monkeypatch: pytest.MonkeyPatch) 
 
     # A GPU's queue takes about a thousand commands before it makes the processor wait: few marks, read early.
     unread, rounds, bursts = 16, 40, 2
-    monkeypatch.setattr("lapgs_plugin.runs.breakdown.UNREAD_EVENTS", unread)
+    monkeypatch.setattr("lapgs_plugin.runs.profiling.UNREAD_EVENTS", unread)
     lengths = {"forward": 2.0, "backward": 4.0, "optimizer": 1.0}  # milliseconds
     cycles = 1e6
     seconds(10.0)

@@ -10,7 +10,7 @@ import pytest
 from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.reports.comparison import Cell, comparison_rows, unlike
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, SceneReference
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from tests.training_scene import blob_field
 
 

@@ -17,7 +17,8 @@ from lapgs_plugin.hierarchy.inheritance import SH_C0
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import (
     LATE_OPACITY,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.profiling import PeakMemory
 
 
 class Statistics:

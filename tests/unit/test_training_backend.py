@@ -22,7 +22,8 @@ from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training import views as training_views

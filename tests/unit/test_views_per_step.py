@@ -25,8 +25,9 @@ from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.densification import Densifier
