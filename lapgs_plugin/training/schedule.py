@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from lapgs_plugin.hierarchy.plan import Stage, nested_densify_until
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import MOST_VIEWS, TrainSettings
 
 REFERENCE_ITERATIONS = 30_000
 """Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
@@ -16,11 +16,10 @@ LATE_SHARE = 0.25
 Positions hardly move any more, and the differences between single views are noise; earlier, more steps are better."""
 LEAST_STEPS = 40
 """Fewest such steps; a stage that is too short for them steps after every view."""
-MOST_VIEWS = 8
-"""Most views of one step where the size of the images decides how many."""
-PIXELS_OF_A_STEP = 1 << 20
-"""Pixels of all views of one step where that decides: about as many as keep a GPU busy while its next work is
-queued."""
+PIXELS_OF_A_STEP = 1 << 22
+"""Most pixels of all views of one step where the number of views is left to the program."""
+STEPS_OF_A_STAGE = 900
+"""Fewest steps of a stage where it is: a short stage steps for fewer views."""
 PIXELS_OF_A_LAUNCH = 1 << 22
 """Pixels of views that are rendered together. More of them would take memory and save no time."""
 
@@ -30,14 +29,15 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
 
     Args:
         settings: of the run.
-        stage: its image size decides where the settings say "auto".
+        stage: its image size and length decide where the settings say "auto".
         training_views: number of training views, the upper limit for "auto".
         batches: whether the rasterizer renders several views together; "auto" is 1 where it does not.
     """
     asked = settings.asked_views
     if asked is None:
         pixels = stage.image_size[0] * stage.image_size[1]
-        asked = min(MOST_VIEWS, training_views, max(1, round(PIXELS_OF_A_STEP / pixels))) if batches else 1
+        limits = round(PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
+        asked = max(1, min(MOST_VIEWS, training_views, *limits)) if batches else 1
     return asked
 
 
@@ -68,14 +68,15 @@ class StageSchedule:
     means_first: float
     means_last: float
     sh_rest_factor: float
-    sh_rest_decay: bool
     gather_from: int
     gather: int
     before: int
     views: int = 1
 
     @classmethod
-    def create(cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1) -> StageSchedule:
+    def create(
+        cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1, training_views: int = 1
+    ) -> StageSchedule:
         shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
         given = settings.densification
 
@@ -104,8 +105,7 @@ class StageSchedule:
             sh_degree=settings.sh_degree_of(stage),
             means_first=rates.means_first,
             means_last=rates.means_last,
-            sh_rest_factor=rates.sh_rest_factor,
-            sh_rest_decay=rates.sh_rest_decay,
+            sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),
             gather_from=stage.iterations - late + 1,
             gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
             before=before,
@@ -161,10 +161,7 @@ class StageSchedule:
         return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
 
     def sh_rest_factor_at(self, iteration: int) -> float:
-        """Return the factor on the step size of SH above degree 0; it may decay exponentially to 1 at the stage's
-        end."""
-        if not self.sh_rest_decay:
-            return self.sh_rest_factor
+        """Return the factor on the rate of SH above degree 0, which falls exponentially to 1 at the stage's end."""
         left: float = 1.0 - min(iteration / self.iterations, 1.0)
         factor: float = self.sh_rest_factor**left
         return factor

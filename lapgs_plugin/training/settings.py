@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,6 +21,12 @@ else:  # pydantic cannot read the older TypedDict of `typing`
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.manifest import Manifest
+
+VIEWS_OF_RATE, MOST_RATE = 32, 8.0
+"""SH above degree 0 learn faster in proportion to training views, from the first number on and up to the second: few
+views do not determine how colours depend on direction."""
+MOST_VIEWS = 8
+"""Most views of one step where the number is left to the program."""
 
 ANTIALIASING = "antialiasing"
 """Key of `TrainSettings.raster`, as rasterizers and manifests call it."""
@@ -45,28 +52,12 @@ class LearningRates:
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
-    sh_rest_factor: float = option(
-        1.0,
-        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in every field. 8 suits "
-        "scenes with hundreds of views, 1 those with few.",
-        panel=SCHEDULE,
-        names=("--sh-rate-factor",),
-    )
-    sh_rest_decay: bool = option(
-        False,
-        "Let that factor go exponentially to 1 within each stage.",
-        panel=SCHEDULE,
-        names=("--sh-rate-decay",),
-    )
 
     def check(self) -> None:
-        """Raise a UserInputError about a rate or factor that is not positive."""
+        """Raise a UserInputError about a rate that is not positive."""
         for each in fields(self):
-            if each.name not in ("sh_rest_factor", "sh_rest_decay") and not getattr(self, each.name) > 0:
+            if not getattr(self, each.name) > 0:
                 raise UserInputError(f"{each.name} {getattr(self, each.name)}: expected a positive learning rate")
-        require_positive("--sh-rate-factor", self.sh_rest_factor, "factor")
-        if self.sh_rest_decay and self.sh_rest_factor == 1.0:
-            raise UserInputError("--sh-rate-decay: there is nothing to decay from; give --sh-rate-factor, such as 8")
 
 
 @dataclass(frozen=True)
@@ -149,15 +140,23 @@ class TrainSettings(HierarchySettings):
         names=("--accumulate-views", "--gather"),
     )
     views_per_step: str = option(
-        "1",
+        AUTO,
         "Training views of one optimizer step, rendered together on a GPU; step sizes grow with the root of their "
-        "number. auto: by the size of the images on a GPU, 1 on a CPU. Iterations count views.",
+        f"number. auto: up to {MOST_VIEWS} on a GPU, fewer of large images and in short stages; 1 on a CPU. Iterations "
+        "count views.",
         panel=SCHEDULE,
     )
     sh_degree: int = option(3, "Highest SH degree, 0 to 3.", panel=SCHEDULE)
     base_sh_degree: int | None = option(
         None,
         "With residuals: highest SH degree of the base, at most --sh-degree, which is the default.",
+        panel=SCHEDULE,
+    )
+    sh_rate_factor: float | None = option(
+        None,
+        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
+        "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
+        f"to {VIEWS_OF_RATE} to {MOST_RATE:g}.",
         panel=SCHEDULE,
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
@@ -182,6 +181,8 @@ class TrainSettings(HierarchySettings):
         if self.gather < 1:
             raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         _ = self.asked_views
+        if self.sh_rate_factor is not None:
+            require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -241,6 +242,19 @@ class TrainSettings(HierarchySettings):
     def strategy_of(self, stage: Stage) -> Strategy:
         """Return the strategy of density control with the options of a stage."""
         return self.densification.options.of_stage(self.threshold_factor(stage), self._is_base(stage))
+
+    def sh_rate_factor_of(self, stage: Stage, training_views: int) -> float:
+        """Return the factor on the rate of SH above degree 0 that a stage starts with."""
+        if stage.signed:
+            return 1.0  # `residual_color_rate` is a factor on these, too
+        if self.sh_rate_factor is not None:
+            return self.sh_rate_factor
+        return min(MOST_RATE, max(1.0, training_views / VIEWS_OF_RATE))
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """See `HierarchySettings.paper_settings`."""
+        return {**super().paper_settings, "gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0}
 
     def sh_degree_of(self, stage: Stage) -> int:
         """Return the highest SH degree of a stage's field."""
@@ -308,7 +322,9 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     """Return settings of an older run by their present names and places, and the options of its strategy."""
     # Residual stages reset opacities before there was a choice.
     values = {**LEFT_OUT_ONCE, "residual_resets": given.get("hierarchy", "laplacian") == "laplacian", **given}
-    density = dict(values["densification"])
+    density, rates = dict(values["densification"]), dict(values["learning_rates"])
+    rates.pop("sh_rest_factor", None)
+    rates.pop("sh_rest_decay", None)
     for name in ("coarse_threshold", "prune"):
         values.setdefault(name, density.pop(name, None if name == "coarse_threshold" else 0.0))
     for old, new in (("cache", "images_on"), ("cache_precision", "prediction_precision")):
@@ -332,12 +348,13 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
         values["inherit"] = None  # the same
     values.setdefault("antialiased", bool(values.get("raster")))
     values.setdefault("residual_color_rate", None)
-    return {**values, "densification": density}, options
+    return {**values, "densification": density, "learning_rates": rates}, options
 
 
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
-    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0},
+    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
+    "protocol": "default",
 }
 """Settings that runs of the first weeks do not name, and what they were."""
 
