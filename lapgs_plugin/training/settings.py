@@ -23,31 +23,31 @@ if TYPE_CHECKING:
     from lapgs_plugin.runs.manifest import Manifest
 
 VIEWS_OF_RATE, MOST_RATE = 32, 8.0
-"""SH above degree 0 learn faster in proportion to training views, from the first number on and up to the second: few
+"""The rate of SH above degree 0 is multiplied by the number of training views over the first, from 1 to the second: few
 views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
-"""Most views of one step where the number is left to the program."""
+"""Most views of one step if --views-per-step is auto."""
 
 ANTIALIASING = "antialiasing"
-"""Key of `TrainSettings.raster`, as rasterizers and manifests call it."""
+"""Key of `TrainSettings.raster` for rasterizers and manifests."""
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
 RUN = "Run"
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
-"""Settings that the manifest has fields of its own for."""
+"""Settings that are fields of the manifest itself."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam step sizes, as 3DGS publishes them. Positions are in units of the scene's extent."""
+    """Set Adam's step sizes, by default 3DGS's. Those of positions are in units of the scene's extent."""
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
     means_first: float = 1.6e-4
     means_last: float = 1.6e-6
-    sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it, times the factor below
+    sh: float = 2.5e-3  # a twentieth for coefficients above degree 0, times `TrainSettings.sh_rate_factor`
     residual_sh: float = 1e-2  # the same for residual fields: `TrainSettings.rates` sets it
     opacities: float = 5e-2
     scales: float = 5e-3
@@ -62,10 +62,13 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class Densification:
-    """When Gaussians are cloned, split, pruned and reset, in iterations of a whole run (see `StageSchedule`), and how.
+    """Set when and how Gaussians are cloned, split, pruned and reset. `StageSchedule` divides iterations of the run.
 
-    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000), or the strategy's own, shrunk in proportion
-    for shorter runs. `every` never shrinks: its statistics need about that many views.
+    None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000) or the strategy's, in proportion for shorter
+    runs. `every` does not shrink: its statistics need about that many views.
+
+    Attributes:
+        options: those of the strategy; None takes its defaults.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -125,7 +128,7 @@ class Densification:
 
 @dataclass(frozen=True)
 class TrainSettings(HierarchySettings):
-    """Everything that decides the result of a run besides the scene."""
+    """Set everything besides the scene that decides the result of a run."""
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
@@ -187,7 +190,7 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
     def _check_base(self) -> None:
-        """Refuse settings of a base that there is none of, or that inheritance cannot honour."""
+        """Refuse settings of a base if there is none, or if the next level inherits all of its coefficients."""
         if (share := self.densification.base_share) is not None and self.levels == 1:
             raise UserInputError(f"--base-densify-share {share}: one level has no base; give --densify-until")
         if (degree := self.base_sh_degree) is None:
@@ -203,8 +206,8 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--base-sh-degree {degree}: one level has no base; give --sh-degree")
         if self.inherit_mode == "full" and degree != self.sh_degree:
             raise UserInputError(
-                f"--base-sh-degree {degree} with --inherit full: what takes over all coefficients has as many; "
-                "inherit geometry or xyz"
+                f"--base-sh-degree {degree} with --inherit full: a level that inherits all coefficients has as "
+                "many; inherit geometry or xyz"
             )
 
     def _check_unused(self) -> None:
@@ -221,7 +224,7 @@ class TrainSettings(HierarchySettings):
 
     @property
     def asked_views(self) -> int | None:
-        """Views of one step as asked for; None: by the size of the images, on a GPU."""
+        """The number of views of one step; None if it is "auto"."""
         if self.views_per_step == AUTO:
             return None
         try:
@@ -236,7 +239,7 @@ class TrainSettings(HierarchySettings):
 
     @property
     def raster(self) -> dict[str, Any]:
-        """Settings of the rasterizer that images depend on, as the manifest has them."""
+        """Settings of the rasterizer that change images, for the manifest."""
         return {ANTIALIASING: True} if self.antialiased else {}
 
     def strategy_of(self, stage: Stage) -> Strategy:
@@ -261,20 +264,20 @@ class TrainSettings(HierarchySettings):
         return self.base_sh_degree if self._is_base(stage) and self.base_sh_degree is not None else self.sh_degree
 
     def densify_share_of(self, stage: Stage) -> float | None:
-        """Return the share of its iterations in which a stage densifies, where it has one of its own."""
+        """Return the share of its iterations in which a stage densifies; None if the schedule decides."""
         return self.densification.base_share if self._is_base(stage) else None
 
     def _is_base(self, stage: Stage) -> bool:
-        """Whether finer levels follow, and none came before."""
+        """Return whether a stage is the first of several."""
         return self.levels > 1 and stage.level == self.levels - 1
 
     @property
     def rates(self) -> LearningRates:
-        """Learning rates with that of residual colours, which is a factor on the others'."""
+        """Learning rates with the rate of residual colours, which is a factor on the others'."""
         return replace(self.learning_rates, residual_sh=self.learning_rates.sh * self.color_factor)
 
     def for_manifest(self) -> dict[str, Any]:
-        """Return the settings as keyword arguments of `Manifest`: those it names itself, and the rest as "settings"."""
+        """Return the settings as arguments of `Manifest`: its own fields by name, the others in "settings"."""
         values = {**self.resolved(), "raster": self.raster}
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
@@ -310,7 +313,7 @@ class TrainSettings(HierarchySettings):
 
 
 class _OldSettings(TypedDict):
-    """Settings of a run of any version, as far as `_of_this_version` looks at them."""
+    """Settings of a run of any version that `_of_this_version` converts."""
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     densification: dict[str, Any]
@@ -356,12 +359,12 @@ LEFT_OUT_ONCE: dict[str, Any] = {
     **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
     "protocol": "default",
 }
-"""Settings that runs of the first weeks do not name, and what they were."""
+"""Settings that older manifests do not name, with the values they had."""
 
 
 @dataclass(frozen=True)
 class TrainingControl:
-    """How a run is carried out and watched; its result does not depend on it, but for the rasterizer's rounding."""
+    """Set how a run is executed and observed, which does not change its result except for the rasterizer's rounding."""
 
     rasterizer: str = option(
         AUTO,

@@ -112,7 +112,7 @@ DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     ),
     "iteration too large": (
         lambda saved: put(saved, 999, "state", "progress", "iteration"),
-        "progress.iteration is 999, expected at most 16",
+        "progress.iteration is 999, expected at most 12",
     ),
     "unknown": (lambda saved: put(saved, 1, "state", "colour"), "it has an unknown key colour"),
     "overhead": (lambda saved: put(saved, [], "state", "overhead"), "overhead is"),

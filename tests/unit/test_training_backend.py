@@ -23,10 +23,10 @@ from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
-from lapgs_plugin.training import views as training_views
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
@@ -34,7 +34,6 @@ from lapgs_plugin.training.settings import Densification, LearningRates, TrainSe
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Default, Mcmc
 from lapgs_plugin.training.trainer import Trainer, check_storage
-from lapgs_plugin.training.views import LevelImages
 from tests.training_scene import blob_field, ring_scene
 
 SETTINGS = TrainSettings(
@@ -310,11 +309,14 @@ def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
     eight_bit = tuple(replace(view, image=(view.image * 255).round() / 255) for view in scene.train)
-    held = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
-    monkeypatch.setattr(training_views, "_wants_store", lambda device: True)
-    stored = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
+    stores = ImageStores([(view.camera.width, view.camera.height) for view in eight_bit], torch.device("cpu"), True)
+    held = LevelImages(stores, level, Pyramid(), with_coarse=level == 0, exact=True)
+    stored = LevelImages(stores, level, Pyramid(), with_coarse=level == 0)
+    for view in eight_bit:
+        held.put(view.name, view.image)
+        stored.put(view.name, view.image)
     for view in eight_bit:
         stored.prefetch(view.name)
         (target, coarse), (expected, expected_coarse) = stored.get(view.name), held.get(view.name)
