@@ -9,7 +9,7 @@ from lapgs_plugin.runs.profiling import PeakMemory
 
 
 class Statistics:
-    """A GPU's, in the place of `torch.cuda`'s."""
+    """Stand in for `torch.cuda`'s statistics."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.used = self.highest = 0

@@ -1,4 +1,4 @@
-"""What trains and where, and the parts of training on a GPU that do not need one."""
+"""The choice of rasterizer and device, and the parts of training on a GPU that do not need one."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def losses(archive: RunArchive) -> list[tuple[int, int, float]]:
 # ------------------------------------------------------------------------------------------------------- the choice
 
 
-def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_trains_if_there_is_a_gpu_and_nothing_falls_back_silently(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(backend, "driver_version", lambda: "")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -91,7 +91,7 @@ def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatc
     assert (placed.rasterizer.name, placed.device.type) == ("gsplat", "cuda")
 
 
-def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
+def test_options_of_gsplat_are_refused_elsewhere() -> None:
     settings = replace(SETTINGS, packed=True, antialiased=True)
     with pytest.raises(UserInputError, match="--antialiased, --packed with --rasterizer cpu: only gsplat"):
         training_rasterizer("cpu", settings)
@@ -100,7 +100,7 @@ def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
     check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cuda"))
 
 
-def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
+def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
     strategy = Densification(start=3, until=45, every=5, strategy="mcmc", options=Mcmc(cap_max=500))
     settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
@@ -136,7 +136,7 @@ def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
     monkeypatch.setattr(gsplat, "rasterization", rasterization)
 
     class Deliver(StageHook):
-        """Calls the hooks of gsplat's centres once the backward pass has left their gradient."""
+        """Call the hooks of gsplat's centres after the backward pass."""
 
         def before_render(self, context: StageContext) -> None:
             hooks.clear()  # of renders that were not trained on
@@ -157,7 +157,7 @@ def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
 
 
 def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
-    """They do not cancel: at the same threshold more Gaussians are above it."""
+    """They do not cancel, so more Gaussians are above the same threshold."""
     counts = []
     for absgrad in (False, True):
         density = replace(SETTINGS.densification, reset_every=1000, options=Default(grow_grad2d=2e-4, absgrad=absgrad))
@@ -166,7 +166,7 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
     assert counts[1] > counts[0]
 
 
-def test_losses_that_are_read_later_are_the_same_losses(
+def test_losses_that_are_read_together_are_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_once = train(tmp_path / "a", scene, SETTINGS, CpuRasterizer())
@@ -211,7 +211,7 @@ def stepped(model: TrainableField, steps: int = 5) -> TrainableField:
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("signed", [False, True])
 def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
-    """PyTorch's fused Adam, which exists for CPUs too."""
+    """By PyTorch's fused Adam, which a CPU has, too."""
     field = replace(blob_field(20), sh=torch.randn(20, (degree + 1) ** 2, 3), signed=signed)
     ours = stepped(TrainableField.create(field, LearningRates(), 4.0))
     theirs = stepped(TrainableField._in_two(field, LearningRates(), 4.0, sparse=False))
@@ -290,7 +290,7 @@ def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
             )
 
 
-def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
 
     def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
@@ -333,7 +333,7 @@ def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
 
 
 def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    """Kheradmand et al. 2024, equation 9, term by term: what gsplat's CUDA kernel computes."""
+    """Compute equation 9 of Kheradmand et al. 2024 term by term, as gsplat's CUDA kernel does."""
     new_opacities = 1 - (1 - opacities) ** (1 / ratios)
     denominators = torch.zeros_like(opacities)
     for row, count in enumerate(ratios.tolist()):

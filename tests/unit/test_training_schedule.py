@@ -21,7 +21,7 @@ from lapgs_plugin.training.views import view_index
 
 
 def schedules(**values: Any) -> list[StageSchedule]:
-    """Of a base and its residuals."""
+    """Return the schedules of a base and its residuals."""
     if values.get("levels", 2) == 2:
         values.setdefault("split", "1/2,1/2")
     settings = TrainSettings(hierarchy="laplacian", **values)
@@ -30,7 +30,7 @@ def schedules(**values: Any) -> list[StageSchedule]:
 
 
 def steps(schedule: StageSchedule) -> list[int]:
-    """The iterations after which the optimizers step."""
+    """Return the iterations after which the optimizers step."""
     found = [0]
     while found[-1] < schedule.iterations:
         found.append(found[-1] + schedule.views_of_step(found[-1]))
@@ -100,13 +100,13 @@ def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epo
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 20), st.integers(0, 100_000))
 def test_every_seed_orders_views(seed: int, level: int, epoch: int) -> None:
-    """A date, as 20240101, once asked the generator for more than 64 bits."""
+    """Dates such as 20240101 once gave the generator more than 64 bits."""
     assert sorted(view_index(epoch * 3 + i + 1, 3, seed, level) for i in range(3)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("until", "begins"), [(None, 22_501), (22_000, 22_501), (25_000, 25_001), (29_679, 29_680)])
 def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, begins: int) -> None:
-    """A refinement in between would throw the gradients away that wait for those of other views."""
+    """A refinement in between would lose gradients that wait for those of other views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
     stepping = steps(schedule)
     assert stepping[: begins - 1] == list(range(1, begins))
@@ -116,7 +116,7 @@ def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, b
 
 @pytest.mark.parametrize("until", [29_681, 30_000, 40_000])
 def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
-    """What is left is too short for 40 steps of 8 views."""
+    """The rest is too short for 40 steps of 8 views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
     assert steps(schedule) == list(range(1, 30_001))
 
