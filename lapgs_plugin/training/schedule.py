@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from lapgs_plugin.hierarchy.plan import Stage, nested_densify_until
+from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage, nested_densify_until
 from lapgs_plugin.training.settings import MOST_VIEWS, TrainSettings
 
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 LATE_SHARE = 0.25
 """Share of a stage, its last, in which the gradients of several views make one step, once densification has ended.
 Positions hardly move any more, and the differences between single views are noise; earlier, more steps are better."""
@@ -97,7 +95,7 @@ class StageSchedule:
         rates = settings.learning_rates
         return cls(
             iterations=stage.iterations,
-            densify_start=constant(given.start, 500, 1),
+            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
             densify_until=densify_until,
             densify_every=given.every,
             reset_every=resets,

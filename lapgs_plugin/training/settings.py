@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import check_bounds, option, option_name, options_of
 from lapgs_plugin.training.strategies import DEFAULT, PANEL, STRATEGIES, Strategy, require_positive
@@ -74,7 +74,11 @@ class Densification:
     __pydantic_config__: ClassVar[Any] = STRICT
 
     start: int | None = option(
-        None, "First densification. Default: 500 of 30000.", panel=PANEL, names=("--densify-from",), least=0
+        None,
+        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        panel=PANEL,
+        names=("--densify-from",),
+        least=0,
     )
     until: int | None = option(
         None,
@@ -133,7 +137,7 @@ class TrainSettings(HierarchySettings):
     __pydantic_config__: ClassVar[Any] = STRICT
 
     iterations: int = option(
-        30_000, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
     )
     gather: int = option(
         8,

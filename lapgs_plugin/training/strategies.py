@@ -37,7 +37,7 @@ class Strategy:
     only where one inherits it from the other.
 
     Attributes:
-        densify_until: last densification of a run of `schedule.REFERENCE_ITERATIONS`, unless --densify-until says it.
+        densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         needs_gsplat: whether only gsplat on a GPU can train with it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
     """

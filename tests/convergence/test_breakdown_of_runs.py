@@ -115,7 +115,7 @@ def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
             assert said == []
         else:
             assert record.breakdown_seconds == {}
-            assert "level 0 was begun without --breakdown" in said[0]
+            assert "level 0 was started without --breakdown" in said[0]
 
 
 def test_jointly_trained_fields_count(tmp_path: Path) -> None:
