@@ -22,7 +22,7 @@ from lapgs_plugin.rasterizers.extensions import (
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
-from lapgs_plugin.runs.archive import Manifest
+from lapgs_plugin.runs.manifest import Manifest
 
 logger = logging.getLogger(__name__)
 

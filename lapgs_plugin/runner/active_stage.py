@@ -29,9 +29,9 @@ from lapgs_plugin.runner.joint import FinishedStage, JointLevels
 from lapgs_plugin.runner.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.runner.shim import StageRendering
 from lapgs_plugin.runner.stage_images import StageImages
-from lapgs_plugin.runs.archive import CACHE, OPTIMIZER, LevelRecord, RunArchive
-from lapgs_plugin.runs.overhead import Overhead
-from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.archive import CACHE, OPTIMIZER, RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.runs.profiling import Overhead, PeakMemory
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 logger = logging.getLogger(__name__)

@@ -41,8 +41,9 @@ from lapgs_plugin.runner.joint import FinishedStage
 from lapgs_plugin.runner.run_state import Finished, LoadedScene, RunContext
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.shim import RasterizerShim
-from lapgs_plugin.runs.archive import CACHE, Manifest, RunArchive, SceneReference
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.archive import CACHE, RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.watcher import Watcher
 
 logger = logging.getLogger(__name__)
 

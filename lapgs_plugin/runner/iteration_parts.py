@@ -26,7 +26,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 
 
 class IterationParts:

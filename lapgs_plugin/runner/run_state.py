@@ -17,7 +17,7 @@ from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.shim import RasterizerShim, StageRendering
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 
 
 @dataclass(frozen=True)

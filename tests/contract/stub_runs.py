@@ -28,7 +28,7 @@ from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runner.driver import HierarchyDriver
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
 

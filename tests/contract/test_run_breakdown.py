@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.runs.profiling import PARTS
 from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy, run_residuals
 
 TINY = ("--iterations", 18, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 18)

@@ -13,7 +13,7 @@ import torch
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, run_hierarchy
 
 EVERY = 4
