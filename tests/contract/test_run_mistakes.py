@@ -21,7 +21,7 @@ from lapgs_plugin.cli import app
 from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.runner.installed_rasterizer import explained
+from lapgs_plugin.runner.installed_rasterizer import explain_import_error
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from tests.contract.stub_runs import (
@@ -162,11 +162,11 @@ def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, absent, None)  # which makes importing it fail
     with pytest.raises(ImportError) as caught:
         importlib.import_module(absent)
-    line = explained(caught.value, "train.py")
+    line = explain_import_error(caught.value, "train.py")
     assert line is not None
     for part in (f"train.py needs {absent.partition('.')[0]}", purpose, "--device cpu"):
         assert part in one_line(line)
-    assert explained(ModuleNotFoundError("no", name="numpy"), "train.py") is None
+    assert explain_import_error(ModuleNotFoundError("no", name="numpy"), "train.py") is None
 
 
 @pytest.mark.parametrize("stub", [Stub("graphdeco", "graphdeco-aa", ("--disable_viewer",)), STUBS["fastgs"]])

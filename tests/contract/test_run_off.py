@@ -11,7 +11,7 @@ import torch
 import typer
 
 from lapgs_plugin.checkouts.script import loaded_script
-from lapgs_plugin.cli.run import run
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (
     NAMES,
@@ -40,10 +40,9 @@ def files(folder: Path) -> dict[str, bytes]:
 def run_off(name: str, scene: Path, folder: Path, *more: Any) -> Result:
     results: list[Result] = []
     stub = STUBS[name]
-    app = typer.Typer()
-    app.command()(run)
-    with forgetting_stubs(), captured(folder, results), typer.Context(typer.main.get_command(app)) as context:
-        run(context, stub.script, arguments(stub, scene, folder, more), off=True, device="cpu")
+    words = ["run", "--off", "--device", "cpu", str(stub.script), *arguments(stub, scene, folder, more)]
+    with forgetting_stubs(), captured(folder, results):
+        typer.main.get_command(app)(words, standalone_mode=False)
     return results[0]
 
 

@@ -14,7 +14,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
-from lapgs_plugin.runner import active_stage
+from lapgs_plugin.runner import stage_pruning
 from lapgs_plugin.runner.active_stage import ActiveStage
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, run_hierarchy, run_residuals
 
@@ -40,7 +40,7 @@ def test_what_is_least_seen_goes(
         prune(stage, gaussians)
         fields[stage.stage.level] = before, stage._adapter.snapshot(gaussians, signed=False)
 
-    monkeypatch.setattr(active_stage, "least_blended", noting)
+    monkeypatch.setattr(stage_pruning, "least_blended", noting)
     monkeypatch.setattr(ActiveStage, "_prune", watched)
     archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, hierarchy=hierarchy, **THIRDS)
     assert archive.manifest.complete
@@ -80,7 +80,7 @@ def test_looking_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeyp
         calls.append(len(pixels))
         return torch.zeros_like(pixels, dtype=torch.bool)
 
-    monkeypatch.setattr(active_stage, "least_blended", none)
+    monkeypatch.setattr(stage_pruning, "least_blended", none)
     plys = []
     for share in (0.0, SHARE):
         archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), prune=share, joint=0.25)

@@ -17,7 +17,7 @@ from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, driv
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
-FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0, 1.5)
+FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0, 1.0)
 
 
 def published_call(name: str, adapter: Any, **changes: Any) -> TrainingCall:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin import environment
-from lapgs_plugin.adapters.registry import recognise_checkout
+from lapgs_plugin.cli.doctor import current_folder
 from lapgs_plugin.environment import Finding, Probe, Requirement
 
 GPU = "NVIDIA H100, 80 GiB, compute capability 9.0"
@@ -154,7 +154,7 @@ GRAPHDECO = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.
 @pytest.mark.parametrize(
     ("files", "name"),
     [
-        (GRAPHDECO, "graphdeco 3DGS or a fork of it"),
+        (GRAPHDECO, "graphdeco 3DGS"),
         ((*GRAPHDECO, "utils/taming_utils.py"), "Taming-3DGS"),
         ((*GRAPHDECO, "utils/taming_utils.py", "utils/fast_utils.py"), "FastGS"),
         (("gsplat/rendering.py", "examples/simple_trainer.py"), "gsplat"),
@@ -165,5 +165,6 @@ def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
-    found = recognise_checkout(tmp_path)
-    assert (found.name if found else None) == name
+    found = current_folder(tmp_path, has_gpu=False)
+    assert found.detail.startswith(f"a checkout of {name}" if name else "not a 3DGS checkout that is known")
+    assert ("lapgs run" in found.detail) == (name not in (None, "gsplat"))

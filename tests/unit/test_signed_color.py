@@ -24,7 +24,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
 from lapgs_plugin.rasterizers import signed_color
-from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.rasterizers.extensions import CudaExtension, _Screen, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
     SignedColorRasterizer,
@@ -224,7 +224,7 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
         assert module in installed_extensions()
         extension = CudaExtension(module, device="cpu")
         assert SignedColorRasterizer(extension).path is ColorPath.NATIVE
-        subject = Subject(variant, SignedColorRasterizer(extension), semantics=SEMANTICS[module])
+        subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
         found = list(check(subject, chosen))
     assert len(found) == 2 * len(names)
     assert [(outcome.case, outcome.problems) for outcome in found if outcome.problems] == []

@@ -1,0 +1,119 @@
+"""Hold the objects that the stages of a run over a checkout share, and the results that they hand on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.checkouts.level_views import SceneImages
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.hook_calls import HookCaller
+from lapgs_plugin.runner.iteration_parts import IterationParts
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.runs.watching import Watcher
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """Hold the objects of a run that exist before the script's main block starts.
+
+    Attributes:
+        adapter: adapter of the checkout.
+        options: settings of the hierarchy.
+        device: device that the checkout renders on.
+        images: full-size images of the checkout's scene.
+        wrapper: wrapper of the checkout's rasterizer.
+        hooks: caller of users' hooks.
+        parts: marks parts of iterations for `--breakdown`.
+        watcher: may look at the fields between iterations.
+        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
+    """
+
+    adapter: BackboneAdapter
+    options: RunSettings
+    device: torch.device
+    images: SceneImages
+    wrapper: RasterizerWrapper
+    hooks: HookCaller
+    parts: IterationParts
+    watcher: Watcher
+    test_every: int | None
+
+    def render(
+        self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor
+    ) -> Tensor:
+        """Return the image (3, h, w) that the checkout's render makes of a view, before exposure or clamping.
+
+        Args:
+            rendering: replaces the running stage's meanwhile; it captures.
+            call: call of the script's `training` for the stage of these Gaussians.
+            view: the checkout's camera at that stage's level.
+            gaussians: the checkout's model.
+            background: (3,) behind the Gaussians.
+        """
+        outer, self.wrapper.stage = self.wrapper.stage, rendering
+        try:
+            self.adapter.render(call, view, gaussians, background)
+        finally:
+            self.wrapper.stage = outer
+        image, rendering.captured = rendering.captured, None
+        assert image is not None, "a rendering that captures"
+        return image
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """Hold the objects of a run that exist once the script has called `training`.
+
+    Attributes:
+        call: the script's call, for the whole run.
+        scene: the checkout's scene, loaded once for all stages.
+        archive: run folder, open for writing.
+        color_path: how signed colour is evaluated.
+    """
+
+    call: TrainingCall
+    scene: CheckoutScene
+    archive: RunArchive
+    color_path: ColorPath
+
+
+@dataclass(frozen=True)
+class FinishedStage:
+    """Name a stage whose field is in the archive.
+
+    Attributes:
+        stage: the stage.
+        call: the script's call of `training` for that stage.
+    """
+
+    stage: Stage
+    call: TrainingCall
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """Hand a finished stage on to the next one.
+
+    Attributes:
+        field: its Gaussians, on the CPU.
+        predictions: Up(I_hat^l) of every view by key; None after the finest level, and where levels are nested.
+        carried: attributes for the next model.
+        moments: optimizer state by parameter group, for full inheritance.
+    """
+
+    field: GaussianField
+    predictions: UpsampledImages | None
+    carried: Mapping[str, Any]
+    moments: Mapping[str, dict[str, Tensor]]
