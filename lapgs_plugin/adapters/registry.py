@@ -36,9 +36,16 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
     """Return the adapters of all backbones, this package's first.
 
     Raises:
-        UserInputError: an installed package's cannot be loaded; the line names it.
+        UserInputError: an installed package's cannot be loaded, or has another name; the line names it.
     """
-    return tuple(BACKBONES[name] for name in BACKBONES)
+    found = {name: BACKBONES[name] for name in BACKBONES}
+    for name, adapter in found.items():
+        if adapter.info.name != name:
+            raise UserInputError(
+                f"--backbone {name}: the info of {adapter.__module__}.{adapter.__qualname__} has the name "
+                f"{adapter.info.name}, expected {name}; fix or uninstall the package that brings it"
+            )
+    return tuple(found.values())
 
 
 def recognise(folder: Path) -> type[BackboneAdapter] | None:

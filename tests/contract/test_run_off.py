@@ -12,6 +12,7 @@ import typer
 
 from lapgs_plugin.checkouts.script import loaded_script
 from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (
     NAMES,
@@ -153,3 +154,16 @@ def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
         assert "beside" not in sys.modules
     finally:
         del sys.modules["lapgs_anything"]
+
+
+def test_on_a_gpu_a_script_of_no_known_checkout_runs_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    script = tmp_path / "train.py"
+    script.write_text('import sys\nif __name__ == "__main__":\n    print(sys.argv[1:])\n')
+    command = typer.main.get_command(app)
+    command(["run", "--off", str(script), "-s", "scene"], standalone_mode=False)
+    assert capsys.readouterr().out == "['-s', 'scene']\n"
+    with pytest.raises(UserInputError, match="not the root of a checkout"):
+        command(["run", str(script), "-s", "scene"], standalone_mode=False)
