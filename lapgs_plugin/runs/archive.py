@@ -176,7 +176,7 @@ class Timeline(TypedDict):
 
 
 class BareRecord(TypedDict):
-    """What `lapgs run --off --record` notes of a script's own run, see `adapters.witness`."""
+    """What `lapgs run --off --record` notes of a script's own run, see `runner.recording`."""
 
     __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
     iterations: PositiveInt

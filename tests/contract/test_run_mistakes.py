@@ -1,4 +1,4 @@
-"""What a person can get wrong with `lapgs run`: one line each, before training starts, and nothing written over."""
+"""Test mistakes with `lapgs run`: one line each, before training starts, and nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from tests.contract.stub_runs import (
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """The stub checkouts, to be changed."""
+    """Copy the stub checkouts for a test to change."""
     return Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
 
 
@@ -138,7 +138,7 @@ def test_folders_that_are_no_checkout(tmp_path: Path) -> None:
 def test_the_wrong_rasterizer_is_said_before_training(
     name: str, stand_in: str, message: str, scene: Path, tmp_path: Path
 ) -> None:
-    """Several code bases call different rasterizers by one name."""
+    """Several code bases have different rasterizers of one name."""
     with (
         captured(tmp_path, []),
         loaded(STUBS[name], scene, tmp_path / "run", stand_in=stand_in) as adapter,
@@ -171,7 +171,7 @@ def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("stub", [Stub("graphdeco", "graphdeco-aa", ("--disable_viewer",)), STUBS["fastgs"]])
 def test_sparse_adam_that_is_not_installed(stub: Stub, scene: Path, tmp_path: Path) -> None:
-    """FastGS looks for it in a module that is not its own rasterizer."""
+    """FastGS imports it from a module that is not its own rasterizer."""
     with pytest.raises(UserInputError, match="found no SparseGaussianAdam to import") as caught:
         run_hierarchy(stub, scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
     one_line(caught.value)
@@ -316,14 +316,14 @@ def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp
     for part in ("out of GPU memory at level 0", "finished levels (1) are kept", "--resume", "images", "2.00 GiB"):
         assert part in message
     assert RunArchive.open(folder).available_levels == (1,)
-    # Where images lie is what the message offers to change.
+    # The message suggests another place for images.
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, resume=True, images_on="disk")
     assert archive.manifest.complete
     assert not archive.path(CACHE).exists()
 
 
 def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
-    """From inside a checkout: the words after the script are its own, what it prints too."""
+    """`lapgs run` inside a checkout passes on the script's arguments and output."""
     stub = STUBS["graphdeco"]
     words = arguments(stub, scene, tmp_path / "run", ("--iterations", 30))
     command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "run", "--device", "cpu"]
@@ -337,7 +337,7 @@ def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def lapgs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """`lapgs run` in this process: words -> exit code, lines of stderr."""
+    """Return a function that runs `lapgs run` in this process and returns exit code and lines of stderr."""
     root = logging.getLogger()
     before = root.handlers[:], logging.getLogger("lapgs_plugin").level
 

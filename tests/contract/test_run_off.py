@@ -1,4 +1,4 @@
-"""`lapgs run --off` is the bare run to the bit, and so is one level of the plain backbone; nothing stays replaced."""
+"""Test `lapgs run --off` and one level: both equal the bare run to the bit, and no symbol stays replaced."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Contents by name below the folder, which is not named in them."""
+    """Return the files' contents by name, with the folder's own name replaced."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     name = str(folder).encode()
     return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
@@ -73,7 +73,7 @@ def test_one_level_is_the_backbone_alone(name: str, scene: Path, tmp_path: Path)
 
 
 def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
-    """Everything that a replacement could have touched: modules of the checkout and the classes in them."""
+    """Return all symbols of the checkout's modules and their classes."""
     modules = {"__main__": adapter.train}
     modules |= {
         name: module
@@ -90,7 +90,7 @@ def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
 
 
 class Failing(StageHook):
-    """Breaks in the second stage."""
+    """Raise an error in the second stage."""
 
     def on_densify(self, context: StageContext) -> None:
         if context.stage.level == 0:
@@ -128,7 +128,7 @@ def test_process_state_is_that_of_before(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
-    """Exit codes and exceptions come out as they are."""
+    """Exit codes and exceptions are passed on."""
     for statement, raised in (("sys.exit(3)", SystemExit), ("1 / 0", ZeroDivisionError)):
         script = tmp_path / "train.py"
         script.write_text(f'import sys\nif __name__ == "__main__":\n    {statement}\n')
@@ -139,7 +139,7 @@ def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
 
 
 def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
-    """Packages put objects into `sys.modules` that answer to any name, and end a finished run when they are asked."""
+    """Some packages put objects with any attribute into `sys.modules`; these must not break the end of a run."""
     script = tmp_path / "train.py"
     script.write_text(
         "import sys\nimport beside\n"

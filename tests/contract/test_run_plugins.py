@@ -1,4 +1,4 @@
-"""A backbone, a hook and a supervision of an installed package, at work in a checkout that only that backbone knows."""
+"""Drive a checkout with the backbone, the hook and the supervision of an installed package."""
 
 from __future__ import annotations
 

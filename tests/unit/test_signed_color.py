@@ -1,4 +1,4 @@
-"""Signed colour is found by trying, replaced where it is missing, and wrapped extensions render as the oracle does."""
+"""Test signed colour: probed by rendering, replaced where it is missing; wrapped extensions render as the oracle."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ CONSTANT = 0.28209479177387814  # the first basis function
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_torch_thread() -> Iterator[None]:
-    """The tensors are small: a second OpenMP thread only spins."""
+    """Use one thread: tensors are small, and a second OpenMP thread only spins."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -51,7 +51,7 @@ def _one_torch_thread() -> Iterator[None]:
 
 
 class Unpatched:
-    """An extension as its authors ship it: a negative degree is one below 1, and colours are clamped."""
+    """Render as the authors' extension: a negative degree counts as below 1, and colours are clamped."""
 
     name = "some_extension"
     device = torch.device("cpu")
@@ -80,7 +80,7 @@ class Patched(Unpatched):
 
 
 class PatchedForward(Patched):
-    """Renders signed colour, and still leaves out of the gradient what a clamp would have caught."""
+    """Render signed colour, but with the gradient of a clamp."""
 
     def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
         right = super().with_sh(field, camera, background, sh_degree)
@@ -89,7 +89,7 @@ class PatchedForward(Patched):
 
 
 class AlwaysSigned(Unpatched):
-    """Signed colour of another kind: the degree is taken for 0."""
+    """Render signed colour of degree 0 only."""
 
     def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
         return ORACLE(replace(field, signed=True), camera, background=background, sh_degree=0)
@@ -153,7 +153,7 @@ def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: P
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             scene(signed=True).render(rasterizer)
-    assert len(extension.calls) == 5  # three scenes, and two of the probe
+    assert len(extension.calls) == 5  # three scenes, and two by the probe
     (record,) = caplog.records
     assert "some_extension has no signed colour" in record.getMessage()
     assert "lapgs patch apply" in record.getMessage()
@@ -164,7 +164,7 @@ def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: P
 
 @pytest.fixture
 def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
-    """A rasterizer's sources in a checkout, with a patch of one edit."""
+    """Write a rasterizer's sources in a checkout, and a patch of one edit."""
     folder = tmp_path / "submodules" / "raster"
     (folder / "some_extension").mkdir(parents=True)
     (folder / "shade.cu").write_text("float shade() { return 0.5f; }\n")
@@ -213,9 +213,9 @@ def test_precomputed_colours_of_an_ordinary_field_are_clamped() -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> None:
-    """Matrices, units of the screen gradient, DC apart or not, degree 0, no Gaussians, none in view: seen from outside.
+    """Check matrices, units of the screen gradient, DC apart or not, degree 0, no Gaussians, and none in view.
 
-    The stand-ins take what the CUDA modules take.
+    The stand-ins have the arguments of the CUDA modules.
     """
     names = ("off_centre", "non_square_pixels", "invisible", "no_gaussians", "lower_degree", "degree_0_white")
     chosen = [case for case in conformance_cases() if case.name in names]
@@ -244,7 +244,7 @@ def test_screen_gradients_come_back_in_pixels() -> None:
 
 
 def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
-    """Whether a Gaussian has alpha >= 1/255 anywhere between the first and last pixels of a tile, by dense sampling."""
+    """Return whether a Gaussian has alpha >= 1/255 between the first and last pixels of a tile, by dense sampling."""
     hom = torch.cat([inputs["means3D"], torch.ones(len(inputs["means3D"]), 1)], 1) @ view.projmatrix
     size = torch.tensor([view.image_width, view.image_height])
     centres = ((hom[:, :2] / hom[:, 3:] + 1) * size - 1) / 2  # (n, 2)
@@ -260,7 +260,7 @@ def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
 
 @contextmanager
 def brittle(variant: str) -> Iterator[CudaExtension]:
-    """A stand-in that takes no call in which no tile has a Gaussian, as the CUDA rasterizers that blend in buckets."""
+    """Wrap a stand-in that refuses calls without a Gaussian in any tile, as the CUDA rasterizers with buckets must."""
     with install(variant) as modules:
         module = modules[VARIANTS[variant][0]]
 
@@ -275,7 +275,7 @@ def brittle(variant: str) -> Iterator[CudaExtension]:
 
 
 def sparse_case(places: list[tuple[float, float, float]], opacities: list[float], camera: Camera) -> Case:
-    """Small spheres at (x, y) pixels and depths."""
+    """Return a field of small spheres at (x, y) pixels and depths."""
     x, y, depth = torch.tensor(places, dtype=torch.float64).reshape(-1, 3).unbind(1)
     points = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], 1)
     means = (points * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
@@ -306,8 +306,8 @@ def test_some_tile_always_has_a_gaussian_and_the_image_is_the_oracles(
     with brittle(variant) as extension:
         subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
         problems = check_case(subject, case).problems
-    # Of a sphere in the middle of a pixel most gradients are zero, and only rounding is left of them; of any sphere the
-    # one by its rotation is.
+    # Most gradients of a sphere in the middle of a pixel are zero but for rounding, and of any sphere the
+    # gradient of its rotation.
     rounding = ("is off by", "gradient of quaternions")
     assert [line for line in problems if "gradient" not in line or not any(words in line for words in rounding)] == []
 
