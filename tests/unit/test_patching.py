@@ -781,7 +781,7 @@ def test_patched_code_is_signed_when_asked_and_otherwise_what_it_was(rasterizer:
 def test_a_rasterizer_where_something_else_reads_the_degree_is_refused(rasterizer: Path) -> None:
     path = rasterizer / "cuda_rasterizer/forward.cu"
     path.write_text(path.read_text().replace("{ colour =", "{ if (D > 3) return; colour ="))
-    with pytest.raises(PatchError, match=r"preprocessCUDA but found it 3 times.*something else reads the degree"):
+    with pytest.raises(PatchError, match=r"preprocessCUDA but found it 3 times.*other code uses the degree"):
         plan_apply(find_targets(rasterizer)[0], ["signed-color"])
 
 
