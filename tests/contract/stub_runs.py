@@ -43,7 +43,7 @@ WHITE = ("--white_background", "--densify_from_iter", 0)
 that is 0. In so few iterations opacities would not recover before FastGS prunes faint Gaussians."""
 
 THIRDS: dict[str, Any] = {"split": "1/3,2/3"}
-"""Option for stages of 30 and 60 iterations, the default of residuals; the default of nested levels is halves."""
+"""Option for stages of 30 and 60 iterations, the default of these tests for residuals."""
 KINDS = ("nested", "laplacian")
 """Both kinds of hierarchy."""
 
@@ -169,6 +169,9 @@ def drive(
     test_every: int | None = None,
     **options: Any,
 ) -> None:
+    options.setdefault("hierarchy", "nested")
+    if options["hierarchy"] == "laplacian" and options.get("levels", 2) == 2:
+        options = {**THIRDS, **options}
     driver = HierarchyDriver(
         adapter,
         RunSettings(**options),
