@@ -140,11 +140,10 @@ class _Event:
     def query(self) -> bool:
         return True
 
-    def synchronize(self) -> None:
-        """Do nothing."""
-
     def wait(self, stream: object = None) -> None:
         """Do nothing."""
+
+    synchronize = wait
 
 
 class _Stream:
@@ -173,8 +172,7 @@ class _Stream:
     def wait_event(self, event: object) -> None:
         """Do nothing."""
 
-    def wait_stream(self, stream: object) -> None:
-        """Do nothing."""
+    wait_stream = wait_event
 
 
 def _returns(value: object) -> Callable[..., Any]:

@@ -27,9 +27,7 @@ class ActiveStage:
     """Run one stage: `load_images`, then `train` or `restore`, then `close`.
 
     Args:
-        context: shared objects of the run.
-        run: the script's call, scene, archive and colour path.
-        window: the stage and its place in the run.
+        context, run, window: the stage, its run, and its place there.
         finished: the stages before, coarsest first.
         before: result of the last of them; None for the base.
     """
@@ -85,7 +83,7 @@ class ActiveStage:
         return scene
 
     def optimizers_made(self, gaussians: Any) -> None:
-        """Prepare the optimizers that the checkout has just set up."""
+        """Give the optimizers that the checkout has just set up inherited state."""
         self._model.prepare_optimizers(gaussians)
 
     def iteration_begins(self, gaussians: Any, iteration: int) -> None:

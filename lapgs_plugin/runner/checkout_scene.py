@@ -14,17 +14,11 @@ from lapgs_plugin.errors import UserInputError
 
 @dataclass(frozen=True)
 class CheckoutScene:
-    """Hold a checkout's Scene, whose cameras have no images.
-
-    Attributes:
-        scene: the checkout's object.
-        points: the checkout's BasicPointCloud.
-        others: arguments of `create_from_pcd` after the points.
-    """
+    """Hold a checkout's Scene, whose cameras have no images."""
 
     scene: Any
-    points: Any
-    others: tuple[Any, ...]
+    points: Any  # the checkout's BasicPointCloud
+    others: tuple[Any, ...]  # arguments of `create_from_pcd` after the points
 
     @classmethod
     def load(
@@ -36,7 +30,7 @@ class CheckoutScene:
             make_scene: the checkout's Scene class.
             call: the script's call of `training`.
             adapter: adapter of the checkout.
-            folder: where the Scene writes the files that belong beside a model.
+            folder: receives the files that the Scene writes beside a model.
 
         Raises:
             UserInputError: the Scene initialised no model from points.

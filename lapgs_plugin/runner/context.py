@@ -26,19 +26,7 @@ from lapgs_plugin.runs.watching import Watcher
 
 @dataclass(frozen=True)
 class RunContext:
-    """Hold the objects of a run that exist before the script's main block starts.
-
-    Attributes:
-        adapter: adapter of the checkout.
-        options: settings of the hierarchy.
-        device: device that the checkout renders on.
-        images: full-size images of the checkout's scene.
-        wrapper: wrapper of the checkout's rasterizer.
-        hooks: caller of users' hooks.
-        parts: marks parts of iterations for `--breakdown`.
-        watcher: may look at the fields between iterations.
-        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
-    """
+    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
 
     adapter: BackboneAdapter
     options: RunSettings
@@ -74,32 +62,20 @@ class RunContext:
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Hold the objects of a run that exist once the script has called `training`.
+    """Hold the objects of a run that exist once the script has called `training`."""
 
-    Attributes:
-        call: the script's call, for the whole run.
-        scene: the checkout's scene, loaded once for all stages.
-        archive: run folder, open for writing.
-        color_path: how signed colour is evaluated.
-    """
-
-    call: TrainingCall
+    call: TrainingCall  # for the whole run
     scene: CheckoutScene
-    archive: RunArchive
+    archive: RunArchive  # open for writing
     color_path: ColorPath
 
 
 @dataclass(frozen=True)
 class FinishedStage:
-    """Name a stage whose field is in the archive.
-
-    Attributes:
-        stage: the stage.
-        call: the script's call of `training` for that stage.
-    """
+    """Name a stage whose field is in the archive."""
 
     stage: Stage
-    call: TrainingCall
+    call: TrainingCall  # for this stage
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.runner.rasterizer_wrapper import WrappedRasterizer
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 
 
@@ -94,9 +95,15 @@ class IterationParts:
 
     def _rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(raster_settings: Any) -> Any:
-            return _TimedRasterizer(original(raster_settings=raster_settings), self)
+            return WrappedRasterizer(original(raster_settings=raster_settings), self._render)
 
         return make_rasterizer
+
+    def _render(self, rasterizer: Any, inputs: dict[str, Any]) -> Any:
+        rendered = rasterizer(**inputs)
+        if torch.is_grad_enabled():
+            self.breakdown.mark("loss")
+        return rendered
 
     def _backward(self, original: Callable[..., None]) -> Callable[..., None]:
         def backward(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> None:
@@ -112,19 +119,3 @@ class IterationParts:
                 return original(*args, **kwargs)
 
         return densify
-
-
-class _TimedRasterizer:
-    """Mark the end of the checkout's rasterizer for one view."""
-
-    def __init__(self, original: Any, parts: IterationParts) -> None:
-        self._original, self._parts = original, parts
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-    def __call__(self, **inputs: Any) -> Any:
-        rendered = self._original(**inputs)
-        if torch.is_grad_enabled():
-            self._parts.breakdown.mark("loss")
-        return rendered

@@ -49,8 +49,7 @@ class JointLevels:
     """Render the predictions of coarser levels in place of cached ones, and optimize the fields behind them.
 
     Args:
-        context: shared objects of the run.
-        run: the run's archive, with the coarser fields, and its colour path.
+        context, run: the run, whose archive has the coarser fields.
         finished: the coarser stages, coarsest first.
         images: images of the running stage.
     """

@@ -16,16 +16,8 @@ from lapgs_plugin.runs.archive import Manifest, SceneReference
 
 
 def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan) -> Manifest:
-    """Return the manifest of a run before its first stage.
-
-    Args:
-        adapter: adapter of the checkout.
-        settings: settings of the hierarchy.
-        call: the script's call of `training`, for the whole run.
-        plan: the run's stages.
-    """
+    """Return the manifest of a run before its first stage; `call` is the script's, for the whole run."""
     dataset = call.dataset
-    resolved = settings.resolved()
     return Manifest(
         scene=SceneReference(
             path=str(Path(dataset.source_path).absolute()),
@@ -38,7 +30,7 @@ def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: Trainin
         levels=plan.levels,
         grid=settings.grid,
         supervision=settings.supervision,
-        inherit=resolved["inherit"],
+        inherit=settings.resolved()["inherit"],
         sh_degree=dataset.sh_degree,
         rasterizer=adapter.info.rasterizer,
         seed=settings.seed,

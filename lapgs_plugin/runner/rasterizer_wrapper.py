@@ -92,6 +92,16 @@ class StageRendering:
             image = self.on_image(key, image, below)
         return image
 
+    def render(self, rasterizer: Any, inputs: dict[str, Any], settings: Any) -> tuple[Any, ...]:
+        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image."""
+        if self.signed and self.path is ColorPath.PRECOMPUTED:
+            inputs = _with_signed_colors(inputs, settings)
+        image, *others = rasterizer(**inputs)
+        image = self.compose(self.key(settings), image)
+        if self.capture:
+            self.captured = image
+        return (image, *others)
+
     @property
     def _below_target(self) -> Predictions | None:
         """Images to subtract from targets where residuals are supervised alone."""
@@ -133,7 +143,10 @@ class RasterizerWrapper:
 
         def make_rasterizer(raster_settings: Any) -> Any:
             made = original(raster_settings=raster_settings)
-            return made if self.stage is None else _ComposingRasterizer(made, raster_settings, self.stage)
+            stage = self.stage
+            if stage is None:
+                return made
+            return WrappedRasterizer(made, lambda call, inputs: stage.render(call, inputs, raster_settings))
 
         return make_rasterizer
 
@@ -143,24 +156,17 @@ class RasterizerWrapper:
         return self._zeros
 
 
-class _ComposingRasterizer:
-    """Compose the image of one view after the checkout's rasterizer; all other attributes are the rasterizer's."""
+class WrappedRasterizer:
+    """Replace the call of a checkout's rasterizer for one view by `call(rasterizer, inputs)`; keep all else."""
 
-    def __init__(self, original: Any, settings: Any, stage: StageRendering) -> None:
-        self._original, self._settings, self._stage = original, settings, stage
+    def __init__(self, original: Any, call: Callable[[Any, dict[str, Any]], Any]) -> None:
+        self._original, self._call = original, call
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._original, name)
 
-    def __call__(self, **inputs: Any) -> tuple[Any, ...]:
-        stage = self._stage
-        if stage.signed and stage.path is ColorPath.PRECOMPUTED:
-            inputs = _with_signed_colors(inputs, self._settings)
-        image, *others = self._original(**inputs)
-        image = stage.compose(stage.key(self._settings), image)
-        if stage.capture:
-            stage.captured = image
-        return (image, *others)
+    def __call__(self, **inputs: Any) -> Any:
+        return self._call(self._original, inputs)
 
 
 def _with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]:

@@ -24,6 +24,8 @@ from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
 
 logger = logging.getLogger(__name__)
 
@@ -152,21 +154,20 @@ class BareRunRecorder:
         assert self._call is not None, "called after training"
         cameras = list(self._scene.getTestCameras())
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
-        images: list[Tensor] = []
-
-        def keep(original: Callable[..., Any]) -> Callable[..., Any]:
-            return lambda raster_settings: _KeepingRasterizer(original(raster_settings=raster_settings), images)
-
+        wrapper = RasterizerWrapper()
+        wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
         renderer = sys.modules["gaussian_renderer"]
-        with Attachment([Replacement(renderer, "GaussianRasterizer", keep, None, "render()")]):
-            return mean_quality(self._rendered(camera, gaussians, background, images) for camera in cameras)
+        with Attachment([Replacement(renderer, "GaussianRasterizer", wrapper.rasterizer, None, "render()")]):
+            return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
 
-    def _rendered(self, camera: Any, gaussians: Any, background: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return a view's rendered image, which its rasterizer appends to `images`, and its photo; (3, h, w) each."""
+    def _rendered(
+        self, camera: Any, gaussians: Any, background: Tensor, rendering: StageRendering
+    ) -> tuple[Tensor, Tensor]:
+        """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
         assert self._call is not None, "called after training"
         self._adapter.render(self._call, camera, gaussians, background)
-        image = images.pop()
-        return image, camera.original_image.to(image.device)
+        assert rendering.captured is not None, "render() rasterizes"
+        return rendering.captured, camera.original_image.to(rendering.captured.device)
 
     def _image_bytes(self) -> int:
         """Return the bytes of photos on the GPU."""
@@ -177,18 +178,3 @@ class BareRunRecorder:
     def _synchronize(self) -> None:
         if self._device == "cuda":
             torch.cuda.synchronize()
-
-
-class _KeepingRasterizer:
-    """Keep the image that the checkout's rasterizer makes of one view."""
-
-    def __init__(self, original: Any, images: list[Tensor]) -> None:
-        self._original, self._images = original, images
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-    def __call__(self, **inputs: Any) -> Any:
-        outputs = self._original(**inputs)
-        self._images.append(outputs[0])
-        return outputs

@@ -97,20 +97,15 @@ class StageReplacements:
 
     def _in_model(self) -> list[Replacement]:
         model = self._context.adapter.train.GaussianModel
-        start = "training() at the start of every iteration"
+        start, after_densifying = "training() at the start of every iteration", self._then(ActiveStage.densified)
+        prepare = self._then(ActiveStage.optimizers_made)
+        control = dict.fromkeys(self._context.adapter.info.density_control, after_densifying)
+        if OPACITY_RESET in control:
+            control[OPACITY_RESET] = self._make_opacity_reset
         return [
-            Replacement(model, "update_learning_rate", self._make_update_learning_rate, ("self", "iteration"), start),
-            Replacement(model, "training_setup", self._make_training_setup, ("self", "training_args"), "training()"),
-            *(
-                Replacement(
-                    model,
-                    name,
-                    self._make_opacity_reset if name == OPACITY_RESET else self._make_density_control,
-                    ("self",),
-                    "training()",
-                )
-                for name in self._context.adapter.info.density_control
-            ),
+            Replacement(model, "update_learning_rate", self._before_iteration, ("self", "iteration"), start),
+            Replacement(model, "training_setup", prepare, ("self", "training_args"), "training()"),
+            *(Replacement(model, name, make, ("self",), "training()") for name, make in control.items()),
         ]
 
     def _make_training(self, original: Callable[..., None]) -> Callable[..., None]:
@@ -129,22 +124,6 @@ class StageReplacements:
 
         return make_scene
 
-    def _make_update_learning_rate(self, original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
-        def update_learning_rate(gaussians: Any, iteration: int) -> Any:
-            if (stage := self._running()) is not None:
-                stage.iteration_begins(gaussians, iteration)
-            return original(gaussians, iteration)
-
-        return update_learning_rate
-
-    def _make_training_setup(self, original: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
-        def training_setup(gaussians: Any, training_args: Any) -> None:
-            original(gaussians, training_args)
-            if (stage := self._running()) is not None:
-                stage.optimizers_made(gaussians)
-
-        return training_setup
-
     def _make_save(self, original: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
         def save(scene: Any, iteration: int) -> None:
             if (stage := self._running()) is None:
@@ -155,17 +134,30 @@ class StageReplacements:
 
         return save
 
-    def _make_density_control(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            result = original(gaussians, *args, **kwargs)
+    def _before_iteration(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def update_learning_rate(gaussians: Any, iteration: int) -> Any:
             if (stage := self._running()) is not None:
-                stage.densified(gaussians)
-            return result
+                stage.iteration_begins(gaussians, iteration)
+            return original(gaussians, iteration)
 
-        return control
+        return update_learning_rate
+
+    def _then(self, react: Callable[[ActiveStage, Any], None]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+        """Return a maker of replacements that call `react(stage, gaussians)` after a method of the model."""
+
+        def make(original: Callable[..., Any]) -> Callable[..., Any]:
+            def method(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+                result = original(gaussians, *args, **kwargs)
+                if (stage := self._running()) is not None:
+                    react(stage, gaussians)
+                return result
+
+            return method
+
+        return make
 
     def _make_opacity_reset(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        control = self._make_density_control(original)
+        control = self._then(ActiveStage.densified)(original)
 
         def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             stage = self._running()

@@ -18,14 +18,7 @@ from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
 
 
 class StageModel:
-    """Pass Gaussians and optimizer state from one stage's model to the next.
-
-    Args:
-        context: shared objects of the run.
-        scene: the checkout's scene, with its points.
-        stage: the stage.
-        before: result of the stage before; None for the base.
-    """
+    """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
 
     def __init__(self, context: RunContext, scene: CheckoutScene, stage: Stage, before: StageResult | None) -> None:
         self._options, self._adapter, self._device = context.options, context.adapter, context.device

@@ -15,11 +15,7 @@ from lapgs_plugin.runner.stage_views import StageViews
 
 
 def pruning_iteration(call: TrainingCall) -> int | None:
-    """Return the first iteration of a stage after densification; None if densification does not end in the stage.
-
-    Args:
-        call: the script's call of `training` for the stage.
-    """
+    """Return the first iteration of a stage after densification; None if densification does not end in the stage."""
     opt = call.opt
     return opt.densify_until_iter if opt.densify_from_iter < opt.densify_until_iter < opt.iterations else None
 

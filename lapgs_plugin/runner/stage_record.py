@@ -23,11 +23,6 @@ HISTORY_ENTRIES = 200
 class StageRecord:
     """Measure one stage and write the measurements into the run folder.
 
-    Args:
-        context: shared objects of the run.
-        archive: run folder, open for writing.
-        window: the stage's place in the run.
-
     Attributes:
         overhead: seconds beside optimization, by purpose.
         iteration: running iteration, from 1; 0 before the first.
@@ -98,12 +93,7 @@ class StageRecord:
         self.note_memory(image_bytes)
 
     def archive(self, result: StageResult, joint_fields: Mapping[int, GaussianField] | None) -> None:
-        """Write the stage's field and measurements.
-
-        Args:
-            result: result of the stage.
-            joint_fields: coarser fields that were trained jointly, by level; None without joint training.
-        """
+        """Write the stage's field and measurements, and the coarser fields that were trained jointly, by level."""
         stage, field = self._window.stage, result.field
         inherited: dict[str, Any] = {"carried": dict(result.carried), "moments": dict(result.moments)}
         self._archive.finish_level(

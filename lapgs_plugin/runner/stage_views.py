@@ -24,9 +24,7 @@ class StageViews:
     """Hold the cameras of a stage at its level's size with their images.
 
     Args:
-        context: shared objects of the run.
-        run: the run's scene, archive and colour path.
-        stage: the stage.
+        context, run, stage: the stage and its run.
         call: the script's call of `training` for this stage.
         predictions: Up(I_hat^(l+1)) of every view, closed with the other images; None for the base and nested levels.
 
@@ -91,13 +89,7 @@ class StageViews:
         )
 
     def render_train_view(self, rendering: StageRendering, gaussians: Any, camera: Any) -> Tensor:
-        """Return the image (3, h, w) of a training camera over black.
-
-        Args:
-            rendering: replaces the stage's meanwhile; it captures.
-            gaussians: the checkout's model.
-            camera: one of the scene's training cameras.
-        """
+        """Return the image (3, h, w) of a training camera over black; `rendering` replaces the stage's meanwhile."""
         background = torch.zeros(3, device=self._device)
         return self._context.render(rendering, self._call, self._view(camera), gaussians, background)
 

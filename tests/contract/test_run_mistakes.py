@@ -368,10 +368,9 @@ def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_
         (["--hierarchy", "flat"], "--hierarchy flat: expected nested or laplacian"),
         *(
             (
-                [*words, *option.split()],
+                ["--hierarchy", "nested", *option.split()],
                 f"{option}: is about residuals, and nested levels have none; leave it out, or add --hierarchy lap",
             )
-            for words in ((), ("--hierarchy", "nested"))
             for option in (
                 "--supervision online_residual",
                 "--inherit full",
@@ -396,12 +395,13 @@ def test_what_nested_levels_cannot_honour_is_refused(
 @pytest.mark.parametrize(
     ("words", "settings", "iterations"),
     [
-        ((), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [15, 15]),
-        (("--hierarchy", "laplacian"), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [10, 20]),
+        ((), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [15, 15]),
+        (("--hierarchy", "nested"), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [15, 15]),
+        (("--protocol", "paper"), {"joint": 0.0, "residual_color_rate": 1.0, "inherit": "xyz"}, [10, 20]),
         (
-            ("--hierarchy", "laplacian", "--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
+            ("--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
             {"joint": 0.0, "coarse_threshold": 2.0, "residual_color_rate": 1.0},
-            [10, 20],
+            [15, 15],
         ),
     ],
 )
@@ -413,14 +413,14 @@ def test_defaults_go_with_the_hierarchy(
     scene: Path,
     tmp_path: Path,
 ) -> None:
-    """As the manifest has them. Levels are nested unless residuals are asked for."""
+    """The manifest has the defaults of the hierarchy. Residuals are the default hierarchy."""
     of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
     code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert code == 0
     manifest = RunArchive.open(tmp_path / "run").manifest
-    assert {name: manifest.settings[name] for name in settings} == settings
+    assert {name: {"inherit": manifest.inherit, **manifest.settings}[name] for name in settings} == settings
     assert [record.iterations for record in manifest.records] == iterations
-    assert [record.signed for record in manifest.records] == [False, "laplacian" in words]
+    assert [record.signed for record in manifest.records] == [False, "nested" not in words]
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
