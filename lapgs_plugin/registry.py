@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Generic, TypeVar
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
@@ -19,13 +22,13 @@ class Registry(Generic[T]):
         option: option that chooses one, such as "--supervision", for messages.
         group: entry point group through which other packages add theirs.
         kind: class that every entry must be an instance of, or a subclass of with `classes`.
-        own: this package's implementations by name, in the order of help texts; an `EntryPoint` is loaded when it is
-            looked up. Other packages cannot take these names.
+        own: this package's implementations by name, in the order of help texts; a text "module:name" is imported when
+            it is looked up. Other packages cannot take these names.
         classes: whether entries are classes.
     """
 
     def __init__(
-        self, option: str, group: str, kind: type[Any], own: Mapping[str, T | EntryPoint], *, classes: bool = False
+        self, option: str, group: str, kind: type[Any], own: Mapping[str, T | str], *, classes: bool = False
     ) -> None:
         self._option, self.group, self._kind, self._classes = option, group, kind, classes
         self._own = dict(own)
@@ -33,6 +36,8 @@ class Registry(Generic[T]):
     @cached_property
     def _found(self) -> Mapping[str, EntryPoint]:
         """Entry points of other packages by name."""
+        from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
+
         entries = sorted(entry_points(group=self.group), key=lambda entry: (entry.name, entry.value))
         return {entry.name: entry for entry in entries if entry.name not in self._own}
 
@@ -46,17 +51,19 @@ class Registry(Generic[T]):
         Raises:
             UserInputError: there is none, or an installed package's cannot be loaded; the line names it.
         """
-        found = self._own[name] if name in self._own else self._found.get(name)
-        if found is None:
+        if name in self._own:
+            own = self._own[name]
+            return self._loaded(name, own, lambda: resolve_name(own)) if isinstance(own, str) else own
+        if name not in self._found:
             known = list(self)
             expected = " or ".join(known) if len(known) == 2 else ", ".join(known)
             raise UserInputError(f"{self._option} {name}: expected {expected}")
-        return self._loaded(found) if isinstance(found, EntryPoint) else found
+        return self._loaded(name, self._found[name].value, self._found[name].load)
 
-    def _loaded(self, entry: EntryPoint) -> T:
-        label, advice = f"{self._option} {entry.name}: {entry.value}", "fix or uninstall the package that brings it"
+    def _loaded(self, name: str, source: str, load: Callable[[], Any]) -> T:
+        label, advice = f"{self._option} {name}: {source}", "fix or uninstall the package that brings it"
         try:
-            loaded = entry.load()
+            loaded = load()
         except Exception as error:  # whatever an import does wrong, the user must learn which package it was
             raise UserInputError(f"{label} cannot be loaded: {type(error).__name__}: {error}; {advice}") from error
         is_class = isinstance(loaded, type)

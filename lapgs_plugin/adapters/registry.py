@@ -6,7 +6,6 @@ Imports no torch, and neither does any adapter here when it is imported.
 from __future__ import annotations
 
 import pkgutil
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from lapgs_plugin import adapters
@@ -26,7 +25,7 @@ BACKBONES: Registry[type[BackboneAdapter]] = Registry(
     "--backbone",
     GROUP,
     BackboneAdapter,
-    {name: EntryPoint(name, f"{adapters.__name__}.{name}:Adapter", GROUP) for name in OWN},
+    {name: f"{adapters.__name__}.{name}:Adapter" for name in OWN},
     classes=True,
 )
 """Backbones by name."""

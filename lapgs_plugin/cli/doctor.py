@@ -94,12 +94,12 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
     except UserInputError as error:
         return Finding("Current folder", "problem", str(error))
     if adapter is not None:
-        place = "the GPU, with its own extensions" if has_gpu else "the CPU, on stand-ins of its extensions"
+        place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
         detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run train.py ...` trains it on {place}"
         return Finding("Current folder", "ok", detail)
     if all((folder / file).is_file() for file in GSPLAT_FILES):
         return Finding("Current folder", "ok", "a checkout of gsplat")
-    return Finding("Current folder", "absent", "not a 3DGS checkout that is known")
+    return Finding("Current folder", "absent", "not a known 3DGS checkout")
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:

@@ -166,5 +166,5 @@ def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
     found = current_folder(tmp_path, has_gpu=False)
-    assert found.detail.startswith(f"a checkout of {name}" if name else "not a 3DGS checkout that is known")
+    assert found.detail.startswith(f"a checkout of {name}" if name else "not a known 3DGS checkout")
     assert ("lapgs run" in found.detail) == (name not in (None, "gsplat"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -79,7 +78,7 @@ def test_entries_that_are_no_adapter_are_one_line(name: str, found: str) -> None
 
 
 def test_own_entries_may_be_instances_or_be_loaded_when_they_are_looked_up() -> None:
-    lazy = EntryPoint("b", "lapgs_plugin.hierarchy.supervision:Reconstructed", "nobody")
+    lazy = "lapgs_plugin.hierarchy.supervision:Reconstructed"
     registry: Registry[type[Supervision]] = Registry(
         "--loss", "nobody", Supervision, {"a": Reconstructed, "b": lazy}, classes=True
     )
