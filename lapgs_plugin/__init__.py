@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.hierarchy.pyramid import Pyramid
     from lapgs_plugin.ops.photometric_loss import photometric_loss
     from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-    from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.image_store import ImageStore
     from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 

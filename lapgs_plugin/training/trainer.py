@@ -29,7 +29,7 @@ from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, LevelRecord, RunArchive
+from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.manifest import LevelRecord

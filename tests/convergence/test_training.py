@@ -23,7 +23,7 @@ from lapgs_plugin.interrupt import stop_request
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.runs.archive import Manifest, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick

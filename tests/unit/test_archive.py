@@ -19,7 +19,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runs.archive import MANIFEST, RunArchive
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import FORMAT_VERSION, LevelRecord, Manifest, SceneReference
 from tests.mishaps import FailingWrites, Killed, disk_full
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.runs.image_store import ImageStore
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from tests.unit.test_imagestore import on_every_device

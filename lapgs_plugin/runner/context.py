@@ -1,4 +1,4 @@
-"""What the stages of a run over a checkout share, and what each hands on to the next."""
+"""Hold the objects that the stages of a run over a checkout share, and the results that they hand on."""
 
 from __future__ import annotations
 
@@ -10,84 +10,77 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
-from lapgs_plugin.checkouts.level_views import PhotoAlbum
+from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runner.hooking import HookCaller
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
 from lapgs_plugin.runner.settings import RunSettings
-from lapgs_plugin.runner.shim import RasterizerShim, StageRendering
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 
 
 @dataclass(frozen=True)
 class RunContext:
-    """What all stages of a run share.
-
-    Attributes:
-        adapter: of the checkout.
-        options: of the hierarchy.
-        device: where the checkout renders.
-        album: the images of its scene.
-        shim: between its render and its rasterizer.
-        hooks: of the user.
-        parts: told which part of an iteration begins.
-        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
-        watcher: may look at the fields between iterations.
-    """
+    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
 
     adapter: BackboneAdapter
     options: RunSettings
     device: torch.device
-    album: PhotoAlbum
-    shim: RasterizerShim
+    images: SceneImages
+    wrapper: RasterizerWrapper
     hooks: HookCaller
     parts: IterationParts
     watcher: Watcher
     test_every: int | None
 
-    def image(
+    def render(
         self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor
     ) -> Tensor:
-        """(3, h, w) what the checkout's render makes of a view, before exposure or clamping.
+        """Return the image (3, h, w) that the checkout's render makes of a view, before exposure or clamping.
 
         Args:
-            rendering: takes the running stage's place meanwhile; it captures.
-            call: of the script's `training`, as the stage of these Gaussians made it.
+            rendering: replaces the running stage's meanwhile; it captures.
+            call: call of the script's `training` for the stage of these Gaussians.
             view: the checkout's camera at that stage's level.
             gaussians: the checkout's model.
-            background: (3,) behind them.
+            background: (3,) behind the Gaussians.
         """
-        outer, self.shim.stage = self.shim.stage, rendering
+        outer, self.wrapper.stage = self.wrapper.stage, rendering
         try:
             self.adapter.render(call, view, gaussians, background)
         finally:
-            self.shim.stage = outer
+            self.wrapper.stage = outer
         image, rendering.captured = rendering.captured, None
         assert image is not None, "a rendering that captures"
         return image
 
 
 @dataclass(frozen=True)
-class LoadedScene:
-    """A checkout's scene, its cameras without images."""
+class TrainingRun:
+    """Hold the objects of a run that exist once the script has called `training`."""
 
-    scene: Any
-    points: Any  # the checkout's BasicPointCloud
-    others: tuple[Any, ...]  # what create_from_pcd takes after the points
-
-    @property
-    def train(self) -> list[Any]:
-        return list(self.scene.getTrainCameras())
-
-    @property
-    def test(self) -> list[Any]:
-        return list(self.scene.getTestCameras())
+    call: TrainingCall  # for the whole run
+    scene: CheckoutScene
+    archive: RunArchive  # open for writing
+    color_path: ColorPath
 
 
 @dataclass(frozen=True)
-class Finished:
-    """What a stage leaves for the next one.
+class FinishedStage:
+    """Name a stage whose field is in the archive."""
+
+    stage: Stage
+    call: TrainingCall  # for this stage
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """Hand a finished stage on to the next one.
 
     Attributes:
         field: its Gaussians, on the CPU.
