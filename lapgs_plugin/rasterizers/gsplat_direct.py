@@ -8,7 +8,6 @@ rest in three kernels of `gsplat_triton`. Several views take as many launches as
 
 from __future__ import annotations
 
-import logging
 import math
 import weakref
 from collections.abc import Sequence
@@ -23,8 +22,6 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.ops.self_check import largest, matches_reference
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
-
-logger = logging.getLogger(__name__)
 
 KNOWN_RELEASES = "1.5."
 """Releases of gsplat whose compiled functions take what is given to them here."""
@@ -251,24 +248,19 @@ def compiled_functions() -> Any:
     return _C
 
 
-@lru_cache(maxsize=1)
-def works() -> bool:
-    """Whether gsplat and Triton on this machine are such that this gives what `gsplat.rasterization` gives."""
+@matches_reference("rendering by `gsplat.rasterization`, which takes more launches", LARGEST_DIFFERENCE)
+def works(device: torch.device) -> float:
+    """Compare with `gsplat.rasterization`: images, gradients and densification's inputs, each by its largest value.
+
+    One comparison is of one camera, the other of two at once.
+
+    Raises:
+        RuntimeError: another release of gsplat.
+    """
     import gsplat
 
     if not gsplat.__version__.startswith(KNOWN_RELEASES):
-        logger.info("gsplat %s: rendering by its own `rasterization`, which takes more launches", gsplat.__version__)
-        return False
-    return matches_reference(
-        "rendering by `gsplat.rasterization`", lambda: _largest_difference(torch.device("cuda")), LARGEST_DIFFERENCE
-    )
-
-
-def _largest_difference(device: torch.device) -> float:
-    """From gsplat's way to render, relative to the largest value, of images, gradients and what densification sees.
-
-    Of one camera, and of two at once.
-    """
+        raise RuntimeError(f"gsplat {gsplat.__version__} is not {KNOWN_RELEASES}x")
     from lapgs_plugin.fields.camera import Camera
     from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 

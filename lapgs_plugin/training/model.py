@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats, splats_from_field
-from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, adam_in_triton, step_together
+from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, step_together, triton_works
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.training.settings import LearningRates
 
@@ -52,7 +52,7 @@ class TrainableField:
             sparse: with gsplat's `SelectiveAdam`, on a GPU.
         """
         on_gpu = field.means.device.type != "cpu"
-        if sparse or (on_gpu and not adam_in_triton()):
+        if sparse or (on_gpu and not triton_works()):
             return cls._in_two(field, rates, extent, sparse)
         names = {**SPLAT_NAMES, "sh": "sh"}
         params = {

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 
 SH_SHAPE = (37, 16, 3)
 
@@ -69,6 +70,36 @@ def test_equals_torch_adam_over_many_steps(shape: tuple[int, ...]) -> None:
     # Rounding alone, summed over 300 steps. Worst seen: 9e-14 and 7.2e-5.
     assert difference_from_torch(shape, 300, torch.float64, lr=1e-2, eps=1e-15) < 1e-12
     assert difference_from_torch(shape, 300, torch.float32, lr=1e-2, eps=1e-15) < 3e-4
+
+
+def stepped(values: list[Tensor], rates: tuple[float, float], views: int = 1) -> Tensor:
+    """The tensor after a step of the plain PyTorch version on each gradient."""
+    start = parameter(SH_SHAPE, torch.float64).detach()
+    slot = AdamSlot(start.clone(), *(torch.zeros_like(start) for _ in range(3)), torch.zeros(()), *rates)
+    for gradient in values:
+        slot.step.add_(views)
+        step_torch([slot._replace(gradient=gradient)], views)
+    return slot.values
+
+
+def test_the_version_in_plain_pytorch_is_torch_adam_by_columns() -> None:
+    values = list(gradients(SH_SHAPE, 50, torch.float64))
+    found = stepped(values, (1e-2, 5e-4))
+    for columns, lr in ((slice(0, 1), 1e-2), (slice(1, None), 5e-4)):
+        part = torch.nn.Parameter(parameter(SH_SHAPE, torch.float64).detach()[:, columns].clone())
+        theirs = descend(torch.optim.Adam([part], lr=lr, eps=1e-15), [value[:, columns] for value in values])
+        torch.testing.assert_close(
+            found[:, columns], theirs, rtol=0, atol=1e-12 * lr * len(values)
+        )  # worst seen: 2e-13
+
+
+@pytest.mark.parametrize("views", [1, 4])
+def test_equals_the_version_in_plain_pytorch_for_several_views(views: int) -> None:
+    values = list(gradients(SH_SHAPE, 50, torch.float64))
+    optimizer = FieldAdam([parameter(SH_SHAPE, torch.float64)], lr=1e-2, column_scale=sh_scale(torch.float64))
+    optimizer.param_groups[0]["views"] = views
+    expected = stepped(values, (1e-2, 5e-4), views)
+    torch.testing.assert_close(descend(optimizer, values), expected, rtol=0, atol=1e-12)  # worst seen: 4e-16
 
 
 @settings(deadline=None, max_examples=30)

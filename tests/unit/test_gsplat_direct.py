@@ -51,7 +51,7 @@ def test_it_is_used() -> None:
 
 
 def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
-    gsplat_direct.works.cache_clear()
+    gsplat_direct.works.forget()
     with torch.inference_mode():
         assert gsplat_direct.works()
 

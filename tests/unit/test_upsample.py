@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid, transposed_taps
-from lapgs_plugin.ops import upsample as raising
-from lapgs_plugin.ops.self_check import matches_reference
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.ops.self_check import SelfCheck
+from lapgs_plugin.ops.upsample import triton_works, upsample, upsample_add
 
 TRITON = """
 import os
@@ -114,7 +113,7 @@ def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
 
 
 def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
-    """What runs on a CPU in place of the kernels: PyTorch's operations, and of the sum so many times Up."""
+    """Replace the kernels by PyTorch's operations, with Up times `factor` in the sum."""
     kernels = ModuleType("kernels")
     vars(kernels).update(
         upsample_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
@@ -124,10 +123,7 @@ def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
 
 
 def is_used() -> bool:
-    def difference() -> float:
-        return raising._difference_in_triton(Pyramid(), torch.device("cpu"))
-
-    return matches_reference("PyTorch's operations", difference, raising.LARGEST_DIFFERENCE)
+    return triton_works.passes_on(torch.device("cpu"))
 
 
 @pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False), (math.nan, False)])
@@ -136,15 +132,15 @@ def test_a_kernel_that_is_off_is_not_used(
 ) -> None:
     put_in_place(monkeypatch, factor)
     assert is_used() == right
-    assert ("PyTorch's operations, because our kernels are off by" in caplog.text) != right
+    assert ("many small operations instead of one kernel, because our kernels are off by" in caplog.text) != right
 
 
 def test_a_kernel_that_does_not_compile_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
-    def difference() -> float:
+    def difference(device: torch.device) -> float:
         raise RuntimeError("Failed to find C compiler\nat length")
 
     caplog.set_level(logging.INFO)
-    assert not matches_reference("PyTorch's operations", difference, 1.0)
+    assert not SelfCheck(difference, "PyTorch's operations", 1.0).passes_on(torch.device("cpu"))
     assert "PyTorch's operations: Failed to find C compiler" in caplog.text
     assert "at length" not in caplog.text
 
@@ -178,9 +174,7 @@ def test_the_kernel_of_a_gpu_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
-    from lapgs_plugin.ops.upsample import _triton_works
-
-    assert _triton_works()
+    assert triton_works()
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")
     torch.testing.assert_close(upsample_add(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
     gradients = []
