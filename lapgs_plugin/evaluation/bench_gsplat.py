@@ -26,12 +26,9 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.reference_raster.layout import MIN_ALPHA, MIN_TRANSMITTANCE, NEAR_DEPTH, TILE
 
-TILE = 16
-NEAR_DEPTH = 0.2
-MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4
 
 
 class GsplatTorchRasterizer:

@@ -25,7 +25,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics
 from lapgs_plugin.rasterizers import gsplat_direct
-from lapgs_plugin.reference_raster.oracle import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
+from lapgs_plugin.reference_raster.layout import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
 
 NAME = "gsplat"
 

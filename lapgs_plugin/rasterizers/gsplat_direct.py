@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.ops.self_check import largest, matches_reference
-from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 KNOWN_RELEASES = "1.5."
 """Releases of gsplat whose compiled functions take what is given to them here."""

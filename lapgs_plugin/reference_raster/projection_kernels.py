@@ -60,12 +60,15 @@ from lapgs_plugin.reference_raster.layout import (
     LIMIT_X,
     LIMIT_Y,
     LOG2_MIN_ALPHA,
+    MAX_RADIUS,
+    MIN_ROOT,
     NEAR_DEPTH,
     OPACITY_RATE,
     PIXEL_VARIANCE,
     POSITION,
     PRINCIPAL_X,
     PRINCIPAL_Y,
+    RADIUS_SIGMAS,
     RED_FREE,
     ROTATION,
     SLOT,
@@ -92,11 +95,6 @@ from lapgs_plugin.reference_raster.sh_kernels import (
     store_sh_gradient,
 )
 
-RADIUS_SIGMAS = 3.0
-MIN_ROOT = 0.1
-"""Lower bound of the squared half difference of the covariance's eigenvalues, in px^4, as in the CUDA code."""
-MAX_RADIUS = 2.0**30
-"""Radii saturate here, in px, so that they fit int32."""
 HUGE = 1e37
 """Determinants in px^4 and coordinates in px from here on are taken for overflown, and the Gaussian is culled."""
 REACH_SLACK, REACH_SLOPE = 1e-3, 1e-5

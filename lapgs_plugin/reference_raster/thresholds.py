@@ -32,7 +32,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_basis
-from lapgs_plugin.reference_raster.oracle import (
+from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_ALPHA,
     MAX_RADIUS,
@@ -43,11 +43,8 @@ from lapgs_plugin.reference_raster.oracle import (
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
-    projection_jacobians,
-    tile_lists,
-    tile_rectangles,
-    world_covariances,
 )
+from lapgs_plugin.reference_raster.oracle import projection_jacobians, tile_lists, tile_rectangles, world_covariances
 
 ROUNDINGS = 8
 """Default tolerance in units of the float type's epsilon: the longest dot products of the projection."""

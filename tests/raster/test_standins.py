@@ -68,7 +68,7 @@ def call(module: ModuleType, variant: str, case: Case, inputs: dict[str, Tensor]
 
 
 def module_of(variant: str) -> ModuleType:
-    return stand_ins(variant)[VARIANTS[variant][0]]
+    return stand_ins(variant)[VARIANTS[variant].module]
 
 
 def case_of(*, signed: bool = False, sh_degree: int = 3, n: int = 60, **more: Any) -> Case:
@@ -348,7 +348,7 @@ def test_a_training_loop_written_for_the_cuda_module_learns(variant: str) -> Non
     """The calls of a checkout's train.py in their order: render, SSIM, statistics of densification, optimizer."""
     case = case_of(sh_degree=1, n=80)
     with install(variant) as found, torch.no_grad():
-        module = found[VARIANTS[variant][0]]
+        module = found[VARIANTS[variant].module]
         fused_ssim = found["fused_ssim"].fused_ssim
         target = call(module, variant, case, activated(case))[0]
         start = case.field.with_parameters({"sh": torch.zeros_like(case.field.sh)})

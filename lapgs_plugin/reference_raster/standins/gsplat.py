@@ -17,10 +17,10 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.inheritance import SH_C0
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
+from lapgs_plugin.reference_raster.layout import TILE
 
 __all__ = ["rasterization", "spherical_harmonics"]
 
-TILE = 16
 HIGHEST_OPACITY = 1 - 1e-6
 """Opacities are handed on as logits; that of 1 is infinite."""
 CONVENTIONS = {

@@ -26,12 +26,14 @@ from lapgs_plugin.reference_raster.layout import (
     FACTOR_YY,
     LOG2_MIN_ALPHA,
     LOG2_OPACITY,
+    MIN_ROOT,
     NEAR_DEPTH,
+    RADIUS_SIGMAS,
     SPLAT,
     TILE,
 )
 from lapgs_plugin.reference_raster.pipeline import TileLists
-from lapgs_plugin.reference_raster.projection_kernels import HUGE, MIN_ROOT, RADIUS_SIGMAS
+from lapgs_plugin.reference_raster.projection_kernels import HUGE
 
 Assign = Callable[[Floats, NDArray[np.int32]], TileLists]
 
