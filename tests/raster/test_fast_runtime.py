@@ -245,7 +245,7 @@ def test_only_some_parameters_require_gradients() -> None:
 
 # ------------------------------------------------------------------------------------------------ compilation
 
-MESSAGE = "compiling the CPU rasterizer"
+MESSAGE = "compiling CPU kernels"
 PACKAGE = Path(__file__).parents[2] / "lapgs_plugin"
 
 
