@@ -58,9 +58,8 @@ def ops(
         table.add_column(heading, justify="right", no_wrap=True)
     shown = ""
     for found in benchmark(where, width, height, gaussians, repeats):
-        difference = "" if found.difference is None else f"{found.difference:.0e}"
         name = "" if found.op == shown else found.op
-        table.add_row(name, found.version, f"{found.milliseconds:.2f}", f"{found.ratio:.2f}", difference)
+        table.add_row(name, found.version, f"{found.milliseconds:.2f}", f"{found.ratio:.2f}", f"{found.difference:.0e}")
         shown = found.op
     Console().print(table)
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from statistics import median
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,14 +18,21 @@ from lapgs_plugin.ops import adam, densification_statistics, photometric_loss, u
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
-from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch, ssim
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
-"""The version that the others are compared with."""
+"""The version that the others are compared with; its SSIM is kornia's."""
 
-Versions = dict[str, Callable[[], Tensor]]
-"""By name; a call does the operation once and returns its result."""
+
+class Version(NamedTuple):
+    """Do an operation once with `run`, which returns the result or updates the tensor `result`."""
+
+    run: Callable[[], object]
+    result: Tensor | None = None
+
+
+Versions = dict[str, Version]
 
 
 @dataclass(frozen=True)
@@ -34,15 +42,14 @@ class OpTime:
     Attributes:
         milliseconds: median over all turns.
         ratio: time of the PyTorch version over this one's.
-        difference: largest difference from the PyTorch version's result after one call; None for a peer that computes
-            something else.
+        difference: largest difference from the PyTorch version's result after one call.
     """
 
     op: str
     version: str
     milliseconds: float
     ratio: float
-    difference: float | None
+    difference: float
 
 
 def benchmark(device: torch.device, width: int, height: int, gaussians: int, repeats: int) -> list[OpTime]:
@@ -67,7 +74,10 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
 
 
 def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> list[OpTime]:
-    results = {name: version().clone() for name, version in versions.items()}  # the first call compiles
+    results = {}
+    for name, version in versions.items():
+        found = version.run()  # the first call compiles
+        results[name] = (found if isinstance(found, Tensor) else version.result).detach().clone()
     seconds: dict[str, list[float]] = {name: [] for name in versions}
     wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     for _ in range(repeats):
@@ -75,7 +85,7 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
             with one_pool() if name == NUMBA else nullcontext():  # as in training
                 wait()
                 start = time.perf_counter()
-                version()
+                version.run()
                 wait()
                 seconds[name].append(time.perf_counter() - start)
     medians = {name: median(each) for name, each in seconds.items()}
@@ -83,7 +93,7 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
     return [
         OpTime(
             op, name, 1e3 * each, medians[TORCH] / each,
-            float((results[name] - reference).abs().max()) if results[name].shape == reference.shape else None,
+            float((results[name] - reference).abs().max()),
         )
         for name, each in medians.items()
     ]  # fmt: skip
@@ -91,29 +101,27 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
 
 def _upsample_versions(ours: str, coarse: Tensor, fine: Tensor) -> Versions:
     pyramid, size = Pyramid(), (fine.shape[-2], fine.shape[-1])
-    versions: Versions = {TORCH: lambda: pyramid.up(coarse, size) + fine}
+    versions = {TORCH: Version(lambda: pyramid.up(coarse, size) + fine)}
     if ours == NUMBA or upsample.triton_works():
-        versions[ours] = lambda: upsample.upsample_add(pyramid, coarse, fine)
+        versions[ours] = Version(lambda: upsample.upsample_add(pyramid, coarse, fine))
     if size[0] % 2 == size[1] % 2 == 0:  # kornia doubles sides exactly
         from kornia.geometry.transform import pyrup
 
-        versions["kornia.pyrup"] = lambda: pyrup(coarse[None])[0] + fine
+        versions["kornia.pyrup"] = Version(lambda: pyrup(coarse[None])[0] + fine)
     return versions
 
 
 def _loss_versions(ours: str, prediction: Tensor, target: Tensor) -> Versions:
     leaf = prediction.clone().requires_grad_()
 
-    def gradient_of(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[], Tensor]:
-        # In units of one pixel's share of the loss.
-        return lambda: torch.autograd.grad(loss(leaf, target), leaf)[0] * leaf.numel()
+    def gradient_of(loss: Callable[[Tensor, Tensor], Tensor]) -> Version:
+        # Times the number of pixels and channels, so that values are about 1.
+        return Version(lambda: torch.autograd.grad(loss(leaf, target), leaf)[0] * leaf.numel())
 
-    versions: Versions = {TORCH: gradient_of(photometric_loss_torch)}
-    fused = photometric_loss.fused_ssim()
+    versions = {TORCH: gradient_of(photometric_loss_torch)}
+    fused = photometric_loss.fused_ssim() if ours != NUMBA else None
     if ours == NUMBA or (fused is not None and photometric_loss.triton_works()):
         versions[ours if fused is None else f"{ours} and fused_ssim"] = gradient_of(photometric_loss.photometric_loss)
-    kornia_alone = gradient_of(ssim)
-    versions["kornia.ssim alone"] = lambda: kornia_alone()[0]  # one channel: not comparable
     return versions
 
 
@@ -124,37 +132,36 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
         [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
     )
 
-    def parameters() -> list[torch.nn.Parameter]:
-        made = [torch.nn.Parameter(start.clone()) for start in starts]
-        for parameter, gradient in zip(made, gradients, strict=True):
+    def version(make: Callable[[list[torch.nn.Parameter]], Callable[[], object]]) -> Version:
+        """Give an optimizer its own copy of the parameters."""
+        parameters = [torch.nn.Parameter(start.clone()) for start in starts]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        return made
+        return Version(make(parameters), parameters[-1])
 
-    def stepped(made: list[torch.nn.Parameter], step: Callable[[], object]) -> Callable[[], Tensor]:
-        def call() -> Tensor:
-            step()
-            return made[-1].detach()
+    def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
+        moments = ([torch.zeros_like(start) for start in starts] for _ in range(2))
+        count = torch.zeros(())
+        slots = [AdamSlot(*row, count, 1e-3, 1e-3) for row in zip(parameters, gradients, *moments, strict=True)]
 
-        return call
+        def step() -> None:
+            count.add_(1)
+            step_torch(slots)
 
-    plain, theirs, mine = parameters(), parameters(), parameters()
-    slots = [
-        AdamSlot(one.detach(), gradient, torch.zeros_like(one), torch.zeros_like(one), torch.zeros(()), 1e-3, 1e-3)
-        for one, gradient in zip(plain, gradients, strict=True)
-    ]
+        return step
 
-    def step_plain() -> None:
-        for slot in slots:
-            slot.step.add_(1)
-        step_torch(slots)
+    def triton(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
+        optimizers = [adam.GpuFieldAdam(parameter, 1e-3) for parameter in parameters]
+        return lambda: adam.step_together(optimizers)
 
-    peer = torch.optim.Adam(theirs, lr=1e-3, eps=adam.ADAM_EPS, fused=True)
-    versions = {TORCH: stepped(plain, step_plain), "torch.optim.Adam, fused": stepped(theirs, peer.step)}
+    versions = {
+        TORCH: version(plain),
+        "torch.optim.Adam": version(lambda made: torch.optim.Adam(made, 1e-3, eps=adam.ADAM_EPS, fused=True).step),
+    }
     if ours == NUMBA:
-        versions[ours] = stepped(mine, FieldAdam(mine, lr=1e-3).step)
+        versions[ours] = version(lambda made: FieldAdam(made, 1e-3).step)
     elif adam.triton_works():
-        optimizers = [adam.GpuFieldAdam(one, 1e-3) for one in mine]
-        versions[ours] = stepped(mine, lambda: adam.step_together(optimizers))
+        versions[ours] = version(triton)
     return versions
 
 
@@ -163,16 +170,11 @@ def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Ver
     gradient = torch.randn(gaussians, 2, generator=generator).to(device)
     radii = torch.randint(0, 3, (gaussians,), generator=generator, dtype=torch.int32).to(device)
 
-    def summed(add: Callable[[Tensor, Tensor, tuple[int, int], Tensor, Tensor], None]) -> Callable[[], Tensor]:
+    def version(add: Callable[[Tensor, Tensor, tuple[int, int], Tensor, Tensor], None]) -> Version:
         norms, counts = (torch.zeros(gaussians, device=device) for _ in range(2))
+        return Version(lambda: add(gradient, radii, (2, 2), norms, counts), norms)
 
-        def call() -> Tensor:
-            add(gradient, radii, (2, 2), norms, counts)
-            return norms
-
-        return call
-
-    versions = {TORCH: summed(add_statistics_torch)}
-    if ours == "Triton" and densification_statistics.triton_works():
-        versions[ours] = summed(densification_statistics.add_statistics)
+    versions = {TORCH: version(add_statistics_torch)}
+    if ours != NUMBA and densification_statistics.triton_works():
+        versions[ours] = version(densification_statistics.add_statistics)
     return versions

@@ -409,17 +409,9 @@ def _tight_box(box: _Box, centre_x: Lanes, centre_y: Lanes, half_width: Lanes, h
 
 @inline
 def _color(
-    camera: Floats,
-    mean: Lanes3,
-    sh: Floats,
-    colors: Floats,
-    first: int,
-    n: int,
-    columns: int,
-    signed: bool,
-    degree: int,
-    spare: Floats,
-) -> tuple[Lanes3, Lanes3]:
+    camera: Floats, mean: Lanes3, sh: Floats, colors: Floats, first: int, n: int, columns: int, signed: bool,
+    degree: int, spare: Floats,
+) -> tuple[Lanes3, Lanes3]:  # fmt: skip
     """Return the colours of 16 Gaussians, and 1 where they pass gradients on."""
     one = splat(spare, 1.0)
     if columns == 0:
@@ -546,15 +538,9 @@ def project_backward(
 
 @inline
 def _sum_slots(
-    first: int,
-    n: int,
-    first_pair: NDArray[np.int64],
-    places: NDArray[np.int32],
-    last_place: int,
-    slots: Floats,
-    sums: Floats,
-    pairs: Floats,
-) -> None:
+    first: int, n: int, first_pair: NDArray[np.int64], places: NDArray[np.int32], last_place: int, slots: Floats,
+    sums: Floats, pairs: Floats,
+) -> None:  # fmt: skip
     """Add up the slots of 16 Gaussians, tile by tile; `pairs` gets the number of slots of each."""
     for lane in range(WIDTH):
         total = splat(slots, 0.0)
@@ -570,18 +556,9 @@ def _sum_slots(
 
 @inline
 def _color_backward(
-    camera: Floats,
-    mean: Lanes3,
-    sh: Floats,
-    first: int,
-    n: int,
-    columns: int,
-    degree: int,
-    d_color: Lanes3,
-    blended: Mask,
-    spare: Floats,
-    grad_sh: Floats,
-) -> Lanes3:
+    camera: Floats, mean: Lanes3, sh: Floats, first: int, n: int, columns: int, degree: int, d_color: Lanes3,
+    blended: Mask, spare: Floats, grad_sh: Floats,
+) -> Lanes3:  # fmt: skip
     """Store the gradient by the coefficients; return that by the centre, through the view direction."""
     direction, inverse_distance = _direction(camera, mean)
     rows, start = sh_rows(sh, first, n, columns, spare)
@@ -597,15 +574,9 @@ def _color_backward(
 
 @inline
 def _shape_backward(
-    camera: Floats,
-    mean: Lanes3,
-    scale: Lanes3,
-    quat: Lanes4,
-    shape: tuple[Lanes, ...],
-    total: tuple[Lanes, ...],
-    d_centre_x: Lanes,
-    d_centre_y: Lanes,
-) -> tuple[Lanes3, Lanes4, Lanes3]:
+    camera: Floats, mean: Lanes3, scale: Lanes3, quat: Lanes4, shape: tuple[Lanes, ...], total: tuple[Lanes, ...],
+    d_centre_x: Lanes, d_centre_y: Lanes,
+) -> tuple[Lanes3, Lanes4, Lanes3]:  # fmt: skip
     """Return gradients by the standard deviations, the quaternion, and the centre through the projection.
 
     Args:
@@ -725,17 +696,9 @@ def _store4(array: Floats, first: int, v: Lanes4, where: Mask) -> None:
 
 @inline
 def _store_no_gradient(
-    first: int,
-    columns: int,
-    grad_means: Floats,
-    grad_quats: Floats,
-    grad_scales: Floats,
-    grad_opacities: Floats,
-    grad_sh: Floats,
-    grad_colors: Floats,
-    grad_centres: Floats,
-    absgrad_centres: Floats,
-) -> None:
+    first: int, columns: int, grad_means: Floats, grad_quats: Floats, grad_scales: Floats, grad_opacities: Floats,
+    grad_sh: Floats, grad_colors: Floats, grad_centres: Floats, absgrad_centres: Floats,
+) -> None:  # fmt: skip
     """Store zero gradients of 16 Gaussians that are in no tile's list."""
     none = splat(grad_means, 0.0)
     store_columns(grad_means, first * 3, none, none, none)

@@ -216,19 +216,9 @@ def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: 
 
 @inline
 def _list_by_block(
-    batch: int,
-    size: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    alive: int,
-    lists: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    keep: bool,
-    hits: NDArray[np.uint16],
-) -> None:
+    batch: int, size: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    alive: int, lists: NDArray[np.int64], counts: NDArray[np.int64], keep: bool, hits: NDArray[np.uint16],
+) -> None:  # fmt: skip
     """List the pairs from `batch` on for each block that they reach."""
     left, top = load(offsets, _CORNERS) + tile_x * TILE, load(offsets, _CORNERS + WIDTH) + tile_y * TILE
     for block in range(BLOCKS):
@@ -249,17 +239,9 @@ def _list_by_block(
 
 @inline
 def _blend_block(
-    block: int,
-    start: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    lists: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    state: Floats,
-) -> int:
+    block: int, start: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    lists: NDArray[np.int64], counts: NDArray[np.int64], state: Floats,
+) -> int:  # fmt: skip
     """Blend a block's list into its pixels.
 
     Returns:
@@ -302,15 +284,9 @@ def _blend_block(
 
 @inline
 def _close_tile(
-    state: Floats,
-    background: Floats,
-    tile_x: int,
-    tile_y: int,
-    width: int,
-    height: int,
-    image: Floats,
+    state: Floats, background: Floats, tile_x: int, tile_y: int, width: int, height: int, image: Floats,
     transmittance: Floats,
-) -> None:
+) -> None:  # fmt: skip
     """Blend the background and store the pixels that are inside of the image."""
     pixels = width * height
     for block in range(BLOCKS):
@@ -386,18 +362,9 @@ def blend_backward(
 
 @inline
 def _reopen_tile(
-    state: Floats,
-    tile: int,
-    tile_x: int,
-    tile_y: int,
-    width: int,
-    height: int,
-    background: Floats,
-    final: Floats,
-    grad_image: Floats,
-    grad_transmittance: Floats,
-    by_transmittance: bool,
-) -> None:
+    state: Floats, tile: int, tile_x: int, tile_y: int, width: int, height: int, background: Floats, final: Floats,
+    grad_image: Floats, grad_transmittance: Floats, by_transmittance: bool,
+) -> None:  # fmt: skip
     """Set the state behind the last splat; pixels outside of the image have no gradient."""
     pixels = width * height
     for block in range(BLOCKS):
@@ -427,17 +394,9 @@ def _reopen_tile(
 
 @inline
 def _splat_backward(
-    pair: int,
-    start: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    blocks: int,
-    state: Floats,
-    slots: Floats,
-) -> None:
+    pair: int, start: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    blocks: int, state: Floats, slots: Floats,
+) -> None:  # fmt: skip
     """Step in front of one splat in the given blocks of a tile, and sum up its gradient.
 
     Let T be the transmittance in front of the splat, c its colour times the pixel's gradient, and R the loss's

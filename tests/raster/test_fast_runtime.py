@@ -302,7 +302,7 @@ for kind in (np.int32, np.int64):
 def test_compiling_is_announced_once_and_happens_again_only_after_a_change(copied_package: Path) -> None:
     assert run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package).count(MESSAGE) == 1
     assert run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package) == ""
-    with (copied_package / "lapgs_plugin" / "reference_raster" / "lanes.py").open("a") as file:
+    with (copied_package / "lapgs_plugin" / "jit" / "lanes.py").open("a") as file:
         file.write("# a module that the kernel's own does not even import\n")
     assert MESSAGE in run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
 

@@ -40,16 +40,9 @@ def _moved(parameter: Value, scale: Value, mean: Value, root: Value, rates: Floa
 
 @jit
 def _adam_kernel(
-    counter: NDArray[np.int64],
-    p: Floats,
-    g: Floats,
-    m: Floats,
-    v: Floats,
-    columns: int,
-    active: int,
-    scale: Floats,
+    counter: NDArray[np.int64], p: Floats, g: Floats, m: Floats, v: Floats, columns: int, active: int, scale: Floats,
     rates: Floats,
-) -> None:
+) -> None:  # fmt: skip
     """Update the first `active` elements of each row of `columns`; all arrays flat, `scale` for one row.
 
     No multiplication is fused with an addition, so that vector and scalar code give the same bits.

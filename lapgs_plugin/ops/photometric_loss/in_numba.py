@@ -138,15 +138,9 @@ def _store_derivatives(
 
 @inline
 def _store_gradient(
-    filtered: Floats,
-    row: int,
-    moments: Floats,
-    start: int,
-    pitch: int,
-    weights: tuple[float, float],
-    l1_sum: Floats,
+    filtered: Floats, row: int, moments: Floats, start: int, pitch: int, weights: tuple[float, float], l1_sum: Floats,
     out: Floats,
-) -> None:
+) -> None:  # fmt: skip
     """Store one row of the gradient and add |p - t| to `l1_sum`."""
     l1_weight, ssim_weight = weights
     plus, minus = splat(out, l1_weight), splat(out, -l1_weight)
@@ -186,15 +180,9 @@ def _mark_inside(left: int, width: int, inside: Floats) -> None:
 
 @jit
 def _photometric_kernel(
-    counter: Integers,
-    blocks: Integers,
-    pitch: int,
-    prediction: Floats,
-    target: Floats,
-    weights: tuple[float, float],
-    gradient: Floats,
-    sums: NDArray[np.float64],
-) -> None:
+    counter: Integers, blocks: Integers, pitch: int, prediction: Floats, target: Floats, weights: tuple[float, float],
+    gradient: Floats, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
     """Compute the gradient (c, h, w), and for each block the sums of |p - t| and of SSIM, (blocks, 2)."""
     _, height, width = prediction.shape
     dtype = prediction.dtype
