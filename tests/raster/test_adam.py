@@ -35,7 +35,7 @@ def sh_scale(dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def gradients(shape: tuple[int, ...], steps: int, dtype: torch.dtype) -> Iterator[Tensor]:
-    """As training makes them: of very different sizes, and exactly zero for rows no view saw."""
+    """Yield gradients like those of training: of very different sizes, and zero for rows that no view saw."""
     generator = torch.Generator().manual_seed(1)
     for _ in range(steps):
         row = (shape[0],) + (1,) * (len(shape) - 1)
@@ -49,7 +49,7 @@ def parameter(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> tor
 
 
 def descend(optimizer: torch.optim.Optimizer, values: list[Tensor]) -> Tensor:
-    """The optimizer's one parameter after a step on each gradient."""
+    """Return the optimizer's one parameter after a step on each gradient."""
     param: Tensor = optimizer.param_groups[0]["params"][0]
     for gradient in values:
         param.grad = gradient.clone()
@@ -58,7 +58,7 @@ def descend(optimizer: torch.optim.Optimizer, values: list[Tensor]) -> Tensor:
 
 
 def difference_from_torch(shape: tuple[int, ...], steps: int, dtype: torch.dtype, lr: float, eps: float) -> float:
-    """Largest difference of the parameters after some steps, in units of lr."""
+    """Return the largest difference of the parameters after some steps, in units of lr."""
     values = list(gradients(shape, steps, dtype))
     ours = descend(FieldAdam([parameter(shape, dtype)], lr=lr, eps=eps), values)
     theirs = descend(torch.optim.Adam([parameter(shape, dtype)], lr=lr, eps=eps, foreach=False), values)
@@ -73,7 +73,7 @@ def test_equals_torch_adam_over_many_steps(shape: tuple[int, ...]) -> None:
 
 
 def stepped(values: list[Tensor], rates: tuple[float, float], views: int = 1) -> Tensor:
-    """The tensor after a step of the plain PyTorch version on each gradient."""
+    """Return the tensor after a step of the PyTorch version on each gradient."""
     start = parameter(SH_SHAPE, torch.float64).detach()
     slot = AdamSlot(start.clone(), *(torch.zeros_like(start) for _ in range(3)), torch.zeros(()), *rates)
     for gradient in values:
@@ -123,7 +123,7 @@ def test_column_scale_multiplies_the_learning_rate_of_each_column() -> None:
 
 
 def test_columns_that_become_active_later_train_as_if_they_always_had_been() -> None:
-    """The SH schedule: bands above the current degree have zero gradients until it rises."""
+    """Follow the SH schedule: bands above the current degree have zero gradients until it rises."""
     values = list(gradients(SH_SHAPE, 40, torch.float32))
     schedule = [1] * 10 + [4] * 10 + [9] * 10 + [16] * 10
     for value, active in zip(values, schedule, strict=True):

@@ -1,4 +1,4 @@
-"""Up and the sum in one pass, against Up and the sum."""
+"""Check upsampling in one pass against PyTorch's operations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
         h, w = shape[-2:]
         coarse, fine = torch.randn(*shape[:-2], (h + 1) // 2, (w + 1) // 2), torch.randn(*shape)
         expected = Pyramid(grid).up(coarse, (h, w)) + fine
-        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as gsplat has them
+        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as from gsplat
         for images in ((coarse, fine), turned):
             torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
         gradients = []
@@ -47,7 +47,7 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
 
 
 def images(grid: str, shape: tuple[int, ...], dtype: torch.dtype, device: str = "cpu") -> tuple[torch.Tensor, ...]:
-    """Coarse, fine, and what is expected of them."""
+    """Return coarse, fine, and their expected sum."""
     height, width = shape[-2:]
     coarse = torch.randn(*shape[:-2], (height + 1) // 2, (width + 1) // 2, dtype=dtype, device=device)
     fine = torch.randn(shape, dtype=dtype, device=device)
@@ -76,7 +76,7 @@ def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     torch.testing.assert_close(upsample(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
 
 
-def test_what_is_not_half_of_the_size_is_refused() -> None:
+def test_an_image_that_is_not_half_of_the_size_is_refused() -> None:
     with pytest.raises(UserInputError, match=r"Up to 33x50 .* needs an image of 17x25, got 16x25"):
         upsample(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
 
@@ -103,7 +103,7 @@ def test_taps_are_few_and_averages(grid: str, size: int) -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(GRIDS), st.integers(1, 400))
-def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
+def test_transposed_taps_are_the_gradient(grid: str, size: int) -> None:
     first, weights = transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2)
     assert weights.shape[1] <= 12
     leaf, fine = torch.randn((size + 1) // 2, 1, dtype=torch.float64, requires_grad=True), torch.randn(size).double()
@@ -146,7 +146,7 @@ def test_a_kernel_that_does_not_compile_is_not_used(caplog: pytest.LogCaptureFix
 
 
 class _Asking(torch.autograd.Function):
-    """Asks while PyTorch is in a forward pass of ours, where gradients are off."""
+    """Run the check inside a forward pass, where gradients are off."""
 
     @staticmethod
     def forward(ctx: Any, answer: torch.Tensor) -> torch.Tensor:
