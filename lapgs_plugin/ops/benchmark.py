@@ -77,9 +77,11 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
     results = {}
     for name, version in versions.items():
         found = version.run()  # the first call compiles
-        results[name] = (found if isinstance(found, Tensor) else version.result).detach().clone()
+        result = found if version.result is None else version.result
+        assert isinstance(result, Tensor)
+        results[name] = result.detach().clone()
     seconds: dict[str, list[float]] = {name: [] for name in versions}
-    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    wait: Callable[[], object] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     for _ in range(repeats):
         for name, version in versions.items():
             with one_pool() if name == NUMBA else nullcontext():  # as in training
@@ -140,9 +142,11 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
         return Version(make(parameters), parameters[-1])
 
     def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
-        moments = ([torch.zeros_like(start) for start in starts] for _ in range(2))
         count = torch.zeros(())
-        slots = [AdamSlot(*row, count, 1e-3, 1e-3) for row in zip(parameters, gradients, *moments, strict=True)]
+        slots = [
+            AdamSlot(one, gradient, torch.zeros_like(one), torch.zeros_like(one), count, 1e-3, 1e-3)
+            for one, gradient in zip(parameters, gradients, strict=True)
+        ]
 
         def step() -> None:
             count.add_(1)

@@ -33,12 +33,11 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 
     The window is an 11x11 Gaussian of sigma 1.5. Outside of the images are zeros, and nothing is clamped.
     """
-    from kornia.metrics import ssim as kornia_ssim  # on first use: it takes longer to import than to compute
+    from kornia.metrics import ssim as kornia_ssim  # here, because its import takes longer than one loss
 
     # kornia mirrors images at their borders; 3DGS pads them with zeros.
-    images = (pad(image, (SSIM_RADIUS,) * 4) for image in (prediction, target))
-    found: Tensor = kornia_ssim(*images, window_size=2 * SSIM_RADIUS + 1, eps=0.0, padding="valid")
-    return found
+    border, width = (SSIM_RADIUS,) * 4, 2 * SSIM_RADIUS + 1
+    return kornia_ssim(pad(prediction, border), pad(target, border), width, eps=0.0, padding="valid")
 
 
 def as_batch(image: Tensor) -> Tensor:
