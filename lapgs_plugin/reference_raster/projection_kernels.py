@@ -480,13 +480,8 @@ def project_backward(
     last_place = places.size - 1
     scratch, scratch_sums = np.empty(WIDTH * COLUMNS, splats.dtype), np.empty(WIDTH * (SLOT + 1), splats.dtype)
     spare, sums, pairs = borrowed(scratch), borrowed(scratch_sums), borrowed(scratch_sums[WIDTH * SLOT :])
-    means, quats, scales, sh, camera = (
-        borrowed(means),
-        borrowed(quats),
-        borrowed(scales),
-        borrowed(sh),
-        borrowed(camera),
-    )
+    means, quats, scales = borrowed(means), borrowed(quats), borrowed(scales)
+    sh, camera = borrowed(sh), borrowed(camera)
     splats, first_pair, places, slots = borrowed(splats), borrowed(first_pair), borrowed(places), borrowed(slots)
     grad_means, grad_quats, grad_scales = borrowed(grad_means), borrowed(grad_quats), borrowed(grad_scales)
     grad_opacities, grad_sh, grad_colors = borrowed(grad_opacities), borrowed(grad_sh), borrowed(grad_colors)

@@ -9,19 +9,7 @@ from __future__ import annotations
 import math
 
 from lapgs_plugin.jit.compiler import inline
-from lapgs_plugin.jit.lanes import (
-    WIDTH,
-    Floats,
-    Lanes,
-    Lanes3,
-    Mask,
-    at,
-    fma,
-    load_rows,
-    put,
-    select,
-    store_rows,
-)
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, Lanes3, Mask, at, fma, load_rows, put, select, store_rows
 
 COLUMNS = 48
 """Coefficients of degree 3, three channels each."""

@@ -23,18 +23,7 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
-from lapgs_plugin.jit.lanes import (
-    WIDTH,
-    Floats,
-    Lanes,
-    absolute,
-    fetch_add,
-    fma,
-    load,
-    select,
-    splat,
-    store,
-)
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, absolute, fetch_add, fma, load, select, splat, store
 from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
