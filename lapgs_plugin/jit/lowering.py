@@ -438,7 +438,7 @@ def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
 
 
 def _padded(vectors: Sequence[Any]) -> list[Any]:
-    """Pad to sixteen vectors with zeros; LLVM removes what is computed from these."""
+    """Pad to sixteen vectors with zeros; LLVM removes computations with these."""
     return [*vectors, *[ir.Constant(vectors[0].type, None)] * (WIDTH - len(vectors))]
 
 

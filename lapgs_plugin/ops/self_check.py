@@ -20,7 +20,7 @@ class SelfCheck:
 
     Args:
         difference: runs both versions on a device and returns the largest difference between them.
-        fallback: what is used instead of the kernels, for the log.
+        fallback: operations used instead of the kernels, for the log.
         limit: largest difference that counts as rounding.
     """
 
