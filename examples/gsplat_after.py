@@ -1,9 +1,9 @@
-"""A training loop on gsplat with a hierarchy: `gsplat_before.py` and two dozen lines.
+"""Train with a hierarchy in a loop on gsplat: `gsplat_before.py` with two dozen lines changed.
 
     python examples/gsplat_after.py SCENE -o RUN --resolution 1/4 --iterations 3000
 
-lapgs_plugin reads the scene and gives the loss, as any loader and any L1 + SSIM would. `lapgs eval RUN` works.
-Where there is no CUDA device, `--rasterizer cpu` takes gsplat's two functions from a stand-in.
+lapgs_plugin reads the scene and computes the loss; any loader and any L1 + SSIM would do. `lapgs eval RUN` works.
+Without a CUDA device give `--rasterizer cpu`: gsplat's two functions then come from a stand-in.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class View:
 
 
 class Runner:
-    """A scene, the splats that are fitted to it, and how they are rendered."""
+    """Hold a scene and the splats that are fitted to it, and render them."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.device = torch.device("cpu" if args.rasterizer == "cpu" else "cuda")
@@ -55,7 +55,7 @@ class Runner:
         )
 
     def set_splats(self, splats: dict[str, Tensor]) -> None:
-        """Start with these parameters and fresh optimizers."""
+        """Start from these parameters with fresh optimizers."""
         rates = {**RATES, "means": RATES["means"] * self.scene.extent}
         self.splats = {name: torch.nn.Parameter(value.detach().to(self.device)) for name, value in splats.items()}
         self.optimizers = {
@@ -64,7 +64,7 @@ class Runner:
         }
 
     def render(self, view: View, sh_degree: int = SH_DEGREE) -> tuple[Tensor, dict]:
-        """(3, h, w) image, and what gsplat knows of it."""
+        """Return the (3, h, w) image and gsplat's information about it."""
         colors = torch.cat([self.splats["sh0"], self.splats["shN"]], 1)
         directions = self.splats["means"] + view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         colors = self.gsplat.spherical_harmonics(sh_degree, directions, colors)
@@ -98,7 +98,7 @@ class Runner:
             self.set_splats(lapgs.splats_from_field(lapgs.inherit(field).field))
 
     def train(self, views: list[View], iterations: int) -> list[float]:
-        """Fit the splats to the views; the loss of every iteration."""
+        """Fit the splats to the views and return the loss of every iteration."""
         shrink = min(1.0, self.args.iterations / 30_000)
         strategy = gsplat.DefaultStrategy(
             refine_start_iter=round(500 * shrink),
@@ -125,7 +125,7 @@ class Runner:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Mean over the held-out views, in dB."""
+        """Return the mean over the held-out views, in dB."""
         errors = [(self.render(view)[0].clamp(0, 1) - view.image).square().mean() for view in self.test_views]
         return float((-10 * torch.stack(errors).log10()).mean())
 
