@@ -62,7 +62,7 @@ def test_a_renamed_option_would_be_found() -> None:
 
 
 def every_option() -> set[str]:
-    found, waiting = set(), [typer.main.get_command(app)]
+    found, waiting = {"--help"}, [typer.main.get_command(app)]
     while waiting:
         command: Any = waiting.pop()
         waiting += getattr(command, "commands", {}).values()
