@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import ClassVar
+
+LONGEST_LINE = 1_200
+"""Characters of a message; more than that are left out of its middle."""
+
+
+def printable(text: str) -> str:
+    r"""Make text safe for a terminal: names from files may hold escape sequences, newlines or reversed writing.
+
+    >>> printable("a\n\x1b[2J")
+    'a\\n\\x1b[2J'
+    """
+    return "".join(
+        char if char.isprintable() or unicodedata.category(char) == "Zs" else char.encode("unicode_escape").decode()
+        for char in text
+    )
 
 
 class LapgsError(Exception):
     """Something went wrong that one clear line explains; the command line prints it and exits with `exit_code`.
 
-    The message says what was wrong, the value received, what was expected and what to do next.
+    The message says what was wrong, the value received, what was expected and what to do next. It is one printable
+    line, whatever names it quotes.
     """
 
     exit_code: ClassVar[int] = 2
+
+    def __init__(self, message: str = "") -> None:
+        line = printable(message)
+        if len(line) > LONGEST_LINE:  # it quotes a long value; file and advice stand at its ends
+            line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
+        super().__init__(line)
 
 
 class UserInputError(LapgsError, ValueError):

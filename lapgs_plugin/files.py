@@ -64,13 +64,21 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def one_line_errors(path: Path, action: str = "written") -> Iterator[None]:
-    """Turn an OSError about a file of a run into a RunFolderError: one line that says what to do."""
+def one_line_errors(path: Path, action: str = "written", *, training: bool = False) -> Iterator[None]:
+    """Turn an OSError about a file of a run into a RunFolderError: one line that says what to do.
+
+    Args:
+        path: of the file.
+        action: what cannot be done with it.
+        training: whether a run is being trained, which continues with --resume once the disk has space.
+    """
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            advice = "free some space and continue with --resume; what was finished before is unharmed"
+            advice = "free some space and run the command again"
+            if training:
+                advice = "free some space and continue with --resume; what was finished before is unharmed"
         else:
             advice = "expected a folder this user may read and write"
         raise RunFolderError(f"{path} cannot be {action}: {error.strerror or error}; {advice}") from error
@@ -82,7 +90,9 @@ def require_manifest(folder: Path) -> None:
     Raises:
         RunFolderError: there is none.
     """
-    if not (folder / MANIFEST).is_file():
+    with one_line_errors(folder, "read"):
+        is_run = (folder / MANIFEST).is_file()
+    if not is_run:
         what = f"has no {MANIFEST}" if folder.is_dir() else "does not exist"
         raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
 
@@ -105,7 +115,7 @@ class FolderLock:
             RunFolderError: another process has it.
         """
         path = folder / LOCK
-        with one_line_errors(path):
+        with one_line_errors(path, training=True):
             stream = path.open("a+b")
             try:
                 if not _lock_file(stream):

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
+from lapgs_plugin.errors import UserInputError
+
 KEY = "option"
 
 
@@ -59,3 +61,20 @@ def option_values(settings: Any) -> Mapping[str, Any]:
         elif is_dataclass(value):
             values.update(option_values(value))
     return values
+
+
+def check_bounds(settings: Any) -> None:
+    """Check the numbers of a settings object against the bounds that its fields declare.
+
+    Raises:
+        UserInputError: one is outside.
+    """
+    for each in fields(settings):
+        declared, value = each.metadata.get(KEY), getattr(settings, each.name)
+        if declared is None or value is None or isinstance(value, str):
+            continue
+        name = "--" + parameter_name(each.name, declared).replace("_", "-")
+        if declared.least is not None and not value >= declared.least:
+            raise UserInputError(f"{name} {value}: expected at least {declared.least:g}")
+        if declared.most is not None and not value <= declared.most:
+            raise UserInputError(f"{name} {value}: expected at most {declared.most:g}")

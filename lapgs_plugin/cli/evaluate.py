@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, refuse, show_log
+from lapgs_plugin.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -147,7 +148,7 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
         distances = [*(f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured), *("not measured" for _ in missing)]
-        table.add_row(escape(view["name"]), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}", *distances)
+        table.add_row(escape(printable(view["name"])), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}", *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
     console.print(f"[bold]Views, worst first[/bold]{more}", table, highlight=False)
 

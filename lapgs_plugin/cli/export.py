@@ -45,10 +45,11 @@ def export(
         raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")
     archive = RunArchive.open(run)
     levels, folder = _levels(archive, level), archive.path(EXPORT) if out is None else out
+    fields = {each: archive.field(each) for each in levels}  # all are whole before anything is written
     with one_line_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    for each in levels:
-        field, note = archive.field(each), _note(archive, each)
+    for each, field in fields.items():
+        note = _note(archive, each)
         kind = "base" if each == archive.manifest.levels - 1 else "residual" if field.signed else "field"
         path = folder / f"level_{each}_{kind}.{file_format}"
         with one_line_errors(path):

@@ -110,6 +110,7 @@ def _resume(
     Returns:
         The run, its scene, and its settings, of which `MAY_CHANGE` are as wanted where they are given.
     """
+    from lapgs_plugin.files import MANIFEST
     from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
@@ -124,7 +125,7 @@ def _resume(
                 f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
                 "start again with --overwrite"
             )
-        settings = TrainSettings.from_manifest(manifest)
+        settings = TrainSettings.from_manifest(manifest, str(archive.path(MANIFEST)))
         started_with = _wanted(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
             if wanted[name] != started_with[name]:
@@ -132,8 +133,14 @@ def _resume(
                     f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "
                     f"{started_with[name]}; leave the option out to continue it, or start again with --overwrite"
                 )
-        settings = replace(settings, **{name: wanted[name] for name in MAY_CHANGE if name in given})
-        check_storage(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        anew = {name: wanted[name] for name in MAY_CHANGE if name in given}
+        settings = replace(settings, **anew)
+        try:
+            check_storage(settings, training_rasterizer(manifest.rasterizer, settings).device)
+        except UserInputError as error:
+            if anew:
+                raise
+            raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:

@@ -131,6 +131,10 @@ def run_metrics(
         raise RunFolderError(
             f"{archive.path(METRICS)} lacks {', '.join(sorted(missing))}; write it again with `lapgs eval`"
         )
+    if not metrics["views"]:
+        raise RunFolderError(
+            f"{archive.path(METRICS)} has no views, expected one at least; write it again with `lapgs eval`"
+        )
     return metrics
 
 

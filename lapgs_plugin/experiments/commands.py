@@ -8,12 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
+from lapgs_plugin.untrusted import STRICT
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
 SCRIPT = "train.py"
@@ -36,6 +37,8 @@ class Step:
         command: with its arguments.
         cwd: folder that it is started in.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     command: tuple[str, ...]
     cwd: str

@@ -8,12 +8,13 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.schema import Backbone, Experiment, SampleScene, Scenes, Variant, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
+from lapgs_plugin.untrusted import STRICT
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class RunSpec:
         options: of `lapgs train` or `lapgs run`.
         arguments: of the checkout's script.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     scene: str
     dataset: str

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.errors import MissingExtraError, RunFolderError, UserInputError
 from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.untrusted import parse_json, shortened
 
 CSV, PARQUET, MARKDOWN, LATEX = "results.csv", "results.parquet", "tables.md", "tables.tex"
 
@@ -44,7 +44,13 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         raise MissingExtraError(
             f"{path.name} is not written: pyarrow is not installed; pip install 'lapgs_plugin[parquet]'"
         ) from error
-    table = pyarrow.table({name: [row.get(name) for row in rows] for name in columns_of(rows)})
+    try:
+        table = pyarrow.table({name: [row.get(name) for row in rows] for name in columns_of(rows)})
+    except (pyarrow.ArrowException, OverflowError) as error:
+        raise RunFolderError(
+            f"{path} is not written: runs differ in the type of a figure ({shortened(str(error))}); run the experiment "
+            "again in another folder"
+        ) from error
     with one_line_errors(path), atomic_write(path) as stream:
         pyarrow.parquet.write_table(table, stream)
 
@@ -64,15 +70,29 @@ def columns_of(rows: Sequence[Row]) -> list[str]:
 
 
 def read_csv(path: Path) -> list[dict[str, Any]]:
-    """The rows of a results.csv, numbers as numbers; what is empty is left out."""
+    """The rows of a results.csv, numbers as numbers; what is empty is left out.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no such table.
+    """
     with path.open(newline="", encoding="utf-8") as stream:
-        return [{name: _value(text) for name, text in row.items() if text != ""} for row in csv.DictReader(stream)]
+        reader = csv.DictReader(stream)
+        try:
+            rows = list(reader)
+        except csv.Error as error:
+            raise ValueError(str(error)) from error
+    expected = set(reader.fieldnames or ())
+    for number, row in enumerate(rows, start=1):
+        if row.keys() != expected or None in row.values():
+            raise ValueError(f"row {number} has more or fewer cells than the {len(expected)} of the first line")
+    return [{name: _value(text) for name, text in row.items() if text != ""} for row in rows]
 
 
 def _value(text: str) -> Any:
     try:
-        value = json.loads(text)
-    except ValueError:
+        value = parse_json(text, "a cell", advice="")
+    except UserInputError:
         return text
     return value if isinstance(value, (int, float)) else text
 

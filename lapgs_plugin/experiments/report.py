@@ -33,6 +33,7 @@ from lapgs_plugin.reports.report import (
 )
 from lapgs_plugin.runs.archive import REPORT, RunArchive
 from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.untrusted import read_text, shortened
 
 TEMPLATE = "experiment.html.jinja"
 COLORS = 8
@@ -43,6 +44,9 @@ COUNTS = {
     "gaussians": "Gaussians to render",
 }
 """Columns that say how many Gaussians there were: the first that all rows have is charted."""
+
+NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
+"""Columns that every row has: text and numbers."""
 
 Row = Mapping[str, Any]
 
@@ -93,15 +97,20 @@ class Results:
         path = folder / CSV
         try:
             rows = read_csv(path)
-            missing = {"variant", "baseline", "run", "scene", "backbone", "train_seconds", "gaussians"} - set(
-                rows[0] if rows else ()
-            )
         except (OSError, ValueError) as error:
             raise RunFolderError(f"{path} cannot be read ({error}); expected what `lapgs bench` writes") from error
-        if missing:
-            raise RunFolderError(
-                f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
-            )
+        for row in rows or [{}]:
+            if missing := {*NAMES, *FIGURES} - row.keys():
+                raise RunFolderError(
+                    f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
+                )
+            for name, value in row.items():
+                if (name in FIGURES or name in COUNTS or name.endswith(("_seconds", "_ms"))) and isinstance(value, str):
+                    raise RunFolderError(
+                        f"{path}: {shortened(name)} is {shortened(value)}, expected a number; write it again with "
+                        "`lapgs bench` and --tables-only"
+                    )
+        rows = [{**row, **{name: str(row[name]) for name in NAMES}} for row in rows]
         return cls(folder, rows)
 
     @property
@@ -166,7 +175,8 @@ def _tables(path: Path) -> tuple[str, str]:
     """The experiment's title, and its tables as HTML."""
     if not path.is_file():
         return "", ""
-    first, _, rest = path.read_text(encoding="utf-8").partition("\n")
+    advice = "write it again with `lapgs bench` and --tables-only"
+    first, _, rest = read_text(path, error=RunFolderError, advice=advice).partition("\n")
     html = MarkdownIt("commonmark", {"html": False}).enable("table").render(rest)
     return first.removeprefix("# "), html.replace("<table>", '<div class="scroll"><table>').replace(
         "</table>", "</table></div>"
@@ -268,7 +278,7 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
         kinds = [results.style(variant) for variant in runs]
         charts = training_charts(list(runs.values()), kinds)
     names = {results.style(variant): variant for variant in runs}
-    measured = [name for name in runs if "views" in runs[name].metrics]
+    measured = [name for name in runs if runs[name].metrics.get("views")]
     shown = next((name for name in measured if name != base), base)
     strips: list[Strip] = []
     columns: list[str] = []

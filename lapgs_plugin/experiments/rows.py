@@ -26,7 +26,7 @@ from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
-from lapgs_plugin.runs.archive import LevelRecord, RunArchive
+from lapgs_plugin.runs.archive import LevelRecord, RunArchive, read_bare_record
 
 NOTED = ("psnr", "ssim")
 """What training itself notes of its images."""
@@ -98,13 +98,7 @@ def _figures_of_records(records: Sequence[LevelRecord]) -> dict[str, Any]:
 
 def _bare_figures(folder: Path) -> dict[str, Any]:
     """What was noted while a script ran by itself."""
-    path = folder / BARE_RECORD
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(
-            f"{path} cannot be read ({error}); expected what `lapgs run --off --record` writes"
-        ) from error
+    values = read_bare_record(folder / BARE_RECORD)
     count = values["num_gaussians"]
     row = {
         "train_seconds": values["train_seconds"],

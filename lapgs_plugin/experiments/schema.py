@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -14,11 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, Hierarchy
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from lapgs_plugin.untrusted import read_toml
 
 T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
@@ -241,12 +236,7 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         UserInputError: it is not readable, not TOML, or says something that no experiment may say: a line for each
             mistake, which names the key, and for an unknown one the nearest that is known.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserInputError(f"{path}: {error.strerror}; expected an experiment file such as smoke.toml") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserInputError(f"{path} is not TOML: {error}; expected an experiment file") from error
+    values = read_toml(path, advice="give an experiment file such as smoke.toml")
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:

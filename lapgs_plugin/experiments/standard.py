@@ -7,18 +7,13 @@ from __future__ import annotations
 
 import csv
 import math
-import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from lapgs_plugin.untrusted import read_toml
 
 DATA = Path(__file__).parent / "data"
 KEYS = ("dataset", "scene", "row")
@@ -128,7 +123,8 @@ def _figures(text: str) -> tuple[float, ...]:
 
 
 def _read(name: str) -> dict[str, Any]:
-    return tomllib.loads((DATA / name).read_text(encoding="utf-8"))
+    values: dict[str, Any] = read_toml(DATA / name, advice="install lapgs_plugin again")
+    return values
 
 
 def _datasets() -> dict[str, Dataset]:

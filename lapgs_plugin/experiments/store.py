@@ -21,13 +21,14 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.files import one_line_errors
+from lapgs_plugin.untrusted import STRICT, parse_json
 
 FORMAT_VERSION = 1
 LEASE = 120.0
@@ -69,6 +70,8 @@ class Job:
         evaluate: whether the last of them is `lapgs eval`.
     """
 
+    __pydantic_config__: ClassVar[Any] = STRICT
+
     run_id: str
     spec: RunSpec
     folder: str
@@ -91,9 +94,9 @@ class Job:
 
     @classmethod
     def from_json(cls, text: str) -> Job:
-        values = json.loads(text)
-        steps = tuple(Step(tuple(step["command"]), step["cwd"]) for step in values.pop("steps"))
-        return cls(spec=RunSpec(**values.pop("spec")), steps=steps, **values)
+        advice = "plan the experiment again in another folder"
+        job: Job = parse_json(text, "a run in the store", cls, error=RunFolderError, advice=advice)
+        return job
 
 
 @dataclass(frozen=True)
@@ -144,11 +147,8 @@ class ResultStore:
         self._path = path
         if not path.is_file():
             raise RunFolderError(f"{path} does not exist; `lapgs bench EXPERIMENT.toml` makes it")
-        try:
-            with self._transaction() as connection:
-                about = dict(connection.execute("SELECT key, value FROM about").fetchall())
-        except sqlite3.DatabaseError as error:
-            raise RunFolderError(f"{path} is no store of results ({error}); choose another folder") from error
+        with self._transaction() as connection:
+            about = dict(connection.execute("SELECT key, value FROM about").fetchall())
         if about.get("format") != str(FORMAT_VERSION):
             raise RunFolderError(
                 f"{path} was written by {about.get('created_by', 'an unknown program')} in format "
@@ -251,10 +251,16 @@ class ResultStore:
         with self._transaction() as connection:
             found = connection.execute("SELECT run_id, state, record, error FROM runs ORDER BY position").fetchall()
         return [
-            Outcome(run_id, state, None if record is None else json.loads(record), error or "")
+            Outcome(run_id, state, None if record is None else self._row(run_id, record), error or "")
             for run_id, state, record, error in found
             if wanted is None or run_id in wanted
         ]
+
+    def _row(self, run_id: str, text: str) -> dict[str, Any]:
+        """What is recorded of a run."""
+        name, advice = f"the record of {run_id} in {self._path}", "run the experiment again in another folder"
+        row: dict[str, Any] = parse_json(text, name, dict[str, Any], error=RunFolderError, advice=advice)
+        return row
 
     def _update(self, claim: Claim, changes: str, values: tuple[Any, ...]) -> bool:
         with self._transaction() as connection:
@@ -277,6 +283,8 @@ class ResultStore:
                 f"{self._path} cannot be read or written ({error}); expected a store of results on a disk with room "
                 "and file locks"
             ) from error
+        except sqlite3.DatabaseError as error:
+            raise RunFolderError(f"{self._path} is no store of results ({error}); choose another folder") from error
         finally:
             connection.close()  # rolls back what was not committed
 

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 
 from lapgs_plugin import __version__
 from lapgs_plugin.environment import versions
-from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.errors import LapgsError, printable
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 
@@ -77,7 +77,10 @@ def work(
 
 
 class RunFailedError(LapgsError):
-    """A command of a run ended badly; the message has the end of its log."""
+    """A command of a run ended badly; the message has the end of its log, in lines of their own."""
+
+    def __init__(self, message: str) -> None:
+        Exception.__init__(self, "\n".join(printable(line) for line in message.split("\n")))
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:

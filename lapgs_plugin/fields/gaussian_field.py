@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError
+from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import atomic_write
 
 SIGNED_COMMENT = "lapgs_signed 1"
@@ -198,17 +199,14 @@ def _naming_file(path: Path) -> Iterator[None]:
         yield
     except FieldError as error:
         raise FieldError(f"{path}: {error}") from error
-    except PlyElementParseError as error:
-        at = "" if error.row is None else f" after {error.row} of {error.element.count} Gaussians"
-        raise FieldError(f"{path} is cut short or damaged{at} ({error.message}); expected a whole PLY file") from error
-    except (PlyParseError, UnicodeDecodeError) as error:
-        raise FieldError(f"{path} is not a PLY file ({error}); expected one written by a 3DGS trainer") from error
+    except ValueError as error:  # of `read_ply`
+        raise FieldError(f"{path}: {error}; expected a whole PLY file written by a 3DGS trainer") from error
     except OSError as error:
         raise FieldError(f"{path} cannot be read: {error.strerror}; expected a PLY file") from error
 
 
 def _read_vertices(path: Path) -> tuple[PlyData, PlyElement]:
-    ply = PlyData.read(str(path))
+    ply = read_ply(path)
     if "vertex" not in ply:
         elements = ", ".join(element.name for element in ply.elements) or "none"
         raise FieldError(f"no element 'vertex', got {elements}; expected the PLY of a Gaussian field")
@@ -217,7 +215,7 @@ def _read_vertices(path: Path) -> tuple[PlyData, PlyElement]:
 
 def _sh_degree(vertices: PlyElement) -> int:
     """SH degree of the properties, after checking that a whole set is there."""
-    scalars = {p.name for p in vertices.properties if not isinstance(p, PlyListProperty)}
+    scalars = scalar_names(vertices)
     rest = sum(name.startswith("f_rest_") for name in scalars)
     degree = SH_REST_COUNTS.index(rest) if rest in SH_REST_COUNTS else 3
     names = property_names(degree)

@@ -12,6 +12,9 @@ from lapgs_plugin.errors import UserInputError
 MIN_LEVEL_SIDE = 16
 """Smallest side, in pixels, of a level that is trained: SSIM's window is 11 wide, and a tile 16."""
 
+MOST_LEVELS = 24
+"""Images of a hierarchy with more would have over a hundred million pixels a side."""
+
 DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
     1: (Fraction(1),),
     2: (Fraction(1, 2), Fraction(1, 2)),

@@ -10,14 +10,55 @@ from typing import Any
 
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.patching.tokens import occurrences, tokenize
+from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+if sys.version_info >= (3, 12):
+    from typing import NotRequired, TypedDict
+else:  # pydantic cannot read the older TypedDict of `typing`
+    from typing_extensions import NotRequired, TypedDict
 
-_REQUIRED = {"name", "title", "present"}
-_OPTIONAL = {"extends", "absent", "reinstall", "opt_in", "edit", "check"}
+
+class _Place(TypedDict):
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    file: str
+    find: NotRequired[str]
+    function: NotRequired[str]
+
+
+class _EditEntry(TypedDict):
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    set: str
+    name: str
+    file: str
+    find: str
+    function: NotRequired[str]
+    unless: NotRequired[list[str]]
+    before: NotRequired[str]
+    replace: NotRequired[str]
+
+
+class _CheckEntry(TypedDict):
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    set: str
+    find: str
+    times: int
+    because: str
+    places: list[_Place]
+
+
+class _File(TypedDict):
+    """A whole file; patches/README.md says what its entries are."""
+
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    name: str
+    title: str
+    present: list[_Place]
+    absent: NotRequired[list[_Place]]
+    extends: NotRequired[str]
+    reinstall: NotRequired[str]
+    opt_in: NotRequired[list[str]]
+    edit: NotRequired[list[_EditEntry]]
+    check: NotRequired[list[_CheckEntry]]
 
 
 @dataclass(frozen=True)
@@ -161,25 +202,23 @@ def _stands(anchor: Anchor, folder: Path) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise PatchError(f"{path}: not readable as TOML: {error}") from error
-    missing, unknown = _REQUIRED - table.keys(), table.keys() - _REQUIRED - _OPTIONAL
-    if missing or unknown or table["name"] != path.stem:
-        raise PatchError(
-            f"{path}: expected the keys {sorted(_REQUIRED)} and any of {sorted(_OPTIONAL)}, and a name equal to the "
-            f"file's, got {sorted(table)}"
-        )
+    table: dict[str, Any] = read_toml(path, _File, error=PatchError, advice="patches/README.md says what it holds")
+    if table["name"] != path.stem:
+        raise PatchError(f"{path}: its name is {shortened(table['name'])}, expected that of the file; correct it")
     return table
 
 
-def _recipe(name: str, tables: dict[str, dict[str, Any]]) -> Recipe:
+def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...] = ()) -> Recipe:
+    """One recipe with what it inherits; `heirs` are those that inherit from it."""
     table = tables[name]
     parent = table.get("extends")
+    if parent in (name, *heirs):
+        raise PatchError(
+            f"patches/{name}.toml: extends {shortened(parent)}, which extends it; expected one without a circle"
+        )
     if parent is not None and parent not in tables:
-        raise PatchError(f"patches/{name}.toml: extends {parent!r}, expected one of {sorted(tables)}")
-    base = _recipe(parent, tables) if parent is not None else Recipe(name, "", (), (), "", (), ())
+        raise PatchError(f"patches/{name}.toml: extends {shortened(parent)}, expected one of {sorted(tables)}")
+    base = _recipe(parent, tables, (name, *heirs)) if parent is not None else Recipe(name, "", (), (), "", (), ())
     try:
         return replace(
             base,
@@ -215,7 +254,7 @@ def _edit(item: dict[str, Any]) -> Edit:
     if not put.isascii():
         raise ValueError(f"edit {item['name']!r}: expected ASCII, the same in every encoding a source may have")
     unless = item.get("unless", [])
-    if not (isinstance(unless, list) and all(isinstance(text, str) and text.startswith("#") for text in unless)):
+    if not all(text.startswith("#") for text in unless):
         raise ValueError(f"edit {item['name']!r}: unless = {unless!r}, expected a list of directives that start with #")
     return Edit(item["set"], item["name"], anchor, put, kind == "replace", tuple(unless))
 

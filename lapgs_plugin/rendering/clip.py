@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.images import around_grey
@@ -34,12 +35,13 @@ def parse_size(text: str) -> tuple[int, int]:
     Raises:
         UserInputError: it is not of that form, or out of range.
     """
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
     size = (int(found[1]), int(found[2])) if found else (0, 0)
     if not all(MIN_SIDE <= side <= MAX_SIDE for side in size):
         raise UserInputError(
             f"--size {text}: expected WIDTHxHEIGHT in pixels, each from {MIN_SIDE} to {MAX_SIDE}, such as 1280x720"
         )
+    VIEW_PIXELS.check(size[0] * size[1], f"--size {text} is {size[0] * size[1]:,} pixels", "choose a smaller one")
     return size
 
 

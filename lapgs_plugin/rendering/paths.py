@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
@@ -26,9 +27,11 @@ def path_cameras(
         scene: where the run's scene is now; None where it was trained.
 
     Raises:
-        UserInputError: the file or one of its cameras is not usable.
+        UserInputError: the file or one of its cameras is not usable, or there are more frames than `limits.FRAMES`.
         RunFolderError, SceneError: the scene is not there or not the run's.
     """
+    if frames is not None:
+        FRAMES.check(frames, f"--frames {frames}")
     if trajectory not in PATHS:
         cameras = read_trajectory(Path(trajectory))
         return cameras if frames is None else spline(cameras, frames)

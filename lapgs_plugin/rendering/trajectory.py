@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +16,10 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.limits import FRAMES, VIEW_PIXELS
 from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
+from lapgs_plugin.scenes.source import LARGEST, LONGEST_FOCAL, LONGEST_SIDE
+from lapgs_plugin.untrusted import read_json
 
 MAX_KEYS = 24
 """Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
@@ -112,29 +114,25 @@ def read_trajectory(path: Path) -> list[Camera]:
     Raises:
         UserInputError: the file or one of its cameras is not usable; names the frame.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserInputError(
-            f"--trajectory {path}: cannot be read ({error.strerror}); expected orbit, spline or a JSON file of cameras"
-        ) from error
-    except ValueError as error:
-        raise UserInputError(
-            f"--trajectory {path}: not JSON ({error}); expected cameras as in transforms.json"
-        ) from error
+    advice = "give orbit, spline or a JSON file of cameras as in transforms.json"
+    values = read_json(path, advice=advice, finite=False)
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserInputError(f'--trajectory {path}: no cameras in it, expected a list "frames" as in transforms.json')
+    FRAMES.check(len(frames), f"--trajectory {path} has {len(frames)} frames")
     cameras = []
     for index, frame in enumerate(frames):
         try:
-            cameras.append(_read_camera({**values, **frame}))
+            camera = _read_camera({**values, **frame})
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise UserInputError(
                 f"--trajectory {path}: the camera of frame {index} is not usable: {reason}; expected a rigid 4x4 "
                 "transform_matrix, w, h and fl_x or camera_angle_x"
             ) from error
+        subject = f"--trajectory {path}: the camera of frame {index} has {camera.width}x{camera.height} pixels"
+        VIEW_PIXELS.check(camera.width * camera.height, subject, "write a smaller w and h")
+        cameras.append(camera)
     return cameras
 
 
@@ -201,12 +199,18 @@ def _read_camera(values: dict[str, Any]) -> Camera:
         raise ValueError(f"transform_matrix has shape {matrix.shape}")
     if not np.isfinite([*matrix.ravel(), focal, focal_y, cx, cy]).all():
         raise ValueError("NaN or inf in it")
+    if (largest := float(np.abs(matrix).max())) > LARGEST:
+        raise ValueError(f"{largest:g} in transform_matrix, at most {LARGEST:g} is of use")
     rotation = matrix[:3, :3]
     off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
     if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError("transform_matrix is not a rotation and a translation")
     if min(width, height, focal, focal_y) <= 0:
         raise ValueError(f"{width}x{height} pixels with focal lengths {focal:g} and {focal_y:g}")
+    if max(width, height) > LONGEST_SIDE or max(focal, focal_y, abs(cx), abs(cy)) > LONGEST_FOCAL * max(width, height):
+        raise ValueError(
+            f"{width:.6g}x{height:.6g} pixels with focal lengths {focal:g} and {focal_y:g} around ({cx:g}, {cy:g})"
+        )
     pose = torch.from_numpy(np.linalg.inv(matrix @ OPENGL_AXES)).float()
     return Camera(width, height, focal, focal_y, cx, cy, pose)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 
+from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 from lapgs_plugin.files import atomic_write, one_line_errors
 from lapgs_plugin.hierarchy.plan import Hierarchy
@@ -30,7 +31,8 @@ from lapgs_plugin.reports.charts import (
 )
 from lapgs_plugin.reports.comparison import Metrics, comparison_rows, unlike
 from lapgs_plugin.reports.pictures import Strip, make_strip
-from lapgs_plugin.runs.archive import REPORT, RunArchive
+from lapgs_plugin.runs.archive import METRICS, REPORT, RunArchive
+from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"
 MINUTES_FROM = 300.0
@@ -307,6 +309,11 @@ def view_strips(
     with one_pool():
         scene = run_scene(run.archive, moved_to)
         views = {view.name: view for view in (*scene.train, *scene.test)}
+        if unknown := sorted(shown.keys() - views.keys()):
+            raise RunFolderError(
+                f"{run.archive.path(METRICS)} measures the view {shortened(unknown[0])}, which {scene.path} does not "
+                "have; write it again with `lapgs eval`"
+            )
         with item_progress("views") as progress:
             return [
                 make_strip(views[name], why, figures[name], renderers)
@@ -333,7 +340,9 @@ def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
     keys = {"psnr": "PSNR (dB)", "ssim": "SSIM"}
     keys |= {
-        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})" for name in VARIANTS if LPIPS_KEY.format(name) in views[0]
+        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})"
+        for name in VARIANTS
+        if all(LPIPS_KEY.format(name) in view for view in views)
     }
     others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]
     rows = []

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.level_views import PrefetchingViews
-from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, RunFolderError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.inheritance import inherit
@@ -283,6 +283,11 @@ class ActiveStage:
         left: dict[str, Any] = {"carried": {}, "moments": {}}
         if self._archive.path(f"level_{self.stage.level}", OPTIMIZER).exists():
             left = self._archive.optimizer_state(self.stage.level)
+            if not all(isinstance(left.get(part), dict) for part in ("carried", "moments")):
+                raise RunFolderError(
+                    f"{self._archive.path(f'level_{self.stage.level}', OPTIMIZER)} holds {', '.join(map(str, left))}, "
+                    "expected carried and moments; start again with --overwrite"
+                )
         carried = {
             name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
             for name, value in left["carried"].items()

@@ -15,12 +15,12 @@ its own (`pyramid.MIXED_GRID`).
 from __future__ import annotations
 
 import ast
-import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.adapters.registry import adapters
@@ -32,11 +32,45 @@ from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.compose import CLAMPED
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import LevelRecord, Manifest, PathText, RunArchive, SceneReference, read_bare_record
 from lapgs_plugin.scenes import smallest_size
+from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked, read_json, read_text
+
+if sys.version_info >= (3, 12):
+    from typing import NotRequired, TypedDict
+else:  # pydantic cannot read the older TypedDict of `typing`
+    from typing_extensions import NotRequired, TypedDict
 
 CFG_ARGS, TRAIN_INFO, BREAKDOWN = "cfg_args", "TRAIN_INFO", "runtime_breakdown.json"
-REQUIRED_OPTIONS = ("source_path", "resolution", "sh_degree", "eval")
+COPY = "copy it again"
+
+
+class Options(TypedDict):
+    """What is looked up in cfg_args; codebases keep more there."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    source_path: PathText
+    resolution: int
+    sh_degree: Literal[0, 1, 2, 3]
+    eval: bool
+    white_background: NotRequired[bool]
+    train_test_exp: NotRequired[bool]
+    images: NotRequired[PathText | None]
+
+
+class BreakdownOptions(TypedDict):
+    """What is looked up in the options of a breakdown."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    blur_up: NotRequired[bool]
+
+
+class BreakdownFile(TypedDict):
+    """What is looked up in `BREAKDOWN`."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    config: NotRequired[BreakdownOptions]
+    backbone: NotRequired[str | None]
 
 
 @dataclass(frozen=True)
@@ -115,7 +149,10 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
             f"{folder} holds {found}, expected point_cloud/, or L<n>/point_cloud/ of the coarsest level and of those "
             "below it without gaps; give the folder that training wrote with -m"
         )
-    breakdown = _read_json(folder / BREAKDOWN)
+    breakdown: dict[str, Any] = {}
+    if _is_file(folder / BREAKDOWN):
+        advice = f"{COPY} or remove it"
+        breakdown = read_json(folder / BREAKDOWN, BreakdownFile, error=RunFolderError, advice=advice, finite=False)
     if trained[expected[0]] != folder and options.get("white_background"):
         raise RunFolderError(
             f"{folder} was trained with --white_background, which the release adds again with every residual; "
@@ -124,7 +161,8 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
     if breakdown.get("config", {}).get("blur_up") is False:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
-    record = _read_json(folder / BARE_RECORD) if levels[0].ply.is_relative_to(folder / "point_cloud") else {}
+    is_single = levels[0].ply.is_relative_to(folder / "point_cloud")
+    record = read_bare_record(folder / BARE_RECORD) if is_single and _is_file(folder / BARE_RECORD) else {}
     return ForeignRun(folder, options, levels, _recognised(options, breakdown), record)
 
 
@@ -134,12 +172,11 @@ def read_cfg_args(path: Path) -> dict[str, Any]:
     Raises:
         RunFolderError: it is missing or something else, or lacks an option.
     """
-    with one_line_errors(path, "read"):
-        text = path.read_text(encoding="utf-8") if path.is_file() else None
-    if text is None:
+    if not _is_file(path):
         raise RunFolderError(
             f"{path} does not exist; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
         )
+    text = read_text(path, error=RunFolderError, advice=COPY)
     try:
         call = ast.parse(text.strip(), mode="eval").body
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
@@ -149,12 +186,10 @@ def read_cfg_args(path: Path) -> dict[str, Any]:
         options = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise RunFolderError(
-            f"{path} is not readable ({error}), expected Namespace(name=value, ...); copy it again"
+            f"{path} is not readable ({error}), expected Namespace(name=value, ...); {COPY}"
         ) from error
-    missing = [name for name in REQUIRED_OPTIONS if name not in options]
-    if missing:
-        raise RunFolderError(f"{path} lacks {', '.join(missing)}; expected the options of a 3DGS codebase")
-    return options
+    looked_up = {name: options[name] for name in Options.__annotations__ if name in options}
+    return {**options, **checked(looked_up, Options, str(path), error=RunFolderError, advice=COPY)}
 
 
 def import_run(
@@ -193,7 +228,11 @@ def import_run(
     backbone = known[name]
     RunArchive.require_room(out, overwrite)
     manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
-    size = smallest_size(manifest.scene.path, resolution=manifest.scene.resolution, images=manifest.scene.images)
+    scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
+    try:
+        size = smallest_size(manifest.scene.path, **scene_options)
+    except UserInputError as error:  # of what cfg_args says, more often than of the scene
+        raise type(error)(f"{run.folder / CFG_ARGS}: {error}") from error
     fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0
@@ -236,7 +275,7 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
     saved = {
         int(path.parent.name.removeprefix("iteration_")): path
         for path in (place / "point_cloud").glob("iteration_*/point_cloud.ply")
-        if re.fullmatch(r"iteration_[0-9]{1,9}", path.parent.name)
+        if re.fullmatch(r"iteration_0*[1-9][0-9]{0,8}", path.parent.name)
     }
     chosen = max(saved, default=None) if iteration is None else iteration
     if chosen is None or chosen not in saved:
@@ -265,16 +304,9 @@ def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str
     return noted if noted in known else None
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """A JSON object, empty when there is no file."""
-    if not path.is_file():
-        return {}
-    try:
-        with one_line_errors(path, "read"):
-            values = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RunFolderError(f"{path} is not JSON ({error}); copy it again or remove it") from error
-    return values if isinstance(values, dict) else {}
+def _is_file(path: Path) -> bool:
+    with one_line_errors(path, "read"):
+        return path.is_file()
 
 
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:

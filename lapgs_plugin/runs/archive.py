@@ -20,15 +20,19 @@ level that is not listed count for nothing.
 from __future__ import annotations
 
 import json
+import logging
 import shutil
+import sys
+import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, ClassVar, Literal
 
 import torch
+from pydantic import AfterValidator, Field, GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
@@ -43,8 +47,16 @@ from lapgs_plugin.files import (
     one_line_errors,
     require_manifest,
 )
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Stage
 from lapgs_plugin.runs.overhead import Overhead
+from lapgs_plugin.untrusted import STRICT, STRICT_WITH_MORE, checked, read_json, read_json_lines, shortened, usable_path
+
+if sys.version_info >= (3, 12):
+    from typing import NotRequired, TypedDict
+else:  # pydantic cannot read the older TypedDict of `typing`
+    from typing_extensions import NotRequired, TypedDict
+
+logger = logging.getLogger(__name__)
 
 FORMAT_VERSION = 1
 
@@ -53,6 +65,140 @@ RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """Of a finished level's field as it was trained along with a finer one, until it is in its place."""
+
+PathText = Annotated[str, AfterValidator(usable_path)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Name = Annotated[str, Field(max_length=200)]
+
+
+def _peak_and_images(values: dict[str, int]) -> dict[str, int]:
+    """Check bytes of memory: none, or those that `PeakMemory` notes."""
+    if values and values.keys() != {"peak", "images"}:
+        raise ValueError(f"{shortened(sorted(values))} are counted, expected peak and images, or nothing")
+    return values
+
+
+MemoryBytes = Annotated[dict[str, NonNegativeInt], AfterValidator(_peak_and_images)]
+Settings = Annotated[dict[str, Any], GetPydanticSchema(lambda _source, schema: schema(KnownSettings))]
+
+
+class KnownSettings(TypedDict):
+    """What this package itself looks up in a manifest's settings; training programs keep more there.
+
+    `training.settings` checks all of them before it continues a run.
+    """
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    iterations: NotRequired[PositiveInt]
+    hierarchy: NotRequired[Literal["nested", "laplacian"]]
+    clamped: NotRequired[bool]
+    raster: NotRequired[dict[str, bool | int | float | None]]
+
+
+class HistoryEntry(TypedDict):
+    """A line of the history, of which all but the first two are there where they were measured."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    level: NonNegativeInt
+    iteration: NonNegativeInt
+    elapsed: NotRequired[NonNegativeFloat]
+    loss: NotRequired[float]
+    psnr: NotRequired[float]
+    ssim: NotRequired[float]
+    num_gaussians: NotRequired[NonNegativeInt]
+
+
+class MetricsOfView(TypedDict):
+    """One view in `Metrics`; further figures are distances."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    name: str
+    psnr: float
+    ssim: float
+    lpips_vgg: NotRequired[float]
+    lpips_alex: NotRequired[float]
+    lpips_squeeze: NotRequired[float]
+    lpips_vgg_3dgs: NotRequired[float]
+
+
+class MetricsOfLevel(TypedDict):
+    """One level in `Metrics`."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    psnr: float
+    upsampled_psnr: float
+    iterations: PositiveInt
+    image_size: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
+    train_seconds: NonNegativeFloat
+    num_gaussians: NonNegativeInt
+    mean_gaussians: NonNegativeFloat | None
+    peak_gaussians: NonNegativeInt
+    breakdown_seconds: dict[str, NonNegativeFloat]
+    memory_bytes: MemoryBytes
+
+
+class Metrics(TypedDict):
+    """What `evaluation.figures.run_figures` measures, as far as it is there."""
+
+    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+    psnr: NotRequired[float]
+    ssim: NotRequired[float]
+    lpips_vgg: NotRequired[float]
+    lpips_alex: NotRequired[float]
+    lpips_squeeze: NotRequired[float]
+    lpips_vgg_3dgs: NotRequired[float]
+    lpips_missing: NotRequired[dict[str, str]]
+    fps: NotRequired[NonNegativeFloat]
+    split: NotRequired[Literal["test", "train"]]
+    num_views: NotRequired[NonNegativeInt]
+    views: NotRequired[list[MetricsOfView]]
+    levels: NotRequired[dict[str, MetricsOfLevel]]
+    train_seconds: NotRequired[NonNegativeFloat]
+    overhead_seconds: NotRequired[dict[str, NonNegativeFloat]]
+    breakdown_seconds: NotRequired[dict[str, NonNegativeFloat]]
+    num_gaussians: NotRequired[dict[str, NonNegativeInt]]
+    weighted_gaussians: NotRequired[NonNegativeFloat]
+    mean_gaussians: NotRequired[NonNegativeFloat | None]
+    peak_gaussians: NotRequired[NonNegativeInt]
+    peak_memory_bytes: NotRequired[NonNegativeInt | None]
+    peak_memory_without_images_bytes: NotRequired[int | None]
+    rasterizer: NotRequired[str]
+    versions: NotRequired[dict[str, str]]
+
+
+class Timeline(TypedDict):
+    """A moment of a `BareRecord`."""
+
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    iteration: NonNegativeInt
+    elapsed: NonNegativeFloat
+    num_gaussians: NonNegativeInt
+
+
+class BareRecord(TypedDict):
+    """What `lapgs run --off --record` notes of a script's own run, see `adapters.witness`."""
+
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+    iterations: PositiveInt
+    train_seconds: NonNegativeFloat
+    saving_seconds: NonNegativeFloat
+    num_gaussians: NonNegativeInt
+    peak_gaussians: NonNegativeInt
+    mean_gaussians: NonNegativeFloat
+    memory_bytes: MemoryBytes
+    psnr: NotRequired[float]
+    ssim: NotRequired[float]
+    timeline: list[Timeline]
+
+
+def read_bare_record(path: Path) -> dict[str, Any]:
+    """What is noted in a `BARE_RECORD`.
+
+    Raises:
+        RunFolderError: it cannot be read, or is damaged.
+    """
+    advice = "record the run again, with `lapgs run --off --record`"
+    return dict(read_json(path, BareRecord, error=RunFolderError, advice=advice))
 
 
 @dataclass(frozen=True)
@@ -68,12 +214,14 @@ class SceneReference:
         images: name of the image folder in a COLMAP scene.
     """
 
-    path: str
-    resolution: str
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    path: PathText
+    resolution: Name
     eval: bool
-    background: tuple[float, float, float]
-    kind: str
-    images: str = "images"
+    background: tuple[Share, Share, Share]
+    kind: Name
+    images: PathText = "images"
 
 
 @dataclass(frozen=True)
@@ -95,17 +243,19 @@ class LevelRecord:
         breakdown_seconds: of the optimization by part of an iteration (`breakdown.PARTS`); empty when not measured.
     """
 
-    level: int
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    level: NonNegativeInt
     signed: bool
-    iterations: int
-    num_gaussians: int
-    peak_gaussians: int
-    train_seconds: float
-    overhead_seconds: dict[str, float]
-    image_size: tuple[int, int]
-    memory_bytes: dict[str, int] = field(default_factory=dict)
-    mean_gaussians: float | None = None
-    breakdown_seconds: dict[str, float] = field(default_factory=dict)
+    iterations: PositiveInt
+    num_gaussians: NonNegativeInt
+    peak_gaussians: NonNegativeInt
+    train_seconds: NonNegativeFloat
+    overhead_seconds: dict[str, NonNegativeFloat]
+    image_size: tuple[PositiveInt, PositiveInt]
+    memory_bytes: MemoryBytes = field(default_factory=dict)
+    mean_gaussians: NonNegativeFloat | None = None
+    breakdown_seconds: dict[str, NonNegativeFloat] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:
@@ -133,28 +283,35 @@ class Manifest:
         format_version: of the run folder.
 
     Raises:
-        UserInputError: the records are not the first of the levels L-1, ..., 0.
+        UserInputError: there are no levels or too many, or the records are not the first of the levels L-1, ..., 0.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     scene: SceneReference
     levels: int
-    grid: str
-    supervision: str
-    inherit: str
-    sh_degree: int
-    rasterizer: str
-    seed: int
-    settings: dict[str, Any]
-    records: tuple[LevelRecord, ...] = ()
-    created_by: str = f"lapgs_plugin {__version__}"
-    created: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    grid: Name
+    supervision: Name
+    inherit: Name
+    sh_degree: Annotated[int, Field(ge=0, le=3)]
+    rasterizer: Name
+    seed: NonNegativeInt
+    settings: Settings
+    records: Annotated[tuple[LevelRecord, ...], Field(max_length=MOST_LEVELS)] = ()
+    created_by: Name = f"lapgs_plugin {__version__}"
+    created: Name = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
     format_version: int = FORMAT_VERSION
 
     def __post_init__(self) -> None:
+        if not 1 <= self.levels <= MOST_LEVELS:
+            raise UserInputError(f"levels is {shortened(self.levels)}, expected 1 to {MOST_LEVELS}")
         finished = [record.level for record in self.records]
         expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
         if finished != expected:
-            raise UserInputError(f"finished levels {finished}, expected {expected} of {self.levels}, coarsest first")
+            raise UserInputError(
+                f"finished levels {shortened(finished)}, expected {shortened(expected)} of {self.levels}, coarsest "
+                "first"
+            )
 
     @classmethod
     def of_loop(
@@ -203,32 +360,28 @@ class Manifest:
         )
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Manifest:
-        """The inverse of `dataclasses.asdict`, after a round trip through JSON.
+    def from_json(cls, values: dict[str, Any], name: str = "the manifest") -> Manifest:
+        """The inverse of `dataclasses.asdict`, also after a round trip through JSON.
+
+        Args:
+            values: by field.
+            name: how messages call where they come from.
 
         Raises:
-            UserInputError: something is missing, unknown or inconsistent; names it.
+            RunFolderError: something is missing, unknown, of another type or inconsistent; names it.
         """
-        values = _only_fields(cls, values)
-        scene = _only_fields(SceneReference, values["scene"])
-        scene["background"] = tuple(scene["background"])
-        # Runs of the first weeks know neither their memory nor what else was recorded later.
-        later: dict[str, Any] = {"memory_bytes": {}, "mean_gaussians": None, "breakdown_seconds": {}}
-        records = [_only_fields(LevelRecord, {**later, **record}) for record in values["records"]]
-        values["scene"] = SceneReference(**scene)
-        values["records"] = tuple(LevelRecord(**{**r, "image_size": tuple(r["image_size"])}) for r in records)
-        return cls(**values)
+        advice = "restore it or train again with --overwrite"
+        manifest: Manifest = checked(_as_json(values), cls, name, error=RunFolderError, advice=advice)
+        if lacking := sorted({f.name for f in fields(cls)} - values.keys()):
+            raise RunFolderError(f"{name} is damaged: it lacks {', '.join(lacking)}; {advice}")
+        return manifest
 
 
-def _only_fields(kind: type[Any], values: Any) -> dict[str, Any]:
-    """`values` as keyword arguments of the dataclass `kind`, after checking that they are exactly its fields."""
-    expected = {f.name for f in fields(kind)}
-    given = set(values) if isinstance(values, dict) else set()
-    problems = [f"lacks {', '.join(sorted(expected - given))}"] * bool(expected - given)
-    problems += [f"has unknown {', '.join(sorted(given - expected))}"] * bool(given - expected)
-    if problems:
-        raise UserInputError(f"{kind.__name__} {' and '.join(problems)}")
-    return dict(values)
+def _as_json(value: Any) -> Any:
+    """With lists instead of tuples, as JSON has them."""
+    if isinstance(value, dict):
+        return {key: _as_json(inner) for key, inner in value.items()}
+    return [_as_json(inner) for inner in value] if isinstance(value, (list, tuple)) else value
 
 
 class RunArchive:
@@ -256,10 +409,11 @@ class RunArchive:
 
         Raises:
             RunFolderError: there is a run and `overwrite` is not given, the folder holds something else, another
-                process is writing to it, or it cannot be written.
+                process is writing to it, it cannot be written, or the manifest holds what cannot be read again.
         """
         assert not manifest.records, "a new run has no finished level"
         folder = Path(path).absolute()
+        Manifest.from_json(asdict(manifest))  # what could not be read again is refused before it is trained
         cls.require_room(folder, overwrite)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -270,7 +424,7 @@ class RunArchive:
                 # Should this be interrupted, the folder is first the old run without its checkpoint, which the new one
                 # must never continue from, then an empty run; at no time a manifest without its fields.
                 archive.path(CHECKPOINT).unlink(missing_ok=True)
-                archive._write_json(MANIFEST, asdict(manifest))
+                archive._write_json(MANIFEST, asdict(manifest), training=True)
                 _remove_results(folder)
         except BaseException:
             archive.close()
@@ -285,8 +439,9 @@ class RunArchive:
             RunFolderError: as `create`, except for what only writing shows.
         """
         folder = Path(path).absolute()
-        if folder.exists() and not folder.is_dir():
-            raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
+        with one_line_errors(folder, "read"):
+            if folder.exists() and not folder.is_dir():
+                raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
         if _is_run(folder):
             if not overwrite:
                 raise RunFolderError(
@@ -294,7 +449,8 @@ class RunArchive:
                     "it with --overwrite"
                 )
             return
-        entries = list(folder.iterdir()) if folder.exists() else []
+        with one_line_errors(folder, "read"):
+            entries = list(folder.iterdir()) if folder.exists() else []
         # A run that was killed before its first manifest leaves these two.
         strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
         if strangers:
@@ -365,7 +521,7 @@ class RunArchive:
     def field_path(self, level: int) -> Path:
         """The PLY of a level: the field as it was last trained with a level that is finished."""
         for later in reversed(self.available_levels):
-            if (waiting := self._waiting_path(level, later)).exists():
+            if _exists(waiting := self._waiting_path(level, later)):
                 return waiting
         return self._settled_path(level)
 
@@ -424,16 +580,16 @@ class RunArchive:
         with overhead.timed("archive"):
             for level, thawed in trained_along.items():
                 waiting = self._waiting_path(level, record.level)
-                with one_line_errors(waiting):
+                with one_line_errors(waiting, training=True):
                     thawed.save_ply(waiting)
-            with one_line_errors(path):
+            with one_line_errors(path, training=True):
                 path.parent.mkdir(exist_ok=True)
                 field.save_ply(path)
             if optimizer_state is not None:
                 self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
         manifest = replace(self._manifest, records=(*self._manifest.records, record))
-        self._write_json(MANIFEST, asdict(manifest))
+        self._write_json(MANIFEST, asdict(manifest), training=True)
         self._manifest = manifest
         self._settle_fields()
         with one_line_errors(self._folder):
@@ -458,7 +614,7 @@ class RunArchive:
             RunFolderError: there is none, or it cannot be read.
         """
         path = self.path(f"level_{level}", OPTIMIZER)
-        if not path.exists():
+        if not _exists(path):
             raise RunFolderError(
                 f"{path} does not exist, and the next level goes on with it; start again with --overwrite"
             )
@@ -469,28 +625,18 @@ class RunArchive:
         self._require_lock()
         assert {"level", "iteration"} <= entry.keys(), "a history entry says where in the run it belongs"
         line = json.dumps(entry, allow_nan=False) + "\n"
-        with one_line_errors(self.path(HISTORY)), self.path(HISTORY).open("a", encoding="utf-8") as stream:
+        path = self.path(HISTORY)
+        with one_line_errors(path, training=True), path.open("a", encoding="utf-8") as stream:
             stream.write(line)
 
     def history(self) -> list[dict[str, Any]]:
         """All entries in the order they were added. A last line torn by a crash is left out.
 
         Raises:
-            RunFolderError: another line is not JSON.
+            RunFolderError: another line is damaged.
         """
         path = self.path(HISTORY)
-        if not path.exists():
-            return []
-        with one_line_errors(path, "read"):
-            # What follows the last line break was being written when the run was killed.
-            *lines, _torn = path.read_text(encoding="utf-8").split("\n")
-        entries = []
-        for number, line in enumerate(lines, start=1):
-            try:
-                entries.append(json.loads(line))
-            except json.JSONDecodeError as error:
-                raise RunFolderError(f"{path} line {number} is not JSON ({error.msg}); delete that line") from error
-        return entries
+        return read_json_lines(path, HistoryEntry, error=RunFolderError) if _exists(path) else []
 
     def rewind_history(self, level: int, iteration: int) -> None:
         """Drop the entries after an iteration of a level, which a resumed run will add again.
@@ -500,7 +646,8 @@ class RunArchive:
         self._require_lock()
         kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
         text = "".join(json.dumps(entry) + "\n" for entry in kept)
-        with one_line_errors(self.path(HISTORY)), atomic_write(self.path(HISTORY)) as stream:
+        path = self.path(HISTORY)
+        with one_line_errors(path, training=True), atomic_write(path) as stream:
             stream.write(text.encode())
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
@@ -515,10 +662,11 @@ class RunArchive:
         """The run's metrics, None when they were never measured.
 
         Raises:
-            RunFolderError: the file is not JSON.
+            RunFolderError: the file is damaged.
         """
         path = self.path(METRICS)
-        return _read_json(path) if path.exists() else None
+        advice = "write it again with `lapgs eval`"
+        return dict(read_json(path, Metrics, error=RunFolderError, advice=advice)) if _exists(path) else None
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint of the level in training: tensors, numbers, strings and containers of them."""
@@ -529,14 +677,24 @@ class RunArchive:
         """The latest checkpoint of the next level to train, its tensors on the CPU; None when there is none.
 
         Raises:
-            RunFolderError: it cannot be read.
+            RunFolderError: it cannot be read, or is of a level that is neither finished nor the next.
         """
         path = self.path(CHECKPOINT)
-        if not path.exists():
+        if not _exists(path):
             return None
-        saved = _read_tensors(path, "delete it to continue from the last finished level")
+        advice = "delete it to continue from the last finished level"
+        saved = _read_tensors(path, advice)
+        level, state = saved.get("level"), saved.get("state")
+        if type(level) is not int or not isinstance(state, dict):
+            found = f"level {shortened(level)} and a state that is a {type(state).__name__}"
+            raise RunFolderError(f"{path} holds {found}, expected a number and a dictionary; {advice}")
+        if level == self._manifest.next_level:
+            return state
+        if level not in self.available_levels:
+            raise RunFolderError(f"{path} is of level {level}, expected {self._manifest.next_level}; {advice}")
         # A run killed right after a level was finished leaves that level's checkpoint behind.
-        return saved["state"] if saved["level"] == self._manifest.next_level else None
+        logger.warning("%s is of level %d, which is finished: it is not used", path, level)
+        return None
 
     def _check_fields(self) -> None:
         for record in self._manifest.records:
@@ -551,7 +709,9 @@ class RunArchive:
 
     def _require_file(self, record: LevelRecord) -> None:
         path = self.field_path(record.level)
-        if not path.is_file():
+        with one_line_errors(path, "read"):
+            is_there = path.is_file()
+        if not is_there:
             raise RunFolderError(
                 f"level {record.level} of {self._folder} is missing: no {path.name}; train it again with --overwrite"
             )
@@ -563,13 +723,13 @@ class RunArchive:
                 f"{record.num_gaussians}; train it again with --overwrite"
             )
 
-    def _write_json(self, name: str, values: dict[str, Any]) -> None:
+    def _write_json(self, name: str, values: dict[str, Any], training: bool = False) -> None:
         text = json.dumps(values, indent=2, allow_nan=False) + "\n"
-        with one_line_errors(self.path(name)), atomic_write(self.path(name)) as stream:
+        with one_line_errors(self.path(name), training=training), atomic_write(self.path(name)) as stream:
             stream.write(text.encode())
 
     def _write_tensors(self, path: Path, state: dict[str, Any]) -> None:
-        with one_line_errors(path), atomic_write(path) as stream:
+        with one_line_errors(path, training=True), atomic_write(path) as stream:
             _torch_save(state, stream)
 
     def _require_lock(self) -> None:
@@ -599,42 +759,88 @@ def _torch_save(state: dict[str, Any], stream: BinaryIO) -> None:
         raise
 
 
+def _exists(path: Path) -> bool:
+    """Whether there is a file, in a folder that may be looked into.
+
+    Raises:
+        RunFolderError: it may not.
+    """
+    with one_line_errors(path, "read"):
+        return path.exists()
+
+
 def _read_tensors(path: Path, advice: str) -> dict[str, Any]:
+    """What `torch.save` wrote of a dictionary; tensors that are no more than the file holds.
+
+    Raises:
+        RunFolderError: it cannot be read, or would take more memory than it has bytes.
+    """
     try:
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        _require_stored(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, OSError, ... by damage
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
+    if not isinstance(state, dict):
+        raise RunFolderError(f"{path} holds a {type(state).__name__}, expected a dictionary; {advice}")
+    _require_held(state, path, advice)
     return state
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        with one_line_errors(path, "read"):
-            values = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        if isinstance(error, RunFolderError):
-            raise
-        raise RunFolderError(f"{path} is not readable as JSON ({error}); restore it or train again") from error
-    if not isinstance(values, dict):
-        raise RunFolderError(f"{path} holds a JSON {type(values).__name__}, expected an object; restore it")
-    return values
+def _require_stored(path: Path) -> None:
+    """Check that a zip file's contents are as long as it says and no longer than the file, as `torch.save` writes them.
+
+    Raises:
+        ValueError: they are packed or overlap, and would unpack to more than the file holds.
+        zipfile.BadZipFile, OSError: it is no zip file, or cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    size, held = path.stat().st_size, sum(entry.file_size for entry in entries)
+    if held > size or any(entry.file_size != entry.compress_size for entry in entries):
+        raise ValueError(f"it unpacks to {held:,} bytes, expected no more than its own {size:,}")
+
+
+def _require_held(state: dict[str, Any], path: Path, advice: str) -> None:
+    """Check that tensors are plain ones on the CPU and together no larger than their file.
+
+    A view can name more elements than there are in memory, which would be allocated as soon as it is copied.
+
+    Raises:
+        RunFolderError: they are not.
+    """
+    waiting: list[Any] = [state]
+    seen: set[int] = set()
+    held, size = 0, path.stat().st_size
+    while waiting:
+        each = waiting.pop()
+        if id(each) in seen:
+            continue
+        seen.add(id(each))
+        if isinstance(each, torch.Tensor):
+            if each.layout != torch.strided or each.device.type != "cpu" or each.is_quantized:
+                raise RunFolderError(f"{path} holds a {each.layout} tensor, expected dense ones; {advice}")
+            held += each.nelement() * each.element_size()
+        elif isinstance(each, dict):
+            waiting.extend(each.values())
+        elif isinstance(each, (list, tuple)):
+            waiting.extend(each)
+    if held > size:
+        raise RunFolderError(f"{path} names tensors of {held:,} bytes, expected at most its own {size:,}; {advice}")
 
 
 def _read_manifest(folder: Path) -> Manifest:
     require_manifest(folder)
     path = folder / MANIFEST
-    values = _read_json(path)
+    advice = "restore it or train again with --overwrite"
+    values = read_json(path, dict[str, Any], error=RunFolderError, advice=advice)
     version = values.get("format_version")
     if version != FORMAT_VERSION:
         raise RunFolderError(
-            f"{path} has format_version {version!r}, this version of lapgs reads {FORMAT_VERSION}; "
-            f"use the version that wrote it ({values.get('created_by', 'unknown')})"
+            f"{path} has format_version {shortened(version)}, this version of lapgs reads {FORMAT_VERSION}; "
+            f"use the version that wrote it ({shortened(values.get('created_by', 'unknown'))})"
         )
-    try:
-        return Manifest.from_json(values)
-    except (UserInputError, TypeError) as error:
-        raise RunFolderError(f"{path} is damaged: {error}; restore it or train again with --overwrite") from error
+    return Manifest.from_json(values, str(path))
 
 
 def _is_run(folder: Path) -> bool:
@@ -642,13 +848,14 @@ def _is_run(folder: Path) -> bool:
 
     One that cannot be read any more is ours where it lies beside a history.
     """
-    try:
-        values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except OSError:
-        return False
-    except ValueError:
-        return (folder / HISTORY).is_file()
-    return isinstance(values, dict) and "lapgs_plugin" in str(values.get("created_by"))
+    with one_line_errors(folder, "read"):
+        if not (folder / MANIFEST).is_file():
+            return False
+        try:
+            values = read_json(folder / MANIFEST, dict[str, Any])
+        except UserInputError:
+            return (folder / HISTORY).is_file()
+    return "lapgs_plugin" in str(values.get("created_by"))
 
 
 def _remove_results(folder: Path) -> None:

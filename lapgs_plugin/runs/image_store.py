@@ -311,7 +311,7 @@ class ImageStore:
         known = self._images.get(name)
         # Numbered, because view names may hold slashes or what a file system refuses.
         path = known.path if known and known.path else self._folder / f"{len(self._images):06d}.bin"
-        with one_line_errors(path):
+        with one_line_errors(path, training=True):
             self._folder.mkdir(parents=True, exist_ok=True)
             try:
                 path.write_bytes(_buffer(encoded.contiguous()))

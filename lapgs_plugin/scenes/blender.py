@@ -8,7 +8,6 @@ frame (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -17,12 +16,22 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.scenes.images import image_size
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out, in_name_order
+from lapgs_plugin.scenes.source import (
+    LARGEST,
+    UNDISTORT_HINT,
+    Frame,
+    SceneSource,
+    check_camera,
+    hold_out,
+    in_name_order,
+    is_file,
+)
+from lapgs_plugin.untrusted import read_json
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
@@ -33,6 +42,7 @@ PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 SHORTEST_FOCAL = 1e-3
 """Of a side of the image; shorter ones are of files that hold other units than radians."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
 RANDOM_POINTS = 100_000
@@ -47,7 +57,7 @@ Values = dict[str, Any]
 
 def has_transforms(path: Path) -> bool:
     """Whether the folder holds a transforms layout."""
-    return (path / TRAIN_FILE).is_file() or (path / SINGLE_FILE).is_file()
+    return is_file(path / TRAIN_FILE) or is_file(path / SINGLE_FILE)
 
 
 def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
@@ -65,7 +75,7 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
     Raises:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
-    if (path / TRAIN_FILE).is_file():
+    if is_file(path / TRAIN_FILE):
         values = _read_json(path / TRAIN_FILE)
         train, test = _read_pair(path, values, images, evaluate)
         radius = OBJECT_RADIUS
@@ -82,7 +92,7 @@ def _read_pair(
 ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     train = _read_frames(path, TRAIN_FILE, train_values, images)
     test: list[Frame] = []
-    if (path / TEST_FILE).is_file():
+    if is_file(path / TEST_FILE):
         test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images)
     elif evaluate:
         raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
@@ -90,10 +100,7 @@ def _read_pair(
 
 
 def _read_json(file: Path) -> Values:
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{file}: not readable as JSON ({error}); export the scene again") from error
+    values = read_json(file, error=SceneError, advice="export the scene again", finite=False)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
         raise SceneError(f"{file}: no list of frames in it, expected the transforms of NeRF, instant-ngp or nerfstudio")
     return values
@@ -107,9 +114,12 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
             raise SceneError(f"{where} has no file_path, expected the name of its image")
         image = _image_path(path, frame["file_path"], images)
         where = f"{where} ({frame['file_path']})"
+        if image.name in ("", "..") or image == Path(os.path.normpath(path)):
+            raise SceneError(f"{where} names a folder, expected the name of its image; export the scene again")
         camera = _camera({**values, **frame}, image, where, _world_to_camera(frame.get("transform_matrix"), where))
         inside = os.path.normpath(path)
         name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
+        check_camera(path / file, name, camera)
         frames.append(Frame(name, image, camera))
     return frames
 
@@ -119,20 +129,24 @@ def _image_path(path: Path, file_path: str, images: str) -> Path:
     image = Path(os.path.normpath(path / file_path.replace("\\", "/")))
     if images != "images":
         image = path / images / image.name
-    if image.is_file():
+    if is_file(image) or not image.name:
         return image
     candidates = [image.with_name(image.name + suffix) for suffix in IMAGE_SUFFIXES]
-    return next((candidate for candidate in candidates if candidate.is_file()), image)
+    return next((candidate for candidate in candidates if is_file(candidate)), image)
 
 
 def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
     """(4, 4) in OpenCV axes from a camera-to-world matrix in OpenGL axes, 4x4 or 3x4."""
     try:
         camera_to_world = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ArithmeticError):
         camera_to_world = np.empty(0)
     if camera_to_world.shape not in ((4, 4), (3, 4)) or not np.isfinite(camera_to_world).all():
         raise SceneError(f"{where} has no transform_matrix of 4x4 finite numbers; export the scene again")
+    if (largest := float(np.abs(camera_to_world).max())) > LARGEST:
+        raise SceneError(
+            f"{where} has {largest:g} in its transform_matrix, expected at most {LARGEST:g}; export the scene again"
+        )
     rotation, position = camera_to_world[:3, :3] * (1.0, -1.0, -1.0), camera_to_world[:3, 3]
     u, _, vt = np.linalg.svd(rotation)
     rigid = u @ vt  # the nearest rotation: JSON files round to few digits
@@ -165,7 +179,7 @@ def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np
     for focal, side in ((fx, width), (fy, height)):
         if 0.0 < focal < SHORTEST_FOCAL * side:
             raise SceneError(
-                f"{where} has a focal length of {focal:g} pixels for {side} of the image, expected more than a "
+                f"{where} has a focal length of {focal:g} pixels for {side:.6g} of the image, expected more than a "
                 "thousandth of them; export the scene again"
             )
     return Camera(width, height, fx, fy, cx, cy, torch.from_numpy(world_to_camera))
@@ -185,17 +199,24 @@ def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArr
     named = values.get("ply_file_path")
     if named is not None and not isinstance(named, str):
         raise SceneError(f"{path}: ply_file_path is {named!r}, expected the name of a file; export the scene again")
-    file = path / named if named else next((path / name for name in POINT_FILES if (path / name).is_file()), None)
+    file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
     if file is None:
         return None
     try:
-        vertices = PlyData.read(str(file))["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    except (OSError, KeyError, ValueError, PlyParseError) as error:
+        element = read_ply(file)["vertex"]
+    except (OSError, KeyError, ValueError) as error:
         raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+    vertices, channels = element.data, POINT_COLORS
+    lists = {prop.name for prop in element.properties} - scalar_names(element)
+    if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
+        raise SceneError(
+            f"{file}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number of "
+            "each point); export or remove it"
+        )
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if not set(channels) <= scalar_names(element):
         return points, np.full_like(points, 0.5)
-    colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
+    colors = np.stack([vertices[channel] for channel in channels], axis=1)
     return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
 
 

@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.scenes.colmap_binary import check_whole
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, hold_out
+from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
+from lapgs_plugin.scenes.colmap_text import check_text
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out, is_file, is_folder
 
 MODEL_FILES = ("cameras", "images", "points3D")
+
+UNIT_TOLERANCE = 1e-2
+"""How far a rotation's quaternion may be from length 1; COLMAP writes 17 digits."""
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras when all their distortion parameters are zero; fisheye models never are."""
@@ -27,7 +31,7 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 def find_model(path: Path) -> Path | None:
     """The folder below `path` that holds a COLMAP model, complete or not; None if there is none."""
     for folder in (path / "sparse" / "0", path / "sparse"):
-        if any((folder / f"{name}.{suffix}").is_file() for name in MODEL_FILES for suffix in ("bin", "txt")):
+        if any(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES for suffix in ("bin", "txt")):
             return folder
     return None
 
@@ -46,14 +50,14 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
     """
     reconstruction = _read_model(model)
     folder = path / images
-    if not folder.is_dir():
+    if not is_folder(folder):
         others = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
         hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
         raise SceneError(f"{folder}: no such folder of images; {hint}")
     posed = [image for image in reconstruction.images.values() if image.has_pose]
     used = sorted({image.camera_id for image in posed})
     cameras = {key: _intrinsics(reconstruction.cameras[key], model) for key in used}
-    frames = [Frame(image.name, folder / image.name, _with_pose(cameras[image.camera_id], image)) for image in posed]
+    frames = [_frame(model, folder, cameras[image.camera_id], image) for image in posed]
     points = [(point.xyz, point.color) for point in reconstruction.points3D.values()]
     if not points:
         raise SceneError(f"{model}: the model has no 3D points, expected the sparse points of a reconstruction")
@@ -69,7 +73,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
 
 def _read_model(model: Path) -> pycolmap.Reconstruction:
     suffix = next(
-        (s for s in ("bin", "txt") if all((model / f"{name}.{s}").is_file() for name in MODEL_FILES)),
+        (s for s in ("bin", "txt") if all(is_file(model / f"{name}.{s}") for name in MODEL_FILES)),
         None,
     )
     if suffix is None:
@@ -78,14 +82,14 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
             f"{model}: the sparse model is incomplete, it has only {found}; "
             "expected cameras, images and points3D, all as .bin or all as .txt"
         )
-    if suffix == "bin":
-        check_whole(model)
+    check_whole(model) if suffix == "bin" else check_text(model)
     try:
         return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
-        raise SceneError(
-            f"{model}: the sparse model cannot be read ({' '.join(str(error).split())}); copy or export it again"
-        ) from error
+        reason = (
+            disagreement(model) if suffix == "bin" else None
+        ) or f"its files do not agree: {' '.join(str(error).split())}"
+        raise SceneError(f"{model}: the sparse model cannot be read ({reason}); copy or export it again") from error
 
 
 def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
@@ -107,7 +111,23 @@ def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
     )
 
 
-def _with_pose(camera: Camera, image: pycolmap.Image) -> Camera:
+def _frame(model: Path, folder: Path, camera: Camera, image: pycolmap.Image) -> Frame:
+    try:
+        name = image.name
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{model}: the name of image {image.image_id} is {error.object!r}, expected UTF-8; rename it and "
+            "reconstruct again"
+        ) from error
     pose: NDArray[np.float64] = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()  # (3, 4)
-    return replace(camera, world_to_camera=torch.from_numpy(pose))
+    posed = replace(camera, world_to_camera=torch.from_numpy(pose))
+    check_camera(model, name, posed)
+    quaternion = image.cam_from_world().rotation.quat  # (4,) x, y, z, w
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > UNIT_TOLERANCE:
+        numbers = ", ".join(f"{number:g}" for number in quaternion)
+        raise SceneError(
+            f"{model}: the rotation of {name} is the quaternion ({numbers}), expected one of length 1; copy or export "
+            "the model again"
+        )
+    return Frame(name, folder / name, posed)

@@ -51,6 +51,35 @@ def _holds_all(data: bytes, record_end: Callable[[bytes, int], int]) -> bool:
     return True
 
 
+def disagreement(folder: Path) -> str | None:
+    """Say which ids of whole binary files do not fit together, for a model that pycolmap refuses; None if all do."""
+    cameras, images, points = (_records(folder / f"{name}.bin") for name in ("cameras", "images", "points3D"))
+    files = {"cameras": (cameras, "<I"), "images": (images, "<I"), "points3D": (points, "<Q")}
+    ids: dict[str, set[int]] = {}
+    for name, ((data, starts), kind) in files.items():
+        found = ids.setdefault(name, set())
+        for start in starts:
+            (key,) = struct.unpack_from(kind, data, start)
+            if key in found:
+                return f"{name}.bin holds id {key} twice, expected each once"
+            found.add(key)
+    data, starts = images
+    for start in starts:
+        image, camera = (int(struct.unpack_from("<I", data, start + at)[0]) for at in (0, 4 + POSE_BYTES))
+        if camera not in ids["cameras"]:
+            return f"image {image} of images.bin has camera {camera}, expected one of cameras.bin"
+    return None
+
+
+def _records(file: Path) -> tuple[bytes, list[int]]:
+    """A whole file, and where its records start."""
+    data = file.read_bytes()
+    starts = [COUNT.size]
+    for _ in range(COUNT.unpack_from(data)[0]):
+        starts.append(RECORD_ENDS[file.stem](data, starts[-1]))
+    return data, starts[:-1]
+
+
 def _camera_end(data: bytes, start: int) -> int:
     (model,) = struct.unpack_from("<i", data, start + 4)
     camera = pycolmap.Camera()

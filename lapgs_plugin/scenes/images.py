@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,61 +22,79 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.limits import PHOTO_PIXELS, PHOTO_SIDE
+from lapgs_plugin.scenes.source import is_file
 
 JPEG_QUALITY = 95
 PNG_LEVEL = 4
 """2.5 times as fast as zlib's default of 6, for files 4 % larger (fox, 1062x1894)."""
+Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own is below what phones have
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+LONGEST_NAME = 255
+"""Of a file, in bytes, on every common file system."""
+STRIP_VALUES = 1 << 23
+"""Of all channels in a strip of rows, which is what is in memory of a large image at full size in floating point."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file in pixels, from its header.
 
     Raises:
-        SceneError: the file is missing or no image.
+        SceneError: the file is missing, no image, or has more pixels than `limits.PHOTO_PIXELS`.
+    """
+    return _image_plane(path, _open(path))
+
+
+def check_image(path: Path) -> tuple[int, int]:
+    """Width and height of an image file in pixels, after decoding all of it a few rows at a time.
+
+    Raises:
+        SceneError: as `read_image`.
     """
     source = _open(path)
-    spec = source.spec()
-    return (spec.full_width, spec.full_height) if _has_display_window(source) else (spec.width, spec.height)
+    size = _image_plane(path, source)
+    for _ in _strips(path, source, size, (0.0, 0.0, 0.0)):
+        pass
+    return size
 
 
 def read_image(
-    path: Path, *, size: tuple[int, int] | None = None, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    path: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    clamp: bool = True,
 ) -> Tensor:
     """Read a JPEG, PNG, TIFF or EXR file of any bit depth as RGB.
 
     Grey becomes RGB, channels beyond colour and alpha are ignored, alpha is blended over `background` at full size.
+    The full image is never in memory in floating point, unless that is what is asked for.
 
     Args:
         path: the file.
         size: (width, height) to resize to; None keeps the file's. The filter's overshoot next to strong edges is
             clamped to [0, 1] for integer formats and kept for floating-point ones.
         background: RGB that shows through transparent pixels.
+        clamp: False keeps the overshoot for integer formats too, for images that are resampled again.
 
     Returns:
         (3, h, w) float32, contiguous.
 
     Raises:
-        SceneError: the file is missing, no image, cut short, or holds NaN or inf.
+        SceneError: the file is missing, no image, cut short, holds NaN or inf, or has more pixels than
+            `limits.PHOTO_PIXELS`.
     """
     source = _open(path)
-    spec = source.spec()
-    pixels = source.read_image(oiio.FLOAT)  # (h, w, channels)
-    # A JPEG that ends early is decoded into grey and reported only by the message left behind.
-    complaint = source.geterror()
-    if pixels is None or complaint:
-        raise SceneError(
-            f"{path}: the image is damaged or cut short ({_one_line(complaint)}), expected a whole file; copy it again"
-        )
-    if _has_display_window(source):
-        pixels = _in_display_window(pixels, spec)
-    image = torch.from_numpy(_blend(pixels, spec, background)).permute(2, 0, 1)
-    is_float = spec.format.basetype in FLOAT_FORMATS
-    if is_float and not bool(torch.isfinite(image).all()):
-        raise SceneError(f"{path}: the image holds NaN or inf, expected finite values; render or export it again")
-    if size is not None:
-        image = resize_image(image, size)
-        image = image if is_float else image.clamp(0.0, 1.0)
+    full_width, full_height = _image_plane(path, source)
+    width, height = size or (full_width, full_height)
+    # The filter is separable: first along each row, which strips of rows allow, then along columns.
+    narrowed = torch.empty(3, full_height, width)
+    for top, strip in _strips(path, source, (full_width, full_height), background):
+        rows = slice(top, top + strip.shape[1])
+        narrowed[:, rows] = resize_image(strip, (width, strip.shape[1]))
+    image = resize_image(narrowed, (width, height))
+    if clamp and size is not None and source.spec().format.basetype not in FLOAT_FORMATS:
+        image = image.clamp_(0.0, 1.0)
     return image.contiguous()
 
 
@@ -91,16 +111,13 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
         (3, h, w) float32, k / 255.
 
     Raises:
-        SceneError: the file is missing, no image, or cut short.
+        SceneError: the file is missing, no image, cut short, or has more pixels than `limits.PHOTO_PIXELS`.
     """
+    image_size(path)  # checks the limits
     try:
         with Image.open(path) as source:
-            picture: Image.Image = source if source.mode in ("RGB", "RGBA") else source.convert("RGBA")
-            if background is not None:
-                picture = _blend_8_bits(picture, background)
-            levels = np.asarray(picture.resize(size))[..., :3]  # (h, w, 3)
-    except FileNotFoundError as error:
-        raise SceneError(f"{path}: no such image; put it there or choose another folder with --images") from error
+            source.load()
+            levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
         raise SceneError(
             f"{path}: Pillow, which 3DGS codebases read images with, cannot read it ({_one_line(str(error))}); "
@@ -109,10 +126,38 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
 
 
+def _resize_8_bits(
+    source: Image.Image, size: tuple[int, int], background: tuple[float, float, float] | None
+) -> Image.Image:
+    """Blend over the background and resize: what Pillow does at once, in bands, or a large photo takes gigabytes.
+
+    Pillow too resizes along rows first, to 8 bits.
+    """
+    width, height = source.size
+    narrowed: Image.Image | None = None
+    rows = max(1, STRIP_VALUES // (4 * width))
+    for top in range(0, height, rows):
+        band = source.crop((0, top, width, min(top + rows, height)))
+        band = band if band.mode in ("RGB", "RGBA") else band.convert("RGBA")
+        if background is not None:
+            band = _blend_8_bits(band, background)
+        if source.size != size and band.mode == "RGBA":
+            band = band.convert("RGBa")  # as Pillow does around resizing
+        if narrowed is None:
+            narrowed = Image.new(band.mode, (size[0], height))
+        narrowed.paste(band.resize((size[0], band.height)), (0, top))
+    assert narrowed is not None, "an image has rows"
+    resized = narrowed.resize(size)
+    return resized.convert("RGBA") if resized.mode == "RGBa" else resized
+
+
 def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) -> Image.Image:
-    values = np.asarray(picture.convert("RGBA")) / 255.0  # (h, w, 4) float64
-    colour, alpha = values[..., :3], values[..., 3:]
-    return Image.fromarray(((colour * alpha + np.asarray(background) * (1 - alpha)) * 255.0).astype(np.uint8))
+    pixels = np.asarray(picture.convert("RGBA"))  # (h, w, 4)
+    steps = np.arange(256) / 255.0
+    alpha = steps[:, None]
+    # By table: in float64 a large photo takes half a minute.
+    tables = [((steps * alpha + value * (1 - alpha)) * 255.0).astype(np.uint8) for value in background]
+    return Image.fromarray(np.stack([table[pixels[..., 3], pixels[..., i]] for i, table in enumerate(tables)], axis=-1))
 
 
 def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -198,7 +243,12 @@ def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
 
 
 def _open(path: Path) -> oiio.ImageInput:
-    if not path.is_file():
+    if (length := len(path.name.encode(errors="surrogatepass"))) > LONGEST_NAME:
+        raise SceneError(
+            f"{path.parent}: the name of image {path.name[:32]}... has {length} bytes, expected at most "
+            f"{LONGEST_NAME}; rename the photo and reconstruct or export again"
+        )
+    if not is_file(path):
         raise SceneError(f"{path}: no such image; put it there or choose another folder with --images")
     options = oiio.ImageSpec()
     # Otherwise 8-bit colour is multiplied by alpha in 8 bits, which loses up to 5 levels where alpha is small.
@@ -210,35 +260,111 @@ def _open(path: Path) -> oiio.ImageInput:
     return source
 
 
-def _has_display_window(source: oiio.ImageInput) -> bool:
-    """Whether the pixels may cover only a part of the image; TIFF and PNG offsets are page layout, no such thing."""
-    return bool(source.format_name() == "openexr")
+def _image_plane(path: Path, source: oiio.ImageInput) -> tuple[int, int]:
+    """Width and height of the whole image, of which an EXR may store a part, after checking both against the limits.
 
-
-def _in_display_window(pixels: NDArray[np.float32], spec: oiio.ImageSpec) -> NDArray[np.float32]:
-    """The whole image (full_height, full_width, c) from the part that the file stores; zero (transparent) elsewhere."""
-    left, top = spec.x - spec.full_x, spec.y - spec.full_y
-    if (left, top, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
-        return pixels
-    whole = np.zeros((spec.full_height, spec.full_width, pixels.shape[2]), np.float32)
-    rows = slice(max(top, 0), max(min(top + spec.height, spec.full_height), 0))
-    columns = slice(max(left, 0), max(min(left + spec.width, spec.full_width), 0))
-    whole[rows, columns] = pixels[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+    TIFF and PNG offsets are page layout, no such window.
+    """
+    spec = source.spec()
+    stored = (spec.width, spec.height)
+    whole = (spec.full_width, spec.full_height) if source.format_name() == "openexr" else stored
+    for width, height in (stored, whole):
+        subject = f"{path}: the image is {width}x{height} pixels"
+        if min(width, height) < 1:
+            raise SceneError(f"{subject}, expected at least one; render or export it again")
+        PHOTO_PIXELS.check(width * height, subject, "make it smaller", SceneError)
+        PHOTO_SIDE.check(max(width, height), subject, "make it smaller", SceneError)
     return whole
 
 
+def _strips(
+    path: Path, source: oiio.ImageInput, size: tuple[int, int], background: tuple[float, float, float]
+) -> Iterator[tuple[int, Tensor]]:
+    """The image (width, height) from top to bottom: the first row of each strip of rows, and its RGB (3, rows, width).
+
+    What an EXR's display window has beyond the stored pixels is zero, that is transparent.
+    """
+    spec = source.spec()
+    width, height = size
+    windowed = source.format_name() == "openexr"
+    left, top = (spec.x - spec.full_x, spec.y - spec.full_y) if windowed else (0, 0)
+    channels = _channels(spec)
+    if not channels.colour or spec.depth > 1 or spec.deep:
+        what = "is a volume" if spec.depth > 1 or spec.deep else "has no colours"
+        raise SceneError(f"{path}: the image {what}, expected grey or RGB pixels; render or export it again")
+    count = max(*channels.colour, channels.alpha) + 1
+    step = max(1, STRIP_VALUES // (count * max(width, spec.width)))
+    step = -(-step // spec.tile_height) * spec.tile_height if spec.tile_width else step
+    columns = slice(max(left, 0), max(min(left + spec.width, width), 0))
+    is_float = spec.format.basetype in FLOAT_FORMATS
+
+    def strip(first: int, last: int, stored: NDArray[np.float32] | None) -> tuple[int, Tensor]:
+        if stored is None or left or spec.width != width:
+            pixels = np.zeros((last - first, width, count), np.float32)
+            if stored is not None:
+                pixels[:, columns] = stored[:, columns.start - left : columns.stop - left]
+            stored = pixels
+        image = torch.from_numpy(_blend(stored, channels, background)).permute(2, 0, 1)
+        if is_float and not bool(torch.isfinite(image).all()):
+            raise SceneError(f"{path}: the image holds NaN or inf, expected finite values; render or export it again")
+        return first, image
+
+    for first in range(0, min(top, height), step):
+        yield strip(first, min(first + step, top, height), None)
+    for row in range(0, spec.height, step):
+        first, last = max(row + top, 0), min(row + step + top, spec.height + top, height)
+        if first < last:
+            pixels = _read_rows(path, source, row, min(row + step, spec.height), count)
+            yield strip(first, last, pixels[first - top - row : last - top - row])
+    for first in range(max(spec.height + top, 0), height, step):
+        yield strip(first, min(first + step, height), None)
+
+
+def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, channels: int) -> NDArray[np.float32]:
+    """Rows of the file and its first channels, (last - first, width, channels)."""
+    spec = source.spec()
+    rows = (spec.y + first, spec.y + last)
+    if spec.tile_width:
+        window = (spec.x, spec.x + spec.width, *rows, spec.z, spec.z + max(1, spec.depth))
+        pixels = source.read_tiles(*window, 0, channels, oiio.FLOAT)
+    else:
+        pixels = source.read_scanlines(*rows, spec.z, 0, channels, oiio.FLOAT)
+    # A JPEG that ends early is decoded into grey and reported only by the message left behind.
+    complaint = source.geterror()
+    if pixels is None or complaint:
+        raise SceneError(
+            f"{path}: the image is damaged or cut short ({_one_line(complaint)}), expected a whole file; copy it again"
+        )
+    read: NDArray[np.float32] = pixels.reshape(last - first, spec.width, channels)
+    return read
+
+
+class _Channels(NamedTuple):
+    """Which channels of a file are red, green and blue, which is alpha (-1 for none), and whether colour is straight,
+    not yet multiplied by alpha."""
+
+    colour: list[int]
+    alpha: int
+    straight: bool
+
+
+def _channels(spec: oiio.ImageSpec) -> _Channels:
+    alpha, straight = spec.alpha_channel, bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
+    if alpha >= spec.nchannels:  # OpenImageIO's reader of GIF counts from one, and does not say that colour is straight
+        alpha, straight = spec.channelindex("A"), True
+    colour = [channel for channel in range(spec.nchannels) if channel != alpha][:3]
+    return _Channels(colour if len(colour) == 3 else colour[:1] * 3, alpha, straight)
+
+
 def _blend(
-    pixels: NDArray[np.float32], spec: oiio.ImageSpec, background: tuple[float, float, float]
+    pixels: NDArray[np.float32], channels: _Channels, background: tuple[float, float, float]
 ) -> NDArray[np.float32]:
     """RGB (h, w, 3) over the background from (h, w, channels)."""
-    colour_channels = [channel for channel in range(spec.nchannels) if channel != spec.alpha_channel][:3]
-    if len(colour_channels) < 3:
-        colour_channels = colour_channels[:1] * 3
-    colour = pixels[..., colour_channels]
-    if spec.alpha_channel < 0:
+    colour = pixels[..., channels.colour]
+    if channels.alpha < 0:
         return colour
-    alpha = pixels[..., spec.alpha_channel, None]
-    if spec.get_int_attribute("oiio:UnassociatedAlpha"):
+    alpha = pixels[..., channels.alpha, None]
+    if channels.straight:
         colour = colour * alpha
     return colour + (1.0 - alpha) * np.asarray(background, np.float32)
 

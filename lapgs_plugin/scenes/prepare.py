@@ -29,11 +29,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
 from lapgs_plugin.files import atomic_write
+from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.scenes.images import read_image, resize_image, write_image
+from lapgs_plugin.scenes.images import check_image, read_image, write_image
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
+from lapgs_plugin.untrusted import read_json
 
 _T = TypeVar("_T")
 
@@ -194,7 +196,11 @@ def _read_sizes(job: _Job) -> dict[str, tuple[int, int]]:
     """Width and height by name. Decodes each photo in full: a damaged one is named now, not after an hour."""
 
     def size(name: str) -> tuple[int, int]:
-        _, height, width = read_image(job.photos / name).shape
+        width, height = check_image(job.photos / name)
+        longest = max(width, height)
+        share = min(1.0, (job.max_size or longest) / longest)
+        subject = f"{job.photos / name}: the photo has {width}x{height} pixels"
+        VIEW_PIXELS.check(int(width * share) * int(height * share), subject, "choose a smaller --max-size", SceneError)
         return width, height
 
     return dict(zip(job.names, _each_photo(job, "Reading photos", size, job.names), strict=True))
@@ -224,7 +230,7 @@ def _open_work(job: _Job, single_camera: bool, overwrite: bool) -> None:
     }
     file = job.work / "settings.json"
     if file.is_file():
-        before = json.loads(file.read_text())
+        before = read_json(file, dict[str, Any], advice=f"delete {job.work} to start over")
         changed = [key for key in settings if before.get(key) != settings[key]]
         if not changed:
             return
@@ -295,7 +301,7 @@ def _describe(job: _Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRe
     left_out = sorted(set(job.names) - set(registered))
     if left_out:
         named = ", ".join(left_out[:10]) + (f" and {len(left_out) - 10} more" if len(left_out) > 10 else "")
-        logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), named)
+        logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), printable(named))
     return PrepareResult(
         registered=tuple(registered),
         left_out=tuple(left_out),
@@ -313,7 +319,9 @@ def _write_scene(job: _Job, model: pycolmap.Reconstruction) -> None:
     images = [image for image in model.images.values() if image.has_pose]
 
     def undistort(image: pycolmap.Image) -> None:
-        picture = _undistort(read_image(job.photos / image.name), lenses[image.camera_id])
+        lens = lenses[image.camera_id]
+        photo = read_image(job.photos / image.name, size=(lens.resized.width, lens.resized.height), clamp=False)
+        picture = _undistort(photo, lens)
         write_image(job.scene / "images" / _target_name(image.name), picture)
 
     _each_photo(job, "Undistorting", undistort, images)
@@ -346,15 +354,14 @@ def _lens(camera: pycolmap.Camera, max_size: int | None) -> _Lens:
 
 
 def _undistort(photo: Tensor, lens: _Lens) -> Tensor:
-    """The photo (3, h, w) as the pinhole camera would have taken it, without blank borders, (3, h', w')."""
-    resized = resize_image(photo, (lens.resized.width, lens.resized.height))
+    """The photo (3, h, w) of the resized lens as the pinhole camera would have taken it, (3, h', w')."""
     width, height = lens.pinhole.width, lens.pinhole.height
     rows, columns = np.mgrid[:height, :width] + 0.5  # pixel centres
     source = _through(lens.pinhole, lens.resized, np.stack([columns.ravel(), rows.ravel()], axis=1))  # (h' w', 2)
     grid = torch.from_numpy(source / (lens.resized.width, lens.resized.height) * 2.0 - 1.0).float()
     # pycolmap's own warp has 8 bits and leaves border pixels black.
     straight = torch.nn.functional.grid_sample(
-        resized[None], grid.reshape(1, height, width, 2), "bicubic", "border", align_corners=False
+        photo[None], grid.reshape(1, height, width, 2), "bicubic", "border", align_corners=False
     )[0]
     return straight.clamp(0.0, 1.0)
 

@@ -11,17 +11,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
-from lapgs_plugin.scenes.source import Frame, SceneSource
+from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
 
 ProgressCallback = Callable[[int, int], None]
 """Called with the number of images read and their total."""
@@ -173,7 +175,7 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _read_source(path: Path, images: str, evaluate: bool) -> SceneSource:
-    if not path.is_dir():
+    if not is_folder(path):
         raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
     model = find_model(path)
     if model is not None:
@@ -204,17 +206,17 @@ def _check_source(path: Path, source: SceneSource) -> None:
                 f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it; "
                 "copy the photos there and reconstruct or export again"
             )
-        camera = frame.camera
-        numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-        if not (torch.isfinite(numbers).all() and torch.isfinite(camera.world_to_camera).all()):
-            raise SceneError(f"{path}: the camera of {frame.name} has NaN or inf in it; reconstruct or export it again")
-        if min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
-            raise SceneError(
-                f"{path}: the camera of {frame.name} is {camera.width}x{camera.height} pixels with focal lengths "
-                f"{camera.fx:g} and {camera.fy:g}, expected positive numbers; reconstruct or export it again"
-            )
-    if len(source.points) == 0 or not bool(torch.isfinite(torch.from_numpy(source.points)).all()):
+    if len(source.points) == 0 or not np.isfinite(source.points).all():
         raise SceneError(f"{path}: the sparse points are none or hold NaN or inf; reconstruct or export them again")
+    if (furthest := float(np.abs(source.points).max())) > LARGEST:
+        raise SceneError(
+            f"{path}: a sparse point lies at {furthest:g}, expected at most {LARGEST:g}; reconstruct or export them "
+            "again"
+        )
+    if not np.isfinite(source.colors).all():
+        raise SceneError(
+            f"{path}: colours of the sparse points hold NaN or inf, expected 0 to 255 or 0.0 to 1.0; export them again"
+        )
 
 
 def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
@@ -227,7 +229,10 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
             "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
         )
-    resized = camera.resized(*rule.size_for(width, height)).to(dtype=torch.float32)
+    size = rule.size_for(width, height)
+    subject = f"{frame.path}: at --resolution {rule.text} the image has {size[0]}x{size[1]} pixels"
+    VIEW_PIXELS.check(size[0] * size[1], subject, "choose a smaller --resolution", SceneError)
+    resized = camera.resized(*size).to(dtype=torch.float32)
     return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if rule.backbone is not None else resized
 
 

@@ -9,12 +9,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 
 HOLD_OUT_EVERY = 8
 """With evaluation every eighth view in name order is held out, starting with the first, as in 3DGS."""
 
 UNDISTORT_HINT = "only pinhole images can be trained on, `lapgs prepare PHOTOS OUT` makes such a scene from photos"
+
+
+LARGEST = 1e12
+"""Of coordinates in world units. Training in float32 multiplies squares of them with each other."""
+
+LONGEST_SIDE = 1 << 31
+"""Of a camera's image, in pixels; what a file says before it is compared with the photo."""
+
+LONGEST_FOCAL = 1e6
+"""Of a side of the image; a telescope sees less than a tenth of that."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,61 @@ class SceneSource:
     test: tuple[Frame, ...]
     points: NDArray[np.float64]  # (n, 3)
     colors: NDArray[np.float64]  # (n, 3)
+
+
+def check_camera(path: Path, name: str, camera: Camera) -> None:
+    """Refuse a camera that cannot be trained on.
+
+    Args:
+        path: file or folder that holds it.
+        name: of its image.
+        camera: in float64.
+
+    Raises:
+        SceneError: NaN, inf, numbers too large for float32, or sizes and focal lengths out of range.
+    """
+    who = f"{path}: the camera of {name}"
+    numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    pose = camera.world_to_camera.numpy()
+    if not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
+        raise SceneError(f"{who} has NaN or inf in it; reconstruct or export it again")
+    if np.abs(pose).max() > LARGEST:
+        raise SceneError(
+            f"{who} has {np.abs(pose).max():g} in its pose, expected at most {LARGEST:g}; reconstruct or export it "
+            "again"
+        )
+    size = (camera.width, camera.height)
+    if min(camera.fx, camera.fy, *size) <= 0:
+        raise SceneError(
+            f"{who} is {camera.width}x{camera.height} pixels with focal lengths {camera.fx:g} and {camera.fy:g}, "
+            "expected positive numbers; reconstruct or export it again"
+        )
+    if max(size) > LONGEST_SIDE:
+        raise SceneError(
+            f"{who} is {max(size):.3g} pixels wide or high, expected at most {LONGEST_SIDE}; reconstruct or export it "
+            "again"
+        )
+    if (np.abs(numbers) > LONGEST_FOCAL * np.array([*size, *size])).any():
+        raise SceneError(
+            f"{who} has focal lengths {camera.fx:g} and {camera.fy:g} and a principal point ({camera.cx:g}, "
+            f"{camera.cy:g}), expected at most {LONGEST_FOCAL:g} sides of the image; reconstruct or export it again"
+        )
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False too for names that the file system cannot have, of more than 255 bytes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there; False too for names that the file system cannot have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
 
 
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:

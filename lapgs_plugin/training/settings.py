@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
-from lapgs_plugin.options import option
+from lapgs_plugin.options import check_bounds, option
+from lapgs_plugin.untrusted import STRICT, checked
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import Manifest
@@ -44,6 +45,8 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 class LearningRates:
     """Adam step sizes, as 3DGS publishes them. Positions are in units of the scene's extent."""
 
+    __pydantic_config__: ClassVar[Any] = STRICT
+
     means_first: float = 1.6e-4
     means_last: float = 1.6e-6
     sh: float = 2.5e-3  # coefficients above degree 0 take a twentieth of it
@@ -51,6 +54,11 @@ class LearningRates:
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            if not getattr(self, each.name) > 0:
+                raise UserInputError(f"{each.name} {getattr(self, each.name)}: expected a positive learning rate")
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,8 @@ class Densification:
     None takes 3DGS's constant for 30,000 iterations (500, 15,000, 3,000), shrunk in proportion for shorter runs; for
     "mcmc" the second is 25,000. `every` never shrinks: its statistics need about that many views.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     start: int | None = option(
         None, "First densification. Default: 500 of 30000.", panel=SCHEDULE, names=("--densify-from",), least=0
@@ -95,6 +105,8 @@ class Densification:
 class TrainSettings(HierarchySettings):
     """Everything that decides the result of a run besides the scene."""
 
+    __pydantic_config__: ClassVar[Any] = STRICT
+
     iterations: int = option(
         30_000, "Optimizer steps, all stages together. The 3DGS schedule shrinks with it.", least=1
     )
@@ -116,6 +128,8 @@ class TrainSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_bounds(self)
+        check_bounds(self.densification)
         if self.densification.strategy not in STRATEGIES:
             raise UserInputError(f"--strategy {self.densification.strategy}: expected {' or '.join(STRATEGIES)}")
         if not 0 <= self.sh_degree <= 3:
@@ -169,23 +183,24 @@ class TrainSettings(HierarchySettings):
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
     @classmethod
-    def from_manifest(cls, manifest: Manifest) -> TrainSettings:
+    def from_manifest(cls, manifest: Manifest, name: str = "the run's manifest") -> TrainSettings:
         """Return the settings that a run was started with.
 
         Raises:
-            RunFolderError: they hold a key this version does not know or lack one.
+            RunFolderError: they hold a key this version does not know, lack one, or one has another type.
         """
         values = {**manifest.settings, **{name: getattr(manifest, name) for name in IN_MANIFEST}}
         values = _of_this_version(values)
         values.pop("raster", None)  # `antialiased` says it
         if difference := sorted(set(values) ^ {f.name for f in fields(cls)}):
             raise RunFolderError(
-                f"the run was not started by `lapgs train` of this version (settings {', '.join(difference)} do not "
-                f"match); continue it with {manifest.created_by}"
+                f"{name}: the run was not started by `lapgs train` of this version (settings {', '.join(difference)} "
+                f"do not match); continue it with {manifest.created_by}"
             )
-        values["learning_rates"] = LearningRates(**values["learning_rates"])
-        values["densification"] = Densification(**values["densification"])
-        return cls(**values)
+        settings: TrainSettings = checked(
+            values, cls, name, error=RunFolderError, advice="restore it or train again with --overwrite"
+        )
+        return settings
 
 
 def _of_this_version(given: dict[str, Any]) -> dict[str, Any]:

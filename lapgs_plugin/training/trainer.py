@@ -27,7 +27,7 @@ from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
-from lapgs_plugin.runs.archive import CACHE, LevelRecord, RunArchive
+from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
 from lapgs_plugin.runs.overhead import Overhead
@@ -35,6 +35,7 @@ from lapgs_plugin.runs.peak_memory import PeakMemory
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watching import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
 from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -152,7 +153,7 @@ class Trainer:
             TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
             DeviceMemoryError: the GPU is full; the same stays.
         """
-        checkpoint = self.archive.load_checkpoint() if resume else None
+        checkpoint = self._checkpoint() if resume else None
         with stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
@@ -171,12 +172,29 @@ class Trainer:
                 if self._images is not None:
                     self._images.close()
 
+    def _checkpoint(self) -> dict[str, Any] | None:
+        """What the next stage is continued from; None where it starts from its beginning."""
+        state, level = self.archive.load_checkpoint(), self.archive.manifest.next_level
+        if state is not None:
+            (stage,) = (each for each in self.plan if each.level == level)
+            path = self.archive.path(CHECKPOINT)
+            check_checkpoint(state, path, stage, self.settings, self.archive.available_levels)
+        return state
+
+    def _moments(self, level: int, field: GaussianField) -> dict[str, Any]:
+        """Adam's state that a finished level left, of its field."""
+        moments = self.archive.optimizer_state(level)
+        check_moments(moments, field, self.archive.path(f"level_{level}", OPTIMIZER))
+        return moments
+
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
         self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
         self._memory = PeakMemory(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint))
         if checkpoint is not None:
+            path = self.archive.path(CHECKPOINT)
+            check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
             run.restore(checkpoint)
             if self.breakdown and not run.breakdown.measures:
                 self.monitor.say(f"level {stage.level} was begun without --breakdown: its parts are not told")
@@ -204,7 +222,7 @@ class Trainer:
             if continues_field(stage, self.plan.levels):
                 field = self.archive.field(stage.level + 1)
                 model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
-                model.adopt_moments(self.archive.optimizer_state(stage.level + 1), torch.arange(len(field)))
+                model.adopt_moments(self._moments(stage.level + 1, field), torch.arange(len(field)))
                 return model
             if not stage.signed:
                 points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
@@ -212,12 +230,11 @@ class Trainer:
                     points = mcmc_start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
-            field, kept = inherit(
-                self.archive.field(stage.level + 1), self.settings.inherit_mode, self.settings.inherit_ratio, generator
-            )
+            coarser = self.archive.field(stage.level + 1)
+            field, kept = inherit(coarser, self.settings.inherit_mode, self.settings.inherit_ratio, generator)
             model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
             if self.settings.inherit_mode == "full":
-                model.adopt_moments(self.archive.optimizer_state(stage.level + 1), kept)
+                model.adopt_moments(self._moments(stage.level + 1, coarser), kept)
             return model
 
     def _next_stage_inherits_moments(self, stage: Stage) -> bool:

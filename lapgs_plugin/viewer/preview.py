@@ -7,16 +7,16 @@ it is. Reading it needs no torch, which takes longer to import than a page to lo
 from __future__ import annotations
 
 import io
-import json
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
 from lapgs_plugin.files import MANIFEST, PREVIEW, atomic_write
+from lapgs_plugin.untrusted import read_json
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import RunArchive
@@ -34,7 +34,7 @@ QUALITY = 85
 def read_preview(run: Path) -> Image.Image | None:
     """The picture in a run folder; None where there is none, it is damaged, or the run was trained on since."""
     try:
-        manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
+        manifest = read_json(run / MANIFEST, dict[str, Any])
         image = Image.open(io.BytesIO((run / PREVIEW).read_bytes()), formats=("JPEG",))
         if image.info.get("comment") != _state(manifest["created"], len(manifest["records"])):
             return None

@@ -187,7 +187,7 @@ def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
         ("dict(sh_degree=3)", "is not readable"),
         ("Namespace(**{'sh_degree': 3})", "is not readable"),
         ("Namespace(sh_degree=3", "is not readable"),
-        ("Namespace(sh_degree=3)", "lacks source_path, resolution, eval"),
+        ("Namespace(sh_degree=3)", "lacks source_path"),
         ("[" * 5000, "is not readable"),
     ],
 )
@@ -226,7 +226,7 @@ def test_what_cannot_be_rendered_as_it_was_is_refused(foreign: Foreign, tmp_path
     (foreign.folder / "runtime_breakdown.json").unlink()
     ply = foreign.folder / "L0" / "point_cloud" / "iteration_10" / "point_cloud.ply"
     ply.write_bytes(ply.read_bytes()[:-100])
-    refused("point_cloud.ply is cut short")
+    refused("point_cloud.ply: it is cut short")
     (foreign.folder / "cfg_args").unlink()
     refused("cfg_args does not exist")
 

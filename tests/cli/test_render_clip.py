@@ -116,6 +116,15 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
         (("--trajectory", "orbit", "--out", "clip.avi"), r"expected an \.mp4 file or a folder"),
         (("--trajectory", "orbit", "--out", "clip.mp4", "--format", "exr"), "a video has 8 bits"),
         (("--trajectory", "orbit", "--out", "frames", "--frame-rate", 10), r"--frame-rate needs an \.mp4"),
+        (
+            ("--trajectory", "orbit", "--frames", 10**9),
+            "--frames 1000000000, expected at most 100,000 ",
+        ),
+        (("--trajectory", "spline", "--frames", 10**9), "expected at most 100,000 frames"),
+        (
+            ("--trajectory", "orbit", "--size", "16384x16384"),
+            "expected at most 128,000,000 pixels; ",
+        ),
         (("--trajectory", "helix"), "expected orbit, spline or a JSON file"),
         (("--trajectory", "orbit", "--level", 3), "level 3 cannot be rendered"),
     ],

@@ -178,3 +178,36 @@ def test_mistakes(experiment: Path) -> None:
     with pytest.raises(RunFolderError, match="cannot be read"):
         lapgs_report(experiment)
     assert not (experiment / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (",1000.0,", ",many,", r"results.csv: '\w+' is 'many', expected a number"),
+        (",bare,bare,", ",bare,", r"row 1 has more or fewer cells than the 20 of the first line"),
+        (",bare,bare,", ",bare,bare,bare,", r"row 1 has more or fewer cells"),
+        (",bare,bare,", ",,bare,", "results.csv lacks variant"),
+        ("trial,", "x" * 200_000 + ",", r"results.csv cannot be read \(.*field larger than field limit"),
+    ],
+)
+def test_results_that_were_edited_are_one_line(experiment: Path, before: str, after: str, message: str) -> None:
+    table = (experiment / "results.csv").read_text()
+    assert before in table
+    (experiment / "results.csv").write_text(table.replace(before, after, 1))
+    with pytest.raises(RunFolderError, match=message) as caught:
+        lapgs_report(experiment)
+    assert "\n" not in str(caught.value)
+
+
+def test_tables_that_are_no_text_are_one_line(experiment: Path) -> None:
+    (experiment / "tables.md").write_bytes(b"# A trial\n\xff\xfe")
+    with pytest.raises(RunFolderError, match=r"tables.md is not readable: byte 10 .*--tables-only"):
+        lapgs_report(experiment)
+
+
+def test_an_experiment_whose_runs_are_gone_keeps_its_tables(experiment: Path) -> None:
+    shutil.rmtree(experiment / "runs")
+    lapgs_report(experiment)
+    page = (experiment / "report.html").read_text()
+    assert "two levels is not shown: " in page
+    assert "<td>27.0</td>" in page

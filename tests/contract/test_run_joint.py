@@ -68,7 +68,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
         assert not torch.equal(after[part], value), part
     if name != "fastgs":  # it reports no held-out views
         (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
-        assert composed_psnr(archive) == pytest.approx(reported, abs=1e-4)  # 5e-7 seen
+        assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 5e-7 seen; a pixel at 1/255: 5e-5
 
 
 @pytest.mark.parametrize("options", [{"joint": 0.0}, {"supervision": "online_residual"}, {"joint": 0.001}])
@@ -119,7 +119,10 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
             image = levels.get(key)
             level = min(renderer.fields)
             composed = renderer.render(view.camera, level).composed[level]
-            found.append(float((image - Pyramid("camera").up(composed, image.shape[1:])).detach().abs().max()))
+            difference = (image - Pyramid("camera").up(composed, image.shape[1:])).detach().abs()
+            # Another processor may decide otherwise about a pixel of a coarse level, which Up spreads over some of 16.
+            found.append(float(difference.flatten().quantile(0.98)))
+            assert difference.max() < 0.02
         return found
 
     inspected = Inspected(monkeypatch, differences)

@@ -190,7 +190,8 @@ def test_the_finest_field_alone_makes_the_held_out_views(
         values = [
             psnr(rasterizer(alone, view.camera, background=white).image, view.image) for view in run_scene(archive).test
         ]
-    assert sum(values) / len(values) == pytest.approx(noted["psnr"], abs=1e-6)  # 4e-9 seen
+    # 4e-9 seen; the cameras round apart, and a pixel at 1/255 that another processor decides otherwise makes 5e-5.
+    assert sum(values) / len(values) == pytest.approx(noted["psnr"], abs=1e-3)
 
 
 @pytest.mark.parametrize("name", NAMES)

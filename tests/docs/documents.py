@@ -59,6 +59,7 @@ def commands(document: Path) -> list[list[str]]:
     found = []
     for block in blocks(document):
         for line in re.sub(r"\\\n\s*", "", block.text).splitlines():
-            if line.startswith("lapgs "):
-                found.append(shlex.split(line, comments=True)[1:])
+            words = shlex.split(line, comments=True) if re.match(r"([A-Z_]+=\S+ )*lapgs ", line) else []
+            if words:
+                found.append(words[words.index("lapgs") + 1 :])
     return found

@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import typer
 
+from lapgs_plugin import limits
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
+from lapgs_plugin.untrusted import JSON_MIB, JSON_MIB_VARIABLE
 from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, prose
 
 WITH_COMMANDS = [path for path in PAGES if commands(path)]
@@ -80,6 +82,19 @@ def test_options_in_the_text_exist(document: Path) -> None:
 def test_links_lead_to_files(document: Path) -> None:
     for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", prose(document)):
         assert (document.parent / target).exists(), target
+
+
+def test_limits_are_those_of_the_code() -> None:
+    in_code = {
+        limit.variable: f"{limit.default:,}" for limit in vars(limits).values() if isinstance(limit, limits.Limit)
+    }
+    in_code[JSON_MIB_VARIABLE] = str(JSON_MIB)
+    rows = re.findall(
+        r"^\| `(LAPGS_\w+)` \| ([\d,]+) \|", (ROOT / "docs/scenes.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert dict(rows) == in_code
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert [variable for variable in in_code if variable not in changes] == []
 
 
 def test_the_readme_is_a_screen_and_a_half() -> None:

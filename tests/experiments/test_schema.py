@@ -131,7 +131,7 @@ def test_options_of_residuals_are_refused_before_the_first_run(
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match=r"none\.toml: No such file"):
+    with pytest.raises(UserInputError, match=r"none\.toml cannot be read: No such file"):
         load_experiment(tmp_path / "none.toml", _option_names())
 
 

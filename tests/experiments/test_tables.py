@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.errors import MissingExtraError, RunFolderError
 from lapgs_plugin.experiments import exports
 from lapgs_plugin.experiments.aggregate import Cell, ResultTable, make_table
 from lapgs_plugin.experiments.expansion import PlannedRun, Selection, plan_runs
@@ -178,6 +178,13 @@ def test_parquet_has_types_and_nulls(tmp_path: Path) -> None:
         {"run": "b", "psnr": None, "gaussians": 7},
     ]
     assert str(found.schema.field("gaussians").type) == "int64"
+
+
+def test_figures_of_two_types_are_no_parquet(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    with pytest.raises(RunFolderError, match=r"r.parquet is not written: runs differ in the type of a figure"):
+        exports.write_parquet(tmp_path / "r.parquet", [{"psnr": 30.25}, {"psnr": [1]}])
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_pyarrow_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,7 +88,7 @@ def test_a_run_comes_back_as_it_was_written(tmp_path: Path) -> None:
         assert (archive.available_levels, archive.manifest.complete, archive.manifest.next_level) == ((), False, 1)
         finish(archive, 1)
         finish(archive, 0)
-        archive.write_metrics({"psnr": 30.5, "views": {"a.jpg": 30.5}})
+        archive.write_metrics({"psnr": 30.5, "overhead_seconds": {"pyramid": 30.5}})
     again = RunArchive.open(tmp_path / "deep" / "run")
     records = []
     for level in (1, 0):
@@ -99,7 +99,7 @@ def test_a_run_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert (again.available_levels, again.manifest.complete, again.manifest.next_level) == ((1, 0), True, None)
     assert_level_is_whole(again, 1)
     assert_level_is_whole(again, 0)
-    assert again.metrics() == {"psnr": 30.5, "views": {"a.jpg": 30.5}}
+    assert again.metrics() == {"psnr": 30.5, "overhead_seconds": {"pyramid": 30.5}}
     assert again.path("renders", "x.png") == tmp_path / "deep" / "run" / "renders" / "x.png"
     layout = {"manifest.json", "metrics.json", ".lock", "level_0/point_cloud.ply", "level_1/point_cloud.ply"}
     assert set(snapshot(again.path())) == layout
@@ -233,18 +233,18 @@ def test_opening_damaged_manifests(tmp_path: Path) -> None:
     for contents, message in [
         (whole[: len(whole) // 2], "not readable as JSON"),
         ("", "not readable as JSON"),
-        ("[]", "holds a JSON list"),
+        ("[]", r"it is \[\], expected a valid dictionary|it is \[\], expected an object"),
         (b"\xff\xfe\x00".decode("latin-1"), "not readable as JSON"),
         (
             json.dumps({**values, "format_version": 99}),
             f"format_version 99, this version of lapgs reads {FORMAT_VERSION}",
         ),
-        (json.dumps({k: v for k, v in values.items() if k != "grid"}), "Manifest lacks grid"),
-        (json.dumps({**values, "flavour": 1}), "Manifest has unknown flavour"),
-        (json.dumps({**values, "scene": None}), "SceneReference lacks background, eval"),
-        (json.dumps({**values, "records": [{}]}), "LevelRecord lacks image_size, iterations"),
+        (json.dumps({k: v for k, v in values.items() if k != "grid"}), "it lacks grid"),
+        (json.dumps({**values, "flavour": 1}), "it has an unknown key flavour"),
+        (json.dumps({**values, "scene": None}), "scene is None, expected an object"),
+        (json.dumps({**values, "records": [{}]}), r"it lacks records\[0\]\.level"),
         (json.dumps({**values, "records": values["records"][1:]}), r"finished levels \[0\], expected \[1\] of 2"),
-        (json.dumps({**values, "levels": "two"}), "is damaged"),
+        (json.dumps({**values, "levels": "two"}), "levels is 'two', expected a valid integer"),
     ]:
         (tmp_path / "manifest.json").write_text(contents)
         with pytest.raises(RunFolderError, match=message) as caught:
@@ -494,11 +494,13 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path, monkeypatch: 
         for write in (
             lambda: finish(archive, 0),
             lambda: archive.save_checkpoint({"iteration": 4}),
-            lambda: archive.write_metrics({"psnr": 2.0}),
             lambda: archive.rewind_history(0, 0),
         ):
             with pytest.raises(RunFolderError, match=r"cannot be written: No space left.*free some space.*--resume"):
                 write()
+        for measure in (lambda: archive.write_metrics({"psnr": 2.0}), lambda: archive.write_stability({"psnr": 2.0})):
+            with pytest.raises(RunFolderError, match=r"No space left.*free some space and run the command again$"):
+                measure()
         writes.left = sys.maxsize
         assert snapshot(tmp_path) == before
         finish(archive, 0)
@@ -566,7 +568,7 @@ def test_a_damaged_line_of_history_is_numbered(tmp_path: Path) -> None:
             archive.append_history({"level": 1, "iteration": i})
         lines = (tmp_path / "history.jsonl").read_text().splitlines()
         (tmp_path / "history.jsonl").write_text("\n".join([lines[0], lines[1][:5], lines[2], ""]))
-        with pytest.raises(RunFolderError, match="line 2 is not JSON"):
+        with pytest.raises(RunFolderError, match="line 2 is not readable as JSON"):
             archive.history()
 
 

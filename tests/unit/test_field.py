@@ -193,7 +193,7 @@ def test_a_cut_file_says_after_which_gaussian(tmp_path: Path) -> None:
     contents = (tmp_path / "f.ply").read_bytes()
     row = 4 * len(standard_names(0))
     (tmp_path / "f.ply").write_bytes(contents[: -3 * row - 1])
-    with pytest.raises(FieldError, match=r"f\.ply is cut short or damaged after 5 of 9 Gaussians"):
+    with pytest.raises(FieldError, match=r"f\.ply: it is cut short or damaged after 5 of 9"):
         GaussianField.load_ply(tmp_path / "f.ply")
 
 

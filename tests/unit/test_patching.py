@@ -857,19 +857,31 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name = [", "not readable as TOML"),
-        ('name = "new"\ntitle = "New"', "expected the keys"),
-        ('name = "old"\ntitle = "New"\npresent = []', "a name equal to the file's"),
+        ("name = [", "is not TOML"),
+        ('name = "new"\ntitle = "New"', "it lacks present"),
+        ('name = "old"\ntitle = "New"\npresent = []', "its name is 'old', expected that of the file"),
         ('name = "new"\ntitle = "New"\npresent = []\nextends = "old"', "extends 'old', expected one of"),
         ('name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"', "README"),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',
+            "it has an unknown key edit[0].after",
+        ),
+        (
+            'name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"',
             "either `before` or `replace`",
         ),
+        ('name = "new"\ntitle = "New"\npresent = []\nextends = "new"', "expected one without a circle"),
+        ('name = "new"\ntitle = 5\npresent = []', "title is 5, expected a valid string"),
+        ('name = "new"\ntitle = "New"\npresent = [3]', "present[0] is 3, expected"),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = "#include <f>"',
+            "edit[0].unless is '#include <f>', expected a valid array",
+        ),
+        (
+            'name = "new"\ntitle = "New"\npresent = []\n'
+            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = ["<f>"]',
             "expected a list of directives that start with #",
         ),
         (

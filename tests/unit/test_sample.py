@@ -314,7 +314,7 @@ def test_a_ball_with_holes_shows_its_far_side_through_them() -> None:
     ("change", "message"),
     [
         ({"views": 1}, "--views 1: expected 2 to 9999"),
-        ({"points": 0}, "--points 0: expected at least 1"),
+        ({"points": 0}, "--points 0: expected 1 to 10000000"),
         ({"width": 8}, "--size 8x64: expected at least 16x16"),
         ({"seed": -1}, "--seed -1: expected 0 or more"),
     ],

@@ -361,7 +361,7 @@ def test_binary_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
 def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
     path = make_scene(tmp_path, binary=False)
     (path / "sparse" / "0" / f"{name}.txt").write_text("these are not numbers\n\n" * 3)
-    with pytest.raises(SceneError, match="the sparse model cannot be read") as caught:
+    with pytest.raises(SceneError, match=rf"{name}\.txt: line 1 is 'these are not numbers', expected ") as caught:
         load(path)
     assert_one_line(caught)
 
@@ -435,7 +435,7 @@ def test_nan_pose(tmp_path: Path, value: float) -> None:
 def test_focal_length_that_is_no_positive_number(tmp_path: Path, value: float) -> None:
     path = make_scene(tmp_path)
     overwrite(path / "sparse" / "0" / "cameras.bin", 82.0, value)
-    with pytest.raises(SceneError, match=r"the camera of 00\.png|the sparse model cannot be read"):
+    with pytest.raises(SceneError, match=r"the camera of 0\d\.png"):
         load(path)
 
 
@@ -464,6 +464,139 @@ def test_names_that_lead_out_of_the_scene(tmp_path: Path, name: str) -> None:
     write_images(path / "images", {"a.png": (96, 64), "b.png": (96, 64)})
     with pytest.raises(SceneError, match="is named by a path outside the scene"):
         load(path)
+
+
+def test_names_that_no_file_can_have(tmp_path: Path) -> None:
+    path = tmp_path / "scene"
+    for name, message in (
+        ("b" * 300 + ".png", r"images: the name of image b{32}\.\.\. has 304 bytes, expected at most 255"),
+        ("/", "image / is named by a path outside the scene"),
+        ("..", r"image \.\. is named by a path outside the scene"),
+        (".", "no such image"),
+        ("\x1b[2J\x07.png", r"images/\\x1b\[2J\\x07\.png: no such image"),
+    ):
+        Model(names=["a.png", name, "c.png"]).write(path / "sparse" / "0", binary=False)
+        write_images(path / "images", {"a.png": (96, 64), "c.png": (96, 64)})
+        with pytest.raises(SceneError, match=message) as caught:
+            load(path)
+        assert str(caught.value).isprintable()
+
+
+def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
+    path = make_scene(tmp_path)
+    model = path / "sparse" / "0" / "images.bin"
+    model.write_bytes(model.read_bytes().replace(b"03.png", b"\xff\xfe.png"))
+    with pytest.raises(SceneError, match=r"the name of image \d+ is b'\\xff\\xfe\.png.*', expected UTF-8") as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        (
+            "cameras",
+            r"^1 PINHOLE.*",
+            "1 PINHOLE 96 64 80 82 47.3",
+            r"line 1 is '1 PINHOLE .*', expected 4 parameters of PINHOLE, not 3",
+        ),
+        ("cameras", r"^1 PINHOLE.*", "1 PINHOLE 96 64 80 82 47.3 33.1 5", "expected 4 parameters of PINHOLE, not 5"),
+        ("cameras", r"^1 PINHOLE.*", "1 PINHOLE 96 64 80 82 nan 33.1", "expected 4 finite parameters of PINHOLE"),
+        ("cameras", r"^1 PINHOLE.*", "1 PINHOLE 96 64 80 1e400 4 5", "expected 4 finite parameters of PINHOLE"),
+        (
+            "cameras",
+            r"^1 PINHOLE",
+            "1 PINPOINT",
+            "expected a camera model of COLMAP, such as PINHOLE, in place of PINPOINT",
+        ),
+        (
+            "cameras",
+            r"^1 PINHOLE 96",
+            "1 PINHOLE -96",
+            "expected CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS with positive",
+        ),
+        ("cameras", r"^1 PINHOLE 96", "1 PINHOLE " + "9" * 5000, r"9\.\.\.', expected CAMERA_ID MODEL WIDTH HEIGHT"),
+        ("cameras", r"^1 PINHOLE.*", "1", "line 1 is '1', expected CAMERA_ID MODEL"),
+        ("cameras", r"^1 (.*)", r"1 \1\n1 \1", "line 2 .* expected each id once, 1 was there before"),
+        ("images", r"^10( \S+){4}", "10 0 0 0 0", "line 1 .* expected a rotation, the quaternion"),
+        ("images", r"^10( \S+){4}", "10 nan 0 0 0", "line 1 .* with finite numbers"),
+        (
+            "images",
+            r"^10( \S+){4}",
+            "10 5 0 0 0",
+            r"the rotation of 00\.png is the quaternion .* expected one of length 1",
+        ),
+        (
+            "images",
+            r"^(10( \S+){4}) \S+",
+            r"\1 1e300",
+            r"the camera of 00\.png has 1e\+300 in its pose, expected at most 1e\+12",
+        ),
+        ("images", r"1 03\.png", "77 03.png", r"line 7 .* expected the id of a camera in cameras\.txt, there is no 77"),
+        ("images", r"^9 ", "10 ", "line 3 .* expected each id once, 10 was there before"),
+        ("images", r"^9 ", "-1 ", "line 3 .* expected an id from 0 to"),
+        ("images", r" 03\.png", "", "line 7 .* expected IMAGE_ID QW"),
+        ("images", r"00\.png\n", "00.png\n1.0 2.0", "line 2 is '1.0 2.0', expected X Y POINT3D_ID"),
+        (
+            "points3D",
+            r"^1 \S+",
+            "1 x",
+            r"points3D\.txt: line 1 is '1 x .*', expected POINT3D_ID X Y Z R G B ERROR TRACK",
+        ),
+        ("points3D", r"^1 .*", "1 0.5", r"line 1 is '1 0\.5', expected POINT3D_ID"),
+        ("points3D", r"^2 ", "1 ", "line 2 .* expected each id once"),
+        ("points3D", r"^(1 \S+ \S+ \S+) \S+", r"\1 999", "expected a positive id and colours from 0 to 255"),
+        ("points3D", r"^(1 .*)", r"\1 77 0", r"expected ids of images in images\.txt, there is no 77"),
+        ("points3D", r"^(1 .*)", r"\1 1", "expected IMAGE_ID POINT2D_IDX"),
+        ("points3D", r"^(1 .*)", r"\1 1 5000000", "the sparse model cannot be read"),
+        ("points3D", r"^1 \S+", "1 1e300", r"a sparse point lies at 1e\+300, expected at most 1e\+12"),
+    ],
+)
+def test_text_models_name_the_line(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+    path = make_scene(tmp_path, binary=False)
+    text = path / "sparse" / "0" / f"{file}.txt"
+    before = text.read_text()
+    text.write_text(re.sub(old, new, before, count=1, flags=re.MULTILINE))
+    assert text.read_text() != before
+    with pytest.raises(SceneError, match=message) as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("count", [10**18, 2**64 - 1, 2**63, 10**9])
+def test_absurd_counts_of_binary_files(tmp_path: Path, name: str, count: int) -> None:
+    path = make_scene(tmp_path)
+    file = path / "sparse" / "0" / f"{name}.bin"
+    file.write_bytes(struct.pack("<Q", count) + file.read_bytes()[8:])
+    with pytest.raises(SceneError, match=rf"{name}\.bin: the file is damaged or cut short at \d+ bytes") as caught:
+        load(path)
+    assert_one_line(caught)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset", "value", "message"),
+    [
+        ("cameras", 12, struct.pack("<i", 999), "the file is damaged"),
+        ("cameras", 16, struct.pack("<Q", 2**63), r"9\.22e\+18 pixels wide or high, expected at most"),
+        ("cameras", 32, struct.pack("<d", 1e300), r"focal lengths 1e\+300 and 82"),
+        ("images", 68, struct.pack("<I", 77), r"image 10 of images\.bin has camera 77, expected one of cameras\.bin"),
+        ("images", 8, struct.pack("<I", 9), r"images\.bin holds id 9 twice, expected each once"),
+        ("points3D", 8, struct.pack("<Q", 2), r"points3D\.bin holds id 2 twice"),
+        ("frames", 16, struct.pack("<4d", 0, 0, 0, 0), r"the quaternion \(0, 0, 0, 0\), expected one of length 1"),
+        ("frames", 48, struct.pack("<d", 1e300), r"has 1e\+300 in its pose"),
+        ("frames", 12, struct.pack("<I", 99), "the sparse model cannot be read"),
+    ],
+)
+def test_values_of_binary_files(tmp_path: Path, name: str, offset: int, value: bytes, message: str) -> None:
+    path = make_scene(tmp_path)
+    file = path / "sparse" / "0" / f"{name}.bin"
+    content = bytearray(file.read_bytes())
+    content[offset : offset + len(value)] = value
+    file.write_bytes(content)
+    with pytest.raises(SceneError, match=message) as caught:
+        load(path)
+    assert_one_line(caught)
 
 
 # A real scene

@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
-from lapgs_plugin.scenes.images import image_size, read_image, resize_image, write_image
+from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image, resize_image, write_image
 
 
 def noise(*shape: int) -> NDArray[np.float32]:
@@ -181,6 +181,98 @@ def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path, orient
     bitmap = pycolmap.Bitmap.read(str(path), True)
     assert (bitmap.width, bitmap.height) == image_size(path) == (40, 24)
     torch.testing.assert_close(read_image(path), as_tensor(plain.astype(np.float32) / 255), rtol=0, atol=1.1 / 255)
+
+
+def stored_as(folder: Path, kind: str) -> Path:
+    """A noisy image of 211x157, in a format that is read in its own way."""
+    rng = np.random.default_rng(7)
+    path = folder / f"a{kind.removeprefix('tiled')}"
+    if kind == ".exr":
+        save(path, rng.normal(size=(157, 211, 4)).astype(np.float32), oiio.FLOAT)
+    elif kind == "tiled.tif":
+        source = oiio.ImageBuf(oiio.ImageSpec(211, 157, 3, oiio.UINT8))
+        source.set_pixels(oiio.ROI(), rng.random((157, 211, 3), dtype=np.float32))
+        source.set_write_tiles(64, 32)
+        assert source.write(str(path))
+        assert oiio.ImageInput.open(str(path)).spec().tile_height == 32
+    else:
+        assert cv2.imwrite(str(path), rng.integers(0, 256, (157, 211, 3 if kind == ".jpg" else 4)).astype(np.uint8))
+    return path
+
+
+@pytest.mark.parametrize("kind", [".png", ".jpg", ".exr", ".webp", "tiled.tif"])
+@pytest.mark.parametrize("size", [None, (211, 157), (80, 60), (211, 40), (50, 157), (300, 200)])
+def test_strips_of_rows_make_the_same_bits(
+    tmp_path: Path, kind: str, size: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against all rows at once, and that against the whole image in one call of OpenImageIO and one of the filter."""
+    path = stored_as(tmp_path, kind)
+    background = (0.2, 0.4, 0.9)
+    whole = read_image(path, size=size, background=background)
+    monkeypatch.setattr("lapgs_plugin.scenes.images.STRIP_VALUES", 4000)
+    assert torch.equal(read_image(path, size=size, background=background), whole)
+    assert check_image(path) == (211, 157)
+    source = oiio.ImageInput.open(str(path))
+    pixels = source.read_image(oiio.FLOAT)
+    if source.spec().nchannels == 3:
+        expected = resize_image(as_tensor(pixels), size or (211, 157))
+        assert torch.equal(whole, expected.clamp(0, 1))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "LA", "I;16"])
+@pytest.mark.parametrize("size", [(157, 211), (80, 100), (157, 50), (30, 211), (300, 400)])
+def test_bands_of_an_8_bit_image_make_pillows_bytes(tmp_path: Path, mode: str, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    if mode == "I;16":
+        picture = Image.fromarray(rng.integers(0, 65536, (211, 157)).astype(np.uint16))
+    else:
+        picture = Image.fromarray(rng.integers(0, 256, (211, 157, 4)).astype(np.uint8)).convert(
+            "RGB" if mode == "P" else mode
+        )
+        picture = picture.convert(mode)
+    picture.save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as opened:
+        colour = opened if opened.mode in ("RGB", "RGBA") else opened.convert("RGBA")
+        expected = np.asarray(colour.resize(size))[..., :3]
+        values = np.asarray(colour.convert("RGBA")) / 255.0
+    blended = ((values[..., :3] * values[..., 3:] + 0.4 * (1 - values[..., 3:])) * 255.0).astype(np.uint8)
+    over = np.asarray(Image.fromarray(blended).resize(size))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lapgs_plugin.scenes.images.STRIP_VALUES", 4000)
+        for background, bytes_ in ((None, expected), ((0.4, 0.4, 0.4), over)):
+            read = read_as_3dgs(tmp_path / "a.png", size, background)
+            assert np.array_equal((read * 255).round().byte().permute(1, 2, 0).numpy(), bytes_)
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_gif_of_a_palette(tmp_path: Path, transparent: bool) -> None:
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8)).convert("P")
+    picture.save(tmp_path / "a.gif", **({"transparency": int(np.asarray(picture)[0, 0])} if transparent else {}))
+    with Image.open(tmp_path / "a.gif") as opened:
+        rgba = np.asarray(opened.convert("RGBA")) / 255.0
+    expected = rgba[..., :3] * rgba[..., 3:] + 0.25 * (1 - rgba[..., 3:])
+    assert bool((rgba[..., 3] < 1).any()) == transparent
+    image = read_image(tmp_path / "a.gif", background=(0.25, 0.25, 0.25))
+    torch.testing.assert_close(image.double(), as_tensor(expected), rtol=0, atol=3e-7)
+
+
+def test_channels_without_a_colour_are_refused(tmp_path: Path) -> None:
+    spec = oiio.ImageSpec(4, 3, 1, oiio.FLOAT)
+    spec.channelnames, spec.alpha_channel = ("A",), 0
+    target = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+    assert target.open(str(tmp_path / "a.exr"), spec)
+    assert target.write_image(np.ones((3, 4, 1), np.float32))
+    assert target.close()
+    with pytest.raises(SceneError, match=r"a\.exr: the image has no colours, expected grey or RGB"):
+        read_image(tmp_path / "a.exr")
+
+
+def test_names_that_no_file_can_have(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"image a{32}\.\.\. has 304 bytes, expected at most 255"):
+        read_image(tmp_path / ("a" * 300 + ".png"))
+    for name in ("a\0b.png", "\ud800.png"):
+        with pytest.raises(SceneError, match="no such image"):
+            read_image(tmp_path / name)
 
 
 # Files that are no images

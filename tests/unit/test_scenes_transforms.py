@@ -311,6 +311,18 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ({"frames": []}, "no list of frames"),
         ({"frames": [{"transform_matrix": [[1]]}]}, "frame 0 has no file_path"),
         ({"ply_file_path": "none.ply"}, r"none\.ply: not readable as a PLY"),
+        ({"ply_file_path": "a" * 300}, "not readable as a PLY"),
+        ({"ply_file_path": "/"}, "/: not readable as a PLY"),
+        ({"ply_file_path": "\0"}, "not readable as a PLY"),
+        (
+            {"fl_x": 1e300},
+            r"frame_000\.png has focal lengths 1e\+300 and 72 .* expected at most 1e\+06 sides of the image",
+        ),
+        ({"cx": -1e300}, r"principal point \(-1e\+300, 29.5\), expected at most"),
+        ({"w": 1e19, "h": 1e19, "fl_x": 1e19, "fl_y": 1e19}, "1e.19 pixels wide or high, expected at most 2147483648"),
+        ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
+        ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
+        ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
     ],
 )
 def test_wrong_values_of_the_file(tmp_path: Path, change: dict[str, object], message: str) -> None:
@@ -319,11 +331,42 @@ def test_wrong_values_of_the_file(tmp_path: Path, change: dict[str, object], mes
     refused(path, message)
 
 
+def placed(x: float) -> list[list[float]]:
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return matrix.tolist()
+
+
+def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
+    path = capture(tmp_path / "scene")
+    write_images(tmp_path, ["photos/a.png"], (80, 60))
+    edit(path, {"file_path": str(tmp_path / "photos" / "a.png"), "transform_matrix": placed(1e6)}, in_frame=0)
+    scene = load(path)
+    assert scene.train[0].name == "a.png"
+    assert scene.train[0].camera.position[0].item() == pytest.approx(1e6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"file_path": "images/none.png"}, r"images/none\.png: no such image"),
         ({"file_path": "images/frame_003.png"}, r"frame_003\.png is listed twice"),
+        ({"file_path": "a" * 300}, r"the name of image a{32}\.\.\. has 300 bytes, expected at most 255"),
+        ({"file_path": "images/" + "b" * 252 + ".png"}, "has 256 bytes, expected at most 255"),
+        ({"file_path": "/"}, r"frame 4 \(/\) names a folder, expected the name of its image"),
+        ({"file_path": ""}, r"frame 4 \(\) names a folder"),
+        ({"file_path": "images/.."}, "names a folder"),
+        ({"file_path": "images"}, "images: no such image"),
+        ({"file_path": "../../elsewhere.png"}, r"elsewhere\.png: no such image"),
+        ({"file_path": "a\0b"}, r"a\\x00b: no such image"),
+        ({"file_path": "\x1b[2Ja\nb\u202e.png"}, r"/\\x1b\[2Ja\\nb\\u202e\.png: no such image"),
+        ({"file_path": "\ud800.png"}, "not readable as JSON"),
+        ({"transform_matrix": [[10**400] * 4] * 4}, "holds the number of 1329 bits, expected 64 bits at most"),
+        (
+            {"transform_matrix": placed(1e300)},
+            r"frame 4 .* has 1e\+300 in its transform_matrix, expected at most 1e\+12",
+        ),
+        ({"transform_matrix": (1e300 * np.eye(4)).tolist()}, r"frame 4 .* has 1e\+300 in its transform_matrix"),
         ({"transform_matrix": None}, "frame 4 .* has no transform_matrix"),
         ({"transform_matrix": [[1, 2], [3]]}, "frame 4 .* has no transform_matrix"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "frame 4 .* has no transform_matrix"),
@@ -343,7 +386,44 @@ def test_files_that_are_not_what_they_say(tmp_path: Path) -> None:
     refused(path, r"points3d\.ply: not readable as a PLY")
     for text in ("", "{", "[1, 2]", "\x80"):
         (path / "transforms.json").write_text(text, encoding="latin-1")
-        refused(path, r"transforms\.json: (not readable as JSON|no list of frames)")
+        refused(path, r"transforms\.json(: no list of frames| is not readable as JSON)")
+
+
+PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n{}end_header\n{}"
+RGB = "".join(f"property {{0}} {channel}\n" for channel in ("red", "green", "blue"))
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", ["-5", "9" * 30, "1000000000", "1e3", "many", ""])
+def test_points_announced_that_cannot_be_there(tmp_path: Path, count: str, form: str) -> None:
+    path = capture(tmp_path, 2)
+    (path / "points3d.ply").write_text(PLY.format(form, count, "", "1 2 3\n" * 3))
+    refused(
+        path, rf"points3d\.ply: not readable as a PLY of points \(.*(counts '{count}'|of {count} \(vertex\)|line 3)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("properties", "row", "message"),
+    [
+        ("property float x\n", "1 2 3 4", "two properties with same name"),
+        (
+            RGB.format("list uchar float"),
+            "1 2 3 1 .5 1 .5 1 .5",
+            "blue, green, red missing or a list, expected a number",
+        ),
+        (RGB.format("uchar"), "1 2 3 300 1 1", "not readable as a PLY of points"),
+        (RGB.format("float"), "1 2 3 nan .5 .5", "colours of the sparse points hold NaN or inf, expected 0 to 255"),
+        (RGB.format("float"), "1 2 3 .5 inf .5", "colours of the sparse points hold NaN or inf"),
+        (RGB.format("double"), "1 2 3 .5 .5 nan", "colours of the sparse points hold NaN or inf"),
+        ("", "1 nan 3", "the sparse points are none or hold NaN or inf"),
+        ("", "1e20 2 3", r"a sparse point lies at 1e\+20, expected at most 1e\+12"),
+    ],
+)
+def test_points_that_cannot_be_used(tmp_path: Path, properties: str, row: str, message: str) -> None:
+    path = capture(tmp_path, 2)
+    (path / "points3d.ply").write_text(PLY.format("ascii", 3, properties, f"{row}\n" * 3))
+    refused(path, message)
 
 
 def test_ply_cut_anywhere_is_refused(tmp_path: Path) -> None:

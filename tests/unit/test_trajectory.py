@@ -156,6 +156,21 @@ EYE = np.eye(4).tolist()
         ({**GOOD, "fl_x": -3, "frames": [{"transform_matrix": EYE}]}, "focal lengths -3 and -3"),
         ({**GOOD, "w": "wide", "frames": [{"transform_matrix": EYE}]}, "frame 0 is not usable: invalid literal"),
         ({**GOOD, "frames": ["here"]}, "frame 0 is not usable"),
+        (
+            {**GOOD, "w": 10**5, "h": 10**5, "frames": [{"transform_matrix": EYE}]},
+            "frame 0 has 100000x100000 pixels, expected at most 128,000,000 pixels; .* LAPGS_MAX_VIEW_PIXELS",
+        ),
+        (
+            {**GOOD, "w": 10**300, "fl_x": 1e300, "frames": [{"transform_matrix": EYE}]},
+            "holds the number of 997 bits, expected 64 bits at most",
+        ),
+        ({**GOOD, "fl_x": 1e300, "frames": [{"transform_matrix": EYE}]}, "focal lengths 1e.300"),
+        ({**GOOD, "cx": -1e300, "frames": [{"transform_matrix": EYE}]}, r"around \(-1e.300, 24\)"),
+        ({**GOOD, "frames": [{"transform_matrix": (1e300 * np.eye(4)).tolist()}]}, "1e.300 in transform_matrix"),
+        (
+            {**GOOD, "frames": [{"transform_matrix": [[10**400] * 4] * 4}]},
+            "holds the number of 1329 bits, expected 64 bits at most",
+        ),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_the_frame(values: object, message: str, tmp_path: Path) -> None:
@@ -166,11 +181,23 @@ def test_a_bad_file_is_one_line_that_names_the_frame(values: object, message: st
     assert "\n" not in str(error.value)
 
 
+def test_a_file_of_too_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({**GOOD, "frames": [{"transform_matrix": EYE}] * 4}))
+    monkeypatch.setenv("LAPGS_MAX_FRAMES", "3")
+    with pytest.raises(
+        UserInputError, match=r"path\.json has 4 frames, expected at most 3 frames; .* LAPGS_MAX_FRAMES"
+    ):
+        read_trajectory(path)
+    monkeypatch.setenv("LAPGS_MAX_FRAMES", "4")
+    assert len(read_trajectory(path)) == 4
+
+
 def test_a_file_that_is_not_there_or_not_json(tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match="expected orbit, spline or a JSON file"):
+    with pytest.raises(UserInputError, match="give orbit, spline or a JSON file"):
         read_trajectory(tmp_path / "spiral")
     (tmp_path / "path.json").write_text("{")
-    with pytest.raises(UserInputError, match="not JSON"):
+    with pytest.raises(UserInputError, match="not readable as JSON"):
         read_trajectory(tmp_path / "path.json")
 
 

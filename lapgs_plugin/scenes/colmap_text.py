@@ -1,0 +1,138 @@
+"""Whether COLMAP's text files are as https://colmap.github.io/format.html describes them.
+
+pycolmap refuses most of what is wrong with them too, in words about its own source code, and takes a count of -96
+pixels for 18446744073709551520.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NoReturn, TypeVar
+
+import pycolmap
+
+from lapgs_plugin.errors import SceneError
+
+_Number = TypeVar("_Number", int, float)
+
+LARGEST_ID = 2**32 - 2
+"""Of a camera or an image; the next number means none."""
+SHOWN = 60
+"""Characters of a line that a message quotes."""
+
+
+def check_text(folder: Path) -> None:
+    """Check the text files of the model in `folder`: their numbers, their ids, and that ids named in one exist.
+
+    Raises:
+        SceneError: names the file, the line, what it says and what was expected.
+    """
+    cameras = _ids(folder / "cameras.txt", _check_camera)
+    images = _ids(folder / "images.txt", lambda line: _check_image(line, cameras), pairs=True)
+    _ids(folder / "points3D.txt", lambda line: _check_point(line, images))
+
+
+class _Line:
+    """A line that is no comment, and the words in it."""
+
+    def __init__(self, file: Path, number: int, text: str) -> None:
+        self.file, self.number, self.text = file, number, text
+        self.words = text.split()
+
+    def refuse(self, expected: str) -> NoReturn:
+        quoted = self.text if len(self.text) <= SHOWN else f"{self.text[:SHOWN]}..."
+        raise SceneError(
+            f"{self.file}: line {self.number} is {quoted!r}, expected {expected}; copy or export the model again"
+        )
+
+    def numbers(self, kind: Callable[[str], _Number], words: Sequence[str], what: str) -> list[_Number]:
+        """Words as finite numbers."""
+        try:
+            found = [kind(word) for word in words]
+        except ValueError:
+            self.refuse(what)
+        if not all(map(math.isfinite, found)):
+            self.refuse(what)
+        return found
+
+
+def _ids(file: Path, check: Callable[[_Line], int], pairs: bool = False) -> set[int]:
+    """Check a file's lines, of which each or the first of each two begins with an id; the ids."""
+    ids: set[int] = set()
+    for line in _lines(file, pairs):
+        key = check(line)
+        if key in ids:
+            line.refuse(f"each id once, {key} was there before")
+        ids.add(key)
+    return ids
+
+
+def _lines(file: Path, pairs: bool) -> Iterator[_Line]:
+    try:
+        with file.open(encoding="utf-8") as stream:
+            numbered = enumerate(stream, start=1)
+            for number, text in numbered:
+                if (stripped := text.strip()) and not stripped.startswith("#"):
+                    yield _Line(file, number, stripped)
+                    if pairs:
+                        _check_observations(_Line(file, number + 1, next(numbered, (0, ""))[1].strip()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{file}: not readable as text in UTF-8 ({error}); copy or export the model again") from error
+
+
+def _check_camera(line: _Line) -> int:
+    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"
+    if len(line.words) < 4:
+        line.refuse(expected)
+    key, width, height = line.numbers(int, [line.words[0], *line.words[2:4]], expected)
+    if not 0 <= key <= LARGEST_ID or min(width, height) < 1:
+        line.refuse(f"{expected} with positive numbers")
+    model = line.words[1]
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
+    camera = pycolmap.Camera()
+    camera.model = pycolmap.CameraModelId.__members__[model]
+    count = sum(
+        len(each()) for each in (camera.focal_length_idxs, camera.principal_point_idxs, camera.extra_params_idxs)
+    )
+    if len(line.numbers(float, line.words[4:], f"{count} finite parameters of {model}")) != count:
+        line.refuse(f"{count} parameters of {model}, not {len(line.words) - 4}")
+    return key
+
+
+def _check_image(line: _Line, cameras: set[int]) -> int:
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
+    if len(line.words) < 10:
+        line.refuse(expected)
+    key, camera = line.numbers(int, [line.words[0], line.words[8]], expected)
+    quaternion = line.numbers(float, line.words[1:8], expected)[:4]
+    if not 0 <= key <= LARGEST_ID:
+        line.refuse(f"an id from 0 to {LARGEST_ID}")
+    if not 0.0 < math.hypot(*quaternion) < math.inf:
+        line.refuse("a rotation, the quaternion QW QX QY QZ of length 1")
+    if camera not in cameras:
+        line.refuse(f"the id of a camera in cameras.txt, there is no {camera}")
+    return key
+
+
+def _check_observations(line: _Line) -> None:
+    if len(line.words) % 3:
+        line.refuse("X Y POINT3D_ID for each observation")
+
+
+def _check_point(line: _Line, images: set[int]) -> int:
+    expected = "POINT3D_ID X Y Z R G B ERROR TRACK with finite numbers"
+    if len(line.words) < 8:
+        line.refuse(expected)
+    (key,) = line.numbers(int, line.words[:1], expected)
+    line.numbers(float, [*line.words[1:4], line.words[7]], expected)
+    if key < 0 or not all(0 <= channel <= 255 for channel in line.numbers(int, line.words[4:7], expected)):
+        line.refuse("a positive id and colours from 0 to 255")
+    track = line.numbers(int, line.words[8:], expected)
+    if len(track) % 2:
+        line.refuse("IMAGE_ID POINT2D_IDX for each image of the track")
+    if unknown := set(track[::2]) - images:
+        line.refuse(f"ids of images in images.txt, there is no {min(unknown)}")
+    return key

@@ -1,0 +1,218 @@
+"""Check what a stage is continued from: a checkpoint's state, and the optimizer state that the coarser level left."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, TypeAdapter, ValidationError
+from torch import Tensor
+
+from lapgs_plugin.errors import FieldError, RunFolderError
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.untrusted import problem
+
+if sys.version_info >= (3, 12):
+    from typing import NotRequired, TypedDict
+else:  # pydantic cannot read the older TypedDict of `typing`
+    from typing_extensions import NotRequired, TypedDict
+
+ADVICE = "delete it to continue from the last finished level"
+MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
+"""Adam's state of a parameter, once it has made a step."""
+_STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+
+Moments = dict[str, dict[str, Tensor]]
+
+
+class ProgressState(TypedDict):
+    """`stage.StageProgress`; the loss is NaN before the first iteration."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    iteration: NonNegativeInt
+    seconds: NonNegativeFloat
+    loss: float
+    peak_gaussians: NonNegativeInt
+    gaussian_steps: NonNegativeInt
+
+
+class ModelState(TypedDict):
+    """What `model.TrainableField.state` gives."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    params: dict[str, Tensor]
+    moments: Moments
+    gradients: NotRequired[dict[str, Tensor]]
+    signed: bool
+
+
+class StageState(TypedDict):
+    """What `stage.StageRun.state` gives, and the overhead so far."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    level: NonNegativeInt
+    progress: ProgressState
+    breakdown: NotRequired[dict[str, NonNegativeFloat]]
+    model: ModelState
+    densifier: dict[str, Any]
+    joint: NotRequired[dict[int, ModelState] | None]
+    random: Tensor
+    random_gpu: NotRequired[Tensor]
+    overhead: dict[str, NonNegativeFloat]
+
+
+def check_checkpoint(
+    state: dict[str, Any], path: Path, stage: Stage, settings: TrainSettings, finished: Collection[int]
+) -> None:
+    """Check that a stage can be continued from a checkpoint, before anything is made of it.
+
+    Args:
+        state: what the checkpoint holds.
+        path: of its file, for the message.
+        stage: that is to be continued.
+        settings: of the run.
+        finished: levels of the run that are.
+
+    Raises:
+        RunFolderError: it is damaged, or of another stage.
+    """
+    try:
+        _STATE.validate_python(state)
+        _check_state(state, stage, settings, finished)
+    except ValidationError as error:
+        raise RunFolderError(f"{path} is damaged: {problem(error)}; {ADVICE}") from None
+    except (FieldError, ValueError) as error:
+        raise RunFolderError(f"{path} is damaged: {error}; {ADVICE}") from error
+
+
+def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: int, path: Path) -> None:
+    """Check what density control remembers, against what it begins with.
+
+    Args:
+        state: from a checkpoint.
+        fresh: of the same strategy before its first iteration.
+        count: Gaussians of the field.
+        path: of the checkpoint, for the message.
+
+    Raises:
+        RunFolderError: it is of another strategy or field.
+    """
+    sums = {name for name, first in fresh.items() if first is None}
+    right = state.keys() == fresh.keys() and len({state[name] is None for name in sums}) <= 1
+    for name in fresh if right else ():
+        value, first = state[name], fresh[name]
+        if isinstance(first, Tensor):
+            right = right and _is_finite(value, first.shape, first.dtype)
+        elif first is None:
+            right = right and (value is None or _is_finite(value, torch.Size([count]), torch.float32))
+        else:
+            right = right and type(value) is type(first) and math.isfinite(value)
+    if not right:
+        raise RunFolderError(
+            f"{path} is damaged: densifier is not the state of this run's density control for {count} Gaussians; "
+            f"{ADVICE}"
+        )
+
+
+def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
+    """Check the optimizer state that a finished level left, against its field.
+
+    Raises:
+        RunFolderError: it is damaged, or of another field.
+    """
+    try:
+        _MOMENTS.validate_python(moments)
+        _check_moments(moments, _shapes(field))
+    except ValidationError as error:
+        raise RunFolderError(f"{path} is damaged: {problem(error)}; start again with --overwrite") from None
+    except ValueError as error:
+        raise RunFolderError(f"{path} is damaged: {error}; start again with --overwrite") from error
+
+
+def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
+    """Compare the parts of a state with each other and with the run; raises ValueError."""
+    iteration, joint_from = state["progress"]["iteration"], settings.joint_from(stage)
+    if state["level"] != stage.level:
+        raise ValueError(f"level is {state['level']}, expected {stage.level}")
+    if iteration > stage.iterations:
+        raise ValueError(f"progress.iteration is {iteration}, expected at most {stage.iterations}")
+    _check_model(state["model"], "model", stage.signed, settings.sh_degree)
+    joint = state.get("joint") or {}
+    wanted = set(finished) if joint_from is not None and iteration >= joint_from else set()
+    if joint.keys() != wanted:
+        raise ValueError(f"joint has levels {sorted(joint)}, expected {sorted(wanted)}")
+    for level, model in joint.items():
+        _check_model(model, f"joint.{level}", model["signed"], settings.sh_degree)
+    random = state["random"]
+    if random.dtype != torch.uint8 or random.shape != torch.get_rng_state().shape:
+        raise ValueError(f"random is {_what(random)}, expected a state of PyTorch's generator")
+    try:
+        torch.Generator().set_state(random)
+    except RuntimeError as error:
+        raise ValueError(f"random is no state of PyTorch's generator ({str(error).splitlines()[0]})") from error
+
+
+def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int) -> None:
+    """Check a field and what its optimizer has of it."""
+    params = model["params"]
+    field = field_from_splats(params, model["signed"])
+    shapes = _shapes(field)
+    if field.signed != signed or field.sh_degree != sh_degree:
+        raise ValueError(
+            f"{name} is {'a residual' if field.signed else 'no residual'} of SH degree {field.sh_degree}, expected "
+            f"{'a residual' if signed else 'none'} of degree {sh_degree}"
+        )
+    for kind in ("params", "gradients"):
+        for each, tensor in model.get(kind, {}).items():
+            if each not in params or not _is_finite(tensor, shapes.get(each), torch.float32):
+                raise ValueError(f"{name}.{kind}.{each} is {_what(tensor)}, expected finite float32 {shapes.get(each)}")
+    try:
+        _check_moments(model["moments"], {each: shapes[each] for each in params})
+    except ValueError as error:
+        raise ValueError(f"{name}.moments: {error}") from error
+
+
+def _check_moments(moments: Moments, shapes: Mapping[str, torch.Size]) -> None:
+    """Check Adam's state against the parameters that it is of; SH may be one tensor or two."""
+    others = set(SPLAT_NAMES)
+    if moments.keys() not in ({*others, "sh"}, {*others, "sh0", "shN"}) or not moments.keys() <= shapes.keys():
+        raise ValueError(f"Adam's state is of {', '.join(sorted(map(str, moments)))}, expected {', '.join(shapes)}")
+    for name, state in moments.items():
+        if state and state.keys() != MOMENTS:
+            raise ValueError(f"{name} has {', '.join(sorted(state))}, expected {', '.join(sorted(MOMENTS))}")
+        for key, tensor in state.items():
+            shape = torch.Size([]) if key == "step" else shapes[name]
+            if not _is_finite(tensor, shape, torch.float32) or (key != "exp_avg" and bool((tensor < 0).any())):
+                raise ValueError(f"{name}.{key} is {_what(tensor)}, expected finite float32 {tuple(shape)}")
+
+
+def _shapes(field: GaussianField) -> dict[str, torch.Size]:
+    """Of each parameter, by gsplat's names of it."""
+    values = {theirs: field.parameters[ours].shape for theirs, ours in SPLAT_NAMES.items()}
+    return {**values, "sh": field.sh.shape, "sh0": field.sh[:, :1].shape, "shN": field.sh[:, 1:].shape}
+
+
+def _is_finite(value: Any, shape: torch.Size | None, dtype: torch.dtype) -> bool:
+    """Whether it is a tensor of that shape and type without NaN and inf."""
+    return (
+        isinstance(value, Tensor)
+        and value.shape == shape
+        and value.dtype == dtype
+        and bool(torch.isfinite(value).all())
+    )
+
+
+def _what(value: Tensor) -> str:
+    """A tensor for a message."""
+    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+
+
+_STATE: TypeAdapter[Any] = TypeAdapter(StageState)
+_MOMENTS: TypeAdapter[Any] = TypeAdapter(Moments, config=_STRICT)

@@ -1,0 +1,17 @@
+"""One process that reads cases, and one set of whole files, for all tests of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.fuzz.harness import Fuzzer, Reader
+from tests.fuzz.templates import make_templates
+
+
+@pytest.fixture(scope="session")
+def fuzzer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzer]:
+    scratch = tmp_path_factory.mktemp("fuzz")
+    with Reader(scratch / "work") as reader:
+        yield Fuzzer(make_templates(scratch / "templates", reader), scratch / "work", reader)

@@ -1,0 +1,176 @@
+"""The kinds of files that `lapgs` reads: how each is damaged, and which commands read it."""
+
+from __future__ import annotations
+
+import ast
+import json
+import sys
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+from tests.fuzz.formats import (
+    damaged_ascii_ply,
+    damaged_colmap,
+    damaged_exr,
+    damaged_gif,
+    damaged_jpeg,
+    damaged_lines,
+    damaged_ply,
+    damaged_png,
+    damaged_store,
+    damaged_tensors,
+    damaged_tiff,
+)
+from tests.fuzz.harness import Damage, Kind
+from tests.fuzz.mutations import Emit, as_json, as_namespace, as_toml, damaged_document, damaged_file, damaged_text
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def _document(parse: Callable[[str], Any], emit: Emit) -> Damage:
+    def damage(data: bytes, random: Random) -> bytes:
+        return damaged_document(parse(data.decode()), emit, random)
+
+    return damage
+
+
+def _text(data: bytes, random: Random) -> bytes:
+    return damaged_file(data, random) if random.random() < 0.3 else damaged_text(data, random)
+
+
+def damaged_layout(data: bytes, random: Random) -> bytes:
+    """Steps of `harness.rearrange` over the paths in `data`, one a line."""
+    paths = data.decode().split("\n")
+    names = (
+        "x",
+        "L99",
+        "L7",
+        "L00",
+        "iteration_1",
+        "iteration_999999999999",
+        "iteration_",
+        "level_9",
+        "n" * 255,
+        "a\nb",
+        "\x1b[2J",
+    )
+    steps = []
+    for _ in range(random.choice((1, 1, 2))):
+        action = random.choice(("remove", "folder", "file", "loop", "move", "copy"))
+        other = {"move": [random.choice(names)], "copy": [random.choice(paths)]}.get(action, [])
+        steps.append([action, random.choice(paths), *other])
+    return json.dumps(steps).encode()
+
+
+def _options(text: str) -> dict[str, Any]:
+    call = ast.parse(text, mode="eval").body
+    assert isinstance(call, ast.Call)
+    return {str(each.arg): ast.literal_eval(each.value) for each in call.keywords}
+
+
+JSON = _document(json.loads, as_json)
+TOML = _document(tomllib.loads, as_toml)
+NAMESPACE = _document(_options, as_namespace)
+
+ORACLE = ("--rasterizer", "oracle")
+RESUME = ("train", "{templates}/scene_json", "-o", "run_part", "--resume")
+REPORT = ("report", "run_done", *ORACLE)
+EXPORT = ("export", "run_done", "-o", "out")
+CLIP = ("render", "run_done", *ORACLE, "--trajectory", "path/trajectory.json", "-o", "clip")
+TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
+
+
+def _scene(name: str, target: str, damage: Damage, also: tuple[str, ...] = ()) -> Kind:
+    folder = target.split("/", maxsplit=1)[0]
+    resolutions = ("full", "full", "20", *(() if "exr" in name else ("3dgs:24",)))  # Pillow knows no EXR
+    reads = [("read-scene", folder, resolution) for resolution in resolutions]
+    return Kind(name, target, damage, reads, [("train", folder, *TRAIN)], also)
+
+
+KINDS = (
+    Kind("manifest", "run_done/manifest.json", JSON, [EXPORT, EXPORT, REPORT], [CLIP], also=["path"]),
+    Kind("manifest to resume", "run_part/manifest.json", JSON, [RESUME]),
+    Kind("history", "run_done/history.jsonl", damaged_lines, [REPORT]),
+    Kind("history to resume", "run_part/history.jsonl", damaged_lines, [RESUME]),
+    Kind("metrics", "run_done/metrics.json", JSON, [REPORT]),
+    Kind("checkpoint", "run_part/checkpoint.pt", damaged_tensors, [RESUME]),
+    Kind("optimizer", "run_part/level_1/optimizer.pt", damaged_tensors, [RESUME]),
+    Kind(
+        "field",
+        "run_done/level_0/point_cloud.ply",
+        damaged_ply,
+        [("read-field", "run_done/level_0/point_cloud.ply")],
+        [EXPORT, REPORT],
+    ),
+    Kind("field in ASCII", "ascii/field.ply", damaged_ascii_ply, [("read-field", "ascii/field.ply")]),
+    Kind(
+        "trajectory",
+        "path/trajectory.json",
+        JSON,
+        [("read-trajectory", "path/trajectory.json"), CLIP],
+        also=["run_done"],
+    ),
+    _scene("transforms", "scene_json/transforms.json", JSON),
+    _scene("points", "scene_json/points3d.ply", damaged_ascii_ply),
+    *(
+        _scene(f"COLMAP {name}", f"scene_bin/sparse/0/{name}.bin", damaged_colmap)
+        for name in ("cameras", "images", "points3D", "rigs", "frames")
+    ),
+    *(
+        _scene(f"COLMAP {name} text", f"scene_txt/sparse/0/{name}.txt", _text)
+        for name in ("cameras", "images", "points3D")
+    ),
+    *(
+        _scene(f"photo {index} {suffix}", f"scene_{suffix}/photos/{index}.{suffix}", damage)
+        for suffix, damage, indices in (
+            ("png", damaged_png, (0, 1, 2)),
+            ("jpg", damaged_jpeg, (0, 1)),
+            ("gif", damaged_gif, (0,)),
+            ("exr", damaged_exr, (0,)),
+            ("tif", damaged_tiff, (0, 1, 2)),
+        )
+        for index in indices
+    ),
+    Kind(
+        "experiment",
+        "bench/experiment.toml",
+        TOML,
+        [("bench", "run", "bench/experiment.toml", "--out", "out", "--dry-run")],
+        also=["scene_json"],
+    ),
+    Kind(
+        "store",
+        "bench/results.sqlite",
+        damaged_store,
+        [("bench", "run", "bench/experiment.toml", "--out", "bench", "--tables-only")],
+    ),
+    Kind("results", "bench/results.csv", _text, [("report", "bench", *ORACLE)]),
+    *(
+        Kind(f"recipe {name}", f"recipes/{name}.toml", TOML, [("read-recipes", "recipes")])
+        for name in ("fastgs", "taming", "graphdeco")
+    ),
+    Kind("cfg_args", "foreign/cfg_args", NAMESPACE, [("import-run", "foreign", "-o", "out")]),
+    Kind("recorded run", "foreign/lapgs_record.json", JSON, [("import-run", "foreign", "-o", "out")]),
+    Kind("TRAIN_INFO", "foreign_levels/L1/TRAIN_INFO", _text, [("import-run", "foreign_levels", "-o", "out")]),
+    Kind("breakdown", "foreign_levels/runtime_breakdown.json", JSON, [("import-run", "foreign_levels", "-o", "out")]),
+    Kind("tables", "bench/tables.md", _text, [("report", "bench", *ORACLE)]),
+    Kind("run layout", "run_done", damaged_layout, [REPORT, EXPORT], layout=True),
+    Kind("run layout to resume", "run_part", damaged_layout, [RESUME], layout=True),
+    Kind("scene layout", "scene_json", damaged_layout, [("read-scene", "scene_json", "full")], layout=True),
+    Kind("COLMAP layout", "scene_bin", damaged_layout, [("read-scene", "scene_bin", "full")], layout=True),
+    Kind(
+        "foreign layout", "foreign_levels", damaged_layout, [("import-run", "foreign_levels", "-o", "out")], layout=True
+    ),
+    Kind("experiment layout", "bench", damaged_layout, [("report", "bench", *ORACLE)], layout=True),
+    Kind(
+        "foreign field",
+        "foreign/point_cloud/iteration_30/point_cloud.ply",
+        damaged_ply,
+        [("import-run", "foreign", "-o", "out")],
+    ),
+)
+BY_NAME = {kind.name: kind for kind in KINDS}

@@ -1,0 +1,267 @@
+"""Damaged checkpoints and optimizer states: one line, and the run is as it was."""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import pickle
+import signal
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs.archive import CHECKPOINT, Manifest, RunArchive, SceneReference
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import ring_scene
+
+SETTINGS = TrainSettings(
+    iterations=24,
+    hierarchy="laplacian",
+    inherit="full",
+    sh_degree=1,
+    sh_every=4,
+    densification=Densification(start=3, until=20, every=5, reset_every=12),
+    joint=0.25,
+)
+Saved = dict[str, Any]
+
+
+class StopInTheEnd(Monitor):
+    """Asks the run to stop one iteration before its end, when the base is trained along."""
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == (0, stage.iterations - 1):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ring_scene()
+
+
+@pytest.fixture(scope="module")
+def stopped(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was stopped in its last stage."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **SETTINGS.for_manifest())
+    with RunArchive.create(folder, manifest) as archive, pytest.raises(TrainingStoppedError):
+        Trainer(scene, SETTINGS, archive, CpuRasterizer(), monitor=StopInTheEnd()).run()
+    return folder
+
+
+def resume(folder: Path, scene: Scene) -> None:
+    with RunArchive.open(folder, resume=True) as archive:
+        Trainer(scene, SETTINGS, archive, CpuRasterizer()).run(resume=True)
+
+
+def put(saved: Any, value: Any, *keys: Any) -> Any:
+    """`saved` with another value somewhere in it."""
+    at = saved
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = value
+    return saved
+
+
+def drop(saved: Saved, *keys: Any) -> Saved:
+    at = saved
+    for key in keys[:-1]:
+        at = at[key]
+    del at[keys[-1]]
+    return saved
+
+
+def cut(saved: Saved, *keys: Any) -> Saved:
+    """One tensor without its last row."""
+    at = saved
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = at[keys[-1]][:-1].clone()
+    return saved
+
+
+STATE = ("state",)
+DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
+    "a list": (lambda saved: [], "holds a list, expected a dictionary"),
+    "empty": (lambda saved: {}, "holds level None and a state that is a NoneType"),
+    "no state": (lambda saved: {"level": 0}, "a state that is a NoneType, expected a number and a dictionary"),
+    "a tensor": (lambda saved: torch.zeros(3), "holds a Tensor, expected a dictionary"),
+    "level in words": (lambda saved: put(saved, "0", "level"), "holds level '0'"),
+    "another level": (lambda saved: put(saved, 7, "level"), "is of level 7, expected 0"),
+    "another inner level": (lambda saved: put(saved, 1, "state", "level"), "level is 1, expected 0"),
+    "empty state": (lambda saved: {"level": 0, "state": {}}, "it lacks level"),
+    "no progress": (lambda saved: drop(saved, "state", "progress"), "it lacks progress"),
+    "no iteration": (lambda saved: drop(saved, "state", "progress", "iteration"), "it lacks progress.iteration"),
+    "iteration in words": (
+        lambda saved: put(saved, "9", "state", "progress", "iteration"),
+        "progress.iteration is '9'",
+    ),
+    "iteration too large": (
+        lambda saved: put(saved, 999, "state", "progress", "iteration"),
+        "progress.iteration is 999, expected at most 16",
+    ),
+    "unknown": (lambda saved: put(saved, 1, "state", "colour"), "it has an unknown key colour"),
+    "overhead": (lambda saved: put(saved, [], "state", "overhead"), "overhead is"),
+    "a list as model": (lambda saved: put(saved, [], "state", "model"), "model is .., expected"),
+    "no means": (lambda saved: drop(saved, "state", "model", "params", "means"), "splats without means"),
+    "params cut": (lambda saved: cut(saved, "state", "model", "params", "quats"), "quaternions has shape"),
+    "a moment cut": (
+        lambda saved: cut(saved, "state", "model", "moments", "means", "exp_avg"),
+        r"model\.moments: means\.exp_avg is float32 \(\d+, 3\), expected finite float32",
+    ),
+    "no moment": (lambda saved: drop(saved, "state", "model", "moments", "sh", "exp_avg_sq"), "sh has exp_avg, step"),
+    "no moments": (lambda saved: drop(saved, "state", "model", "moments", "sh"), "Adam's state is of means, op"),
+    "a moment in words": (
+        lambda saved: put(saved, "x", "state", "model", "moments", "means", "exp_avg"),
+        r"model\.moments\.means\.exp_avg is 'x'",
+    ),
+    "joint cut": (
+        lambda saved: cut(saved, "state", "joint", 1, "moments", "opacities", "exp_avg_sq"),
+        r"joint\.1\.moments: opacities\.exp_avg_sq",
+    ),
+    "no joint": (lambda saved: put(saved, None, "state", "joint"), r"joint has levels \[\], expected \[1\]"),
+    "other joint": (
+        lambda saved: put(saved, {5: saved["state"]["joint"][1]}, "state", "joint"),
+        r"joint has levels \[5\], expected \[1\]",
+    ),
+    "doubles": (
+        lambda saved: put(
+            saved, saved["state"]["model"]["params"]["means"].double(), *STATE, "model", "params", "means"
+        ),
+        r"model\.params\.means is float64",
+    ),
+    "NaN": (
+        lambda saved: put(saved, saved["state"]["model"]["params"]["sh"] * torch.nan, *STATE, "model", "params", "sh"),
+        r"model\.params\.sh is float32 .*, expected finite",
+    ),
+    "unsigned": (lambda saved: put(saved, False, "state", "model", "signed"), "model is no residual of SH degree 1"),
+    "a gradient": (
+        lambda saved: put(saved, {"means": torch.zeros(2, 3)}, "state", "model", "gradients"),
+        r"model\.gradients\.means is float32 \(2, 3\)",
+    ),
+    "densifier": (lambda saved: put(saved, {}, "state", "densifier"), "densifier is not the state"),
+    "densifier cut": (
+        lambda saved: put(saved, torch.zeros(2), "state", "densifier", "grad2d"),
+        "densifier is not the state",
+    ),
+    "random": (lambda saved: put(saved, torch.zeros(3), "state", "random"), r"random is float32 \(3,\)"),
+    "random numbers": (
+        lambda saved: put(saved, torch.full_like(saved["state"]["random"], 255), "state", "random"),
+        "random is no state of PyTorch's generator",
+    ),
+    "a view of more": (
+        lambda saved: put(saved, torch.zeros(1).expand(10**12), "state", "random"),
+        "names tensors of 4,0.* bytes, expected at most its own",
+    ),
+    "sparse": (lambda saved: put(saved, torch.eye(3).to_sparse(), "state", "random"), "expected dense ones"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_checkpoint_is_one_line(name: str, stopped: Path, scene: Scene) -> None:
+    path = stopped / CHECKPOINT
+    whole = path.read_bytes()
+    make, message = DAMAGE[name]
+    try:
+        torch.save(make(copy.deepcopy(torch.load(path, weights_only=True))), path)
+        damaged = path.read_bytes()
+        history = (stopped / "history.jsonl").read_bytes()
+        with pytest.raises(RunFolderError, match=message) as caught:
+            resume(stopped, scene)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+        assert "delete it to continue from the last finished level" in str(caught.value)
+        assert (path.read_bytes(), (stopped / "history.jsonl").read_bytes()) == (damaged, history)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_a_checkpoint_of_a_finished_level_is_said(
+    stopped: Path, scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = stopped / CHECKPOINT
+    whole = path.read_bytes()
+    try:
+        torch.save({**torch.load(path, weights_only=True), "level": 1}, path)
+        with caplog.at_level(logging.WARNING), RunArchive.open(stopped, resume=True) as archive:
+            assert archive.load_checkpoint() is None
+        assert "is of level 1, which is finished: it is not used" in caplog.text
+    finally:
+        path.write_bytes(whole)
+
+
+def bomb() -> bytes:
+    """A zip file whose contents are a thousand times as large."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("checkpoint/data.pkl", pickle.dumps({"level": 0}))
+        archive.writestr("checkpoint/data/0", bytes(200 * 2**20))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        (bomb, "unpacks to 209,7.* bytes, expected no more than its own"),
+        (lambda: pickle.dumps({"level": 0}), "is not a zip file"),
+        (lambda: b"", "is not a zip file"),
+    ],
+)
+def test_files_that_torch_did_not_write(
+    contents: Callable[[], bytes], message: str, stopped: Path, scene: Scene
+) -> None:
+    path = stopped / CHECKPOINT
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(contents())
+        tracemalloc.start()
+        with pytest.raises(RunFolderError, match=rf"checkpoint\.pt cannot be read \(.*{message}.*; delete it"):
+            resume(stopped, scene)
+        assert tracemalloc.get_traced_memory()[1] < 10 * 2**20  # 0.3 MiB seen
+    finally:
+        tracemalloc.stop()
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda saved: [], "holds a list"),
+        (lambda saved: {}, "Adam's state is of , expected"),
+        (lambda saved: cut(saved, "quats", "exp_avg"), r"quats\.exp_avg is float32 \(\d+, 4\), expected"),
+        (lambda saved: put(saved, 1, "sh"), "sh is 1, expected"),
+    ],
+)
+def test_a_damaged_optimizer_state_is_one_line(
+    make: Callable[[Saved], Any], message: str, stopped: Path, scene: Scene
+) -> None:
+    checkpoint, path = stopped / CHECKPOINT, stopped / "level_1" / "optimizer.pt"
+    kept = checkpoint.read_bytes(), path.read_bytes()
+    try:
+        checkpoint.unlink()
+        torch.save(make(torch.load(path, weights_only=True)), path)
+        with pytest.raises(RunFolderError, match=message) as caught:
+            resume(stopped, scene)
+        assert "start again with --overwrite" in str(caught.value)
+    finally:
+        checkpoint.write_bytes(kept[0])
+        path.write_bytes(kept[1])
+
+
+def test_the_checkpoint_itself_is_fine(stopped: Path, scene: Scene) -> None:
+    """Last in this file: the run ends."""
+    resume(stopped, scene)
+    assert RunArchive.open(stopped).manifest.complete
