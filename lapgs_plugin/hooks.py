@@ -5,6 +5,10 @@ order of their names, then those given as arguments in the order they were given
 
     before_render  ->  (render)  ->  compose  ->  loss  ->  (backward)  ->  after_backward  ->  (step)  ->  on_densify
 
+Where several views make a step, `before_render`, `compose` and `loss` are called for each of them, with its own image
+and iteration, and the losses are added up. `after_backward` and `on_densify` are called once a step, with the context
+of its last view, when the gradients of all its views are there. A step that runs out of memory begins again.
+
 `compose` is a chain: each hook gets what the one before it returned, the first one the rendered image. `loss` is a sum:
 each hook sees the composed image and may add a term.
 """
@@ -85,7 +89,7 @@ class StageHook:
         return None
 
     def after_backward(self, context: StageContext) -> None:
-        """Gradients are there, the optimizer has not stepped yet."""
+        """Gradients are there, of all views of the step, and the optimizer has not stepped yet."""
 
     def on_densify(self, context: StageContext) -> None:
         """Density control has just added, removed or reset Gaussians."""
@@ -149,6 +153,14 @@ class HookDispatcher:
         """
         stock = (Composition(), SupervisionLoss(supervision, ssim_weight))
         return cls((*stock, *entry_point_hooks(), *user_hooks))
+
+    @property
+    def takes_batches(self) -> bool:
+        """Whether `compose` and `loss` may get images of several views, (b, 3, h, w), where the context has such, too.
+
+        Users' hooks are written for one view.
+        """
+        return all(isinstance(hook, (Composition, SupervisionLoss)) for hook in self._hooks)
 
     def on_stage_start(self, stage: Stage) -> None:
         for hook in self._hooks:

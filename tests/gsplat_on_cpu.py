@@ -1,19 +1,23 @@
 """gsplat's CUDA kernels on the CPU: its own PyTorch code of them, or plain tiles and blending.
 
-They take and return what those of gsplat 1.5.3 do, as far as rendering without gradients asks for it, and refuse what
-those cannot bear. gsplat's functions are its own.
+They take and return what those of gsplat 1.5.3 do, as far as we ask for it, and refuse what those cannot bear. gsplat's
+functions are its own. Backward passes are autograd's, through the forward ones; absolute gradients are those of sums.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import pytest
 import torch
 from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
+
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.rasterizers import gsplat_direct
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -29,26 +33,35 @@ def _project(
     width: int, height: int, eps2d: float, near: float, far: float, clip: float, compensates: bool, camera_model: str,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert len(means) > 0, "the kernel's launch divides by it"
-    assert camera_model == "CameraModelType.PINHOLE"
+    assert str(camera_model) == "CameraModelType.PINHOLE"
     covariances_3d, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     radii, means2d, depths, conics, dimmed = _torch_impl._fully_fused_projection(
         means, covariances_3d, viewmats, Ks, width, height,
         eps2d=eps2d, near_plane=near, far_plane=far, calc_compensations=compensates,
     )  # fmt: skip
-    faint = opacities * (1 if dimmed is None else dimmed[0]) < FAINTEST
-    radii[0, faint] = 0
-    culled = ~(radii > clip).all(-1)  # (1, n)
+    faint = opacities * (1 if dimmed is None else dimmed) < FAINTEST  # (n,) or (c, n)
+    radii[faint.expand(len(radii), -1)] = 0
+    culled = ~(radii > clip).all(-1)  # (c, n)
     for values in (means2d, depths, conics):
         values[culled] = torch.nan  # the kernel leaves memory as it was
-    return radii, means2d, depths, conics, dimmed
+    return radii.contiguous(), means2d.contiguous(), depths.contiguous(), conics.contiguous(), dimmed
 
 
 def _intersect(
-    means2d: Tensor, radii: Tensor, depths: Tensor, image_ids: Tensor, gaussian_ids: Tensor, images: int, tile: int,
-    columns: int, rows: int, sort: bool, segmented: bool,
+    means2d: Tensor, radii: Tensor, depths: Tensor, image_ids: Tensor | None, gaussian_ids: Tensor | None, images: int,
+    tile: int, columns: int, rows: int, sort: bool, segmented: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Of a packed list: how many tiles each has; and sorted, which tile over all images it is, and which Gaussian."""
-    assert means2d.ndim == 2
+    """How many tiles each has; and sorted, which tile over all images it is, and which Gaussian over all images.
+
+    Of a packed list, or of as many Gaussians in every image, (i, n, ...).
+    """
+    if means2d.ndim == 3:
+        assert image_ids is gaussian_ids is None
+        assert len(means2d) == images
+        image_ids = gaussian_ids = torch.arange(images).repeat_interleave(means2d.shape[1])
+        means2d, radii, depths = means2d.flatten(0, 1), radii.flatten(0, 1), depths.flatten()
+    assert image_ids is not None
+    assert gaussian_ids is not None
     assert sort
     assert len(means2d) == len(image_ids) == len(gaussian_ids)
     assert image_ids.dtype == gaussian_ids.dtype == torch.int64
@@ -72,13 +85,17 @@ def _offsets(keys: Tensor, images: int, columns: int, rows: int) -> Tensor:
 
 
 def _blend(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: None, masks: None,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, masks: None,
     width: int, height: int, tile_size: int, offsets: Tensor, order: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    assert len(means2d) == len(conics) == len(colors) == len(opacities)
-    assert backgrounds is None
+    assert means2d.shape[:-1] == conics.shape[:-1] == colors.shape[:-1] == opacities.shape
     assert masks is None
     count, rows, columns = offsets.shape
+    if means2d.ndim == 3:
+        assert len(means2d) == count
+        means2d, conics, colors, opacities = (part.flatten(0, 1) for part in (means2d, conics, colors, opacities))
+    else:
+        assert backgrounds is None
     images = torch.zeros(count, rows * tile_size, columns * tile_size, 4)  # with opacities
     ends = [*offsets.flatten().tolist(), len(order)]
     within = torch.arange(tile_size) + 0.5
@@ -100,7 +117,72 @@ def _blend(
         there[..., :3] = torch.einsum("mij,mc->ijc", alphas * before, colors[ids])
         there[..., 3] = 1 - torch.prod(1 - alphas, 0)
     images = images[:, :height, :width]
-    return images[..., :3].contiguous(), images[..., 3:].contiguous(), torch.empty(0)
+    colored, alphas = images[..., :3], images[..., 3:]
+    if backgrounds is not None:
+        assert backgrounds.shape == (count, 3)
+        colored = colored + (1 - alphas) * backgrounds[:, None, None]
+    return colored.contiguous(), alphas.contiguous(), torch.empty(0)
+
+
+def _back(kernel: Callable[..., Any], given: list[Any], outputs: list[int], gradients: list[Tensor]) -> list[Tensor]:
+    """The gradients by the tensors in `given` that are of floats, from those of some of a kernel's outputs."""
+    leaves = [
+        each.detach().clone().requires_grad_() if isinstance(each, Tensor) and each.is_floating_point() else each
+        for each in given
+    ]
+    with torch.enable_grad():
+        found = kernel(*leaves)
+        total = sum(
+            torch.where(found[index].isnan(), 0.0, found[index] * gradient.nan_to_num()).sum()
+            for index, gradient in zip(outputs, gradients, strict=True)
+        )
+    wanted = [each for each in leaves if isinstance(each, Tensor) and each.requires_grad]
+    found_gradients = torch.autograd.grad(total, wanted, allow_unused=True)
+    filled = (
+        torch.zeros_like(x) if g is None else g.nan_to_num() for x, g in zip(wanted, found_gradients, strict=True)
+    )
+    return [each.contiguous() for each in filled]
+
+
+def _spherical_harmonics_back(
+    bases: int, degree: int, directions: Tensor, coefficients: Tensor, masks: None, by_color: Tensor, wants: bool
+) -> tuple[Tensor, Tensor]:
+    by_direction, by_coefficient = _back(
+        lambda *given: [_spherical_harmonics(*given)], [degree, directions, coefficients, masks], [0], [by_color]
+    )
+    return by_coefficient, by_direction
+
+
+def _project_back(
+    means: Tensor, covariances: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int,
+    height: int, eps2d: float, camera_model: str, radii: Tensor, conics: Tensor, dimmed: None, by_means2d: Tensor,
+    by_depths: Tensor, by_conics: Tensor, by_dimmed: None, wants_pose: bool,
+) -> tuple[Tensor, None, Tensor, Tensor, Tensor]:  # fmt: skip
+    shown = (radii > 0).all(-1)
+
+    def project(means: Tensor, quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        covariances_3d, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        _, means2d, depths, conics, _ = _torch_impl._fully_fused_projection(
+            means, covariances_3d, viewmats, Ks, width, height, eps2d=eps2d, near_plane=0.2
+        )
+        return means2d[shown], depths[shown], conics[shown]
+
+    gradients = [part[shown] for part in (by_means2d, by_depths, by_conics)]
+    by_means, by_quats, by_scales = _back(project, [means, quats, scales], [0, 1, 2], gradients)
+    return by_means, None, by_quats, by_scales, torch.zeros_like(viewmats)
+
+
+def _blend_back(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, masks: None,
+    width: int, height: int, tile_size: int, offsets: Tensor, order: Tensor, alphas: Tensor, last: Tensor,
+    by_image: Tensor, by_alpha: Tensor, absolute: bool,
+) -> tuple[Tensor | None, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    def blend(*given: Tensor) -> Any:
+        return _blend(*given, backgrounds, masks, width, height, tile_size, offsets, order)  # type: ignore[arg-type]
+
+    given = [part.nan_to_num() for part in (means2d, conics, colors, opacities)]
+    found = _back(blend, given, [0, 1], [by_image, by_alpha])
+    return found[0].abs() if absolute else None, found[0], found[1], found[2], found[3]
 
 
 KERNELS: dict[str, Callable[..., Any]] = {
@@ -109,6 +191,9 @@ KERNELS: dict[str, Callable[..., Any]] = {
     "intersect_tile": _intersect,
     "intersect_offset": _offsets,
     "rasterize_to_pixels_3dgs_fwd": _blend,
+    "spherical_harmonics_bwd": _spherical_harmonics_back,
+    "projection_ewa_3dgs_fused_bwd": _project_back,
+    "rasterize_to_pixels_3dgs_bwd": _blend_back,
 }
 
 
@@ -126,4 +211,60 @@ def gsplat_on_cpu() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_wrapper, "_make_lazy_cuda_func", _checked)
         patch.setattr(_wrapper, "_make_lazy_cuda_obj", lambda name: name)
+        yield
+
+
+class Compiled:
+    """These kernels as gsplat's compiled module has them."""
+
+    class CameraModelType:
+        PINHOLE = "CameraModelType.PINHOLE"
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return _checked(name)
+
+
+class Finishing:
+    """The functions of `gsplat_triton` that a training render calls, in PyTorch's operations and by autograd."""
+
+    @staticmethod
+    def activated(log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+        return log_scales.exp(), logits.sigmoid()
+
+    @staticmethod
+    def colors_of_shown(
+        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        shown = (radii > 0).all(-1)  # (c, n)
+        values = torch.stack(
+            [sh_to_color(sh, torch.nn.functional.normalize(means - c, dim=-1), degree, signed=signed) for c in centre]
+        )
+        colors = torch.where(shown[..., None], values, 0.0)
+        if pixels is None:
+            return colors, radii.new_empty(len(radii), 0), means.new_empty(len(radii), 0, 2)
+        largest = torch.where(shown, radii.amax(-1), 0)
+        return colors, largest, torch.where(shown[..., None], pixels - 0.5, 0.0)
+
+    @staticmethod
+    def finish_gradients(
+        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
+        scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
+    ) -> Tensor:  # fmt: skip
+        with torch.enable_grad():
+            leaves = means.detach().clone().requires_grad_(), sh.detach().clone().requires_grad_()
+            values, *_ = Finishing.colors_of_shown(leaves[0], centre, leaves[1], degree, signed, radii, None)
+            by_direction, by_sh = torch.autograd.grad((values * by_color).sum(), leaves, allow_unused=True)
+        by_mean += 0.0 if by_direction is None else by_direction
+        by_scale *= scales
+        by_opacity[0] = by_opacity.sum(0) * (opacities * (1 - opacities)).view(-1, len(means))[0]
+        return by_sh
+
+
+@contextmanager
+def direct_on_cpu(finishing: Any = Finishing) -> Iterator[None]:
+    """Let `gsplat_direct` find these kernels, and `finishing` in place of `gsplat_triton`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gsplat_direct, "compiled_functions", Compiled)
+        patch.setattr(torch.cuda, "device", lambda device: nullcontext())
+        patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat_triton", finishing)
         yield

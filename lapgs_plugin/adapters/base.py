@@ -128,7 +128,7 @@ class StageWindow:
         total: iterations of the whole run, as the user asked for.
         levels: of the whole run.
         residual_color_rate: factor on the SH learning rates of residual stages.
-        coarse_threshold: factor on densification thresholds for each time that a level's images are halved.
+        threshold_factor: factor on densification thresholds in this stage.
     """
 
     stage: Stage
@@ -136,7 +136,7 @@ class StageWindow:
     total: int
     levels: int
     residual_color_rate: float
-    coarse_threshold: float
+    threshold_factor: float
 
     @property
     def continues_field(self) -> bool:
@@ -234,7 +234,7 @@ class BackboneAdapter(ABC):
         opt.densify_until_iter = nested_densify_until(until) if window.continues_field else until
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
         for name in self.info.densify_thresholds:
-            setattr(opt, name, getattr(opt, name) * window.coarse_threshold**window.stage.level)
+            setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
             dataset.white_background = False

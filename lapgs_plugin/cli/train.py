@@ -172,7 +172,7 @@ def _create(
     RunArchive.require_room(out, overwrite)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = _load(reference)
-    make_plan(loaded.smallest_size, settings)
+    make_plan(loaded.smallest_size, settings, len(loaded.train))
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
         rasterizer=rasterizer,

@@ -19,7 +19,10 @@ T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without dashes in front and with underscores inside."""
-RESIDUAL_OPTIONS = {"supervision": "reconstructed", "inherit": None, "joint": 0.0, "residual_color_rate": None}
+RESIDUAL_OPTIONS = {
+    **{"supervision": "reconstructed", "inherit": None, "joint": 0.0, "residual_color_rate": None},
+    **{"residual_resets": False, "residual_threshold": 1.0, "base_sh_degree": None},
+}
 """Those that only residuals have, and what of them says no more than leaving them out; None where nothing does."""
 
 

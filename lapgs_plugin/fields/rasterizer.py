@@ -126,6 +126,34 @@ class StackingRasterizer(Protocol):
 
 
 @runtime_checkable
+class BatchRasterizer(Protocol):
+    """A rasterizer that may train on several views of one size with as many launches as on one."""
+
+    @property
+    def can_batch(self) -> bool:
+        """Whether it can with the options it was made with."""
+        ...
+
+    def render_batch(
+        self,
+        field: GaussianField,
+        cameras: Sequence[Camera],
+        *,
+        background: Tensor,
+        sh_degree: int | None = None,
+        describes: bool = True,
+    ) -> RenderResult:
+        """What a call gives for each of b cameras of one size, differentiably, with a leading dimension b each.
+
+        Args:
+            field, background, sh_degree: as a `Rasterizer` takes them.
+            cameras: two or more; only where `can_batch`.
+            describes: fill in radii and centres; False leaves them empty and costs less.
+        """
+        ...
+
+
+@runtime_checkable
 class PlainRasterizer(Protocol):
     """A rasterizer that is faster where nobody looks at radii and centres."""
 

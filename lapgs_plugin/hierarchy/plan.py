@@ -48,7 +48,7 @@ class Hierarchy(str, Enum):
 
 DEFAULT_HIERARCHY = Hierarchy.NESTED
 """Of `lapgs train`, `lapgs run` and experiments. On bonsai residuals lose 0.4 to 0.6 dB and nested levels, about as
-fast, next to nothing; these need no patched rasterizer, and a frame takes what one field's does (docs/gsplat.md).
+fast, next to nothing; these need no patched rasterizer, and a frame takes what one field's does (docs/results.md).
 
 It is no default of what is read: runs that do not say what their levels are were trained before there was a choice, as
 `Hierarchy.LAPLACIAN`."""

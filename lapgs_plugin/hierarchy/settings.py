@@ -35,7 +35,7 @@ RESIDUAL_COLOR_RATE = 4.0
 PANEL = "Hierarchy"
 STORAGE = "Memory and speed"
 
-ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate")
+ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate", "residual_threshold", "residual_resets")
 """Fields that nested levels have no use for."""
 
 
@@ -95,6 +95,12 @@ class HierarchySettings:
         f"{COARSE_THRESHOLD[Hierarchy.LAPLACIAN]:g} with residuals.",
         panel=PANEL,
     )
+    residual_threshold: float = option(
+        1.0, "Factor on the gradient thresholds of densification in residual stages.", panel=PANEL
+    )
+    residual_resets: bool = option(
+        False, "Reset opacities in residual stages, too, as in the paper; otherwise only in the base's.", panel=PANEL
+    )
     grid: str = option(
         "camera",
         "Pixel grid of the pyramid: camera (aligned with the cameras) or even (every second pixel, as OpenCV).",
@@ -145,6 +151,7 @@ class HierarchySettings:
         for name, factor in (
             ("--residual-color-rate", self.color_factor),
             ("--coarse-threshold", self.coarse_factor),
+            ("--residual-threshold", self.residual_threshold),
         ):
             if not (factor > 0 and math.isfinite(factor)):
                 raise UserInputError(f"{name} {factor}: expected a positive factor")
@@ -152,9 +159,9 @@ class HierarchySettings:
             self._refuse_residual_settings()
 
     def _refuse_residual_settings(self) -> None:
-        idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0}
+        idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0, "residual_threshold": 1.0}
         for name in ABOUT_RESIDUALS:
-            if (value := getattr(self, name)) not in (None, idle.get(name)):
+            if (value := getattr(self, name)) not in (None, False, idle.get(name)):
                 raise UserInputError(
                     f"--{name.replace('_', '-')} {value}: is about residuals, and nested levels have none; leave it "
                     f"out, or add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
@@ -185,6 +192,11 @@ class HierarchySettings:
     def coarse_factor(self) -> float:
         """Factor on densification thresholds for each halving."""
         return COARSE_THRESHOLD[self.kind] if self.coarse_threshold is None else self.coarse_threshold
+
+    def threshold_factor(self, stage: Stage) -> float:
+        """Return the factor on densification thresholds in a stage."""
+        factor: float = self.coarse_factor**stage.level
+        return factor * self.residual_threshold if stage.signed else factor
 
     @property
     def inherit_mode(self) -> str:

@@ -139,6 +139,49 @@ class GsplatRasterizer:
             radii = self._describe(found, means2d)
         return RenderResult(_planes(images), 1 - alphas[0, ..., 0], radii, means2d, absgrad2d)
 
+    @property
+    def can_batch(self) -> bool:
+        """See `fields.rasterizer.BatchRasterizer`. What is packed has no row for each camera and Gaussian."""
+        return self._device.type == "cuda" and not self._packed
+
+    def render_batch(
+        self,
+        field: GaussianField,
+        cameras: Sequence[Camera],
+        *,
+        background: Tensor,
+        sh_degree: int | None = None,
+        describes: bool = True,
+    ) -> RenderResult:
+        """Several cameras in one set of launches; see `lapgs_plugin.fields.rasterizer.BatchRasterizer`."""
+        n, means, camera = len(field), field.means, cameras[0]
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
+        absgrad = describes and differentiated and self._absgrad
+        if n and self._direct:
+            shot = self._shots.of_several(cameras, means)
+            image, seen, listeners = gsplat_direct.render(
+                field, shot, background.to(means), degree, describes=describes, absgrad=absgrad
+            )
+            if not describes:
+                return RenderResult(image, None, seen.shown_radii, seen.centres)
+            return self._described(image, seen, listeners, differentiated, absgrad)
+        means2d = means.new_zeros(len(cameras), n, 2).requires_grad_(differentiated)
+        absgrad2d = torch.zeros_like(means2d, requires_grad=False) if absgrad else None
+        if n == 0:
+            nothing = torch.cat([value.flatten() for value in (means2d, *field.parameters.values())]).sum()
+            image = (background.to(means) + nothing)[:, None, None].expand(len(cameras), 3, camera.height, camera.width)
+            return RenderResult(image, None, means2d.detach()[..., 0].int(), means2d, absgrad2d)
+        images, _, info = self._rasterize(field, cameras, background, degree, absgrad)
+        image = images.permute(0, 3, 1, 2).contiguous()
+        if not describes:
+            return RenderResult(image, None, means2d.detach()[:, :0, 0].int(), means2d.detach()[:, :0])
+        if differentiated:
+            _hand_over_gradients(info, means2d, absgrad2d)
+        with torch.no_grad():
+            radii = self._describe(info, means2d)
+        return RenderResult(image, None, radii, means2d, absgrad2d)
+
     def render_image(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> Tensor:
@@ -189,10 +232,22 @@ class GsplatRasterizer:
         image, seen, listeners = gsplat_direct.render(
             field, shot, background.to(field.means), degree, describes=True, absgrad=absgrad
         )
+        one = seen._replace(shown_radii=seen.shown_radii[0], centres=seen.centres[0], conics=seen.conics[0])
+        return self._described(image, one, listeners, differentiated, absgrad)
+
+    def _described(
+        self,
+        image: Tensor,
+        seen: gsplat_direct.Seen,
+        listeners: gsplat_direct.Listeners,
+        differentiated: bool,
+        absgrad: bool,
+    ) -> RenderResult:
+        """What was seen as a result that the backward pass will leave its gradients in."""
         with torch.no_grad():
             radii = seen.shown_radii
             if not self._own_radii:
-                radii = torch.where(radii > 0, _three_sigma_radii(seen.conics[0]), 0).to(torch.int32)
+                radii = torch.where(radii > 0, _three_sigma_radii(seen.conics), 0).to(torch.int32)
         means2d = seen.centres.requires_grad_(differentiated)
         absgrad2d = means2d.new_zeros(means2d.shape) if absgrad else None
         listeners += [weakref.ref(tensor) for tensor in (means2d, absgrad2d) if tensor is not None]
@@ -232,19 +287,19 @@ class GsplatRasterizer:
         return images + (1 - alphas) * background.to(means) if self._packed else images, alphas, info
 
     def _describe(self, found: dict[str, Any], means2d: Tensor) -> Tensor:
-        """Fill in `means2d` (n, 2) and return the radii (n,) from what gsplat found."""
+        """Fill in `means2d` (n, 2) and return the radii (n,) from what gsplat found; of several cameras (b, n, ...)."""
         rows = found["gaussian_ids"] if self._packed else slice(None)
 
         def of(name: str) -> Tensor:
             values: Tensor = found[name]
-            return values if self._packed else values[0]  # (v, ...)
+            return values if self._packed or means2d.ndim == 3 else values[0]  # (v, ...)
 
         theirs = of("radii")  # (v, 2)
         shown = (theirs > 0).all(-1)  # (v,)
         # What gsplat leaves for culled Gaussians is memory as it was; its pixels have their centre at 0.5.
-        means2d[rows] = torch.where(shown[:, None], of("means2d") - 0.5, 0.0)
+        means2d[rows] = torch.where(shown[..., None], of("means2d") - 0.5, 0.0)
         found_radii = theirs.amax(-1) if self._own_radii else _three_sigma_radii(of("conics"))
-        radii = torch.zeros(len(means2d), dtype=torch.int32, device=means2d.device)  # (n,)
+        radii = torch.zeros(means2d.shape[:-1], dtype=torch.int32, device=means2d.device)  # (n,)
         radii[rows] = torch.where(shown, found_radii, 0).to(torch.int32)
         return radii
 
@@ -286,10 +341,21 @@ class _Shots:
         if known is None or shot is None or known() is not camera or shot.pose.device != like.device:
             poses, intrinsics, centres = cameras_on_device([camera], like)
             intrinsics, poses = intrinsics.contiguous(), poses.contiguous()
-            shot = gsplat_direct.Shot(poses, intrinsics, centres[0].contiguous(), camera.width, camera.height)
+            shot = gsplat_direct.Shot(poses, intrinsics, centres.contiguous(), camera.width, camera.height)
             place, sent = id(camera), self._sent
             sent[place] = (weakref.ref(camera, lambda _: sent.pop(place, None)), shot)
         return shot
+
+    def of_several(self, cameras: Sequence[Camera], like: Tensor) -> gsplat_direct.Shot:
+        """Cameras of one size beside `like`, put together in one launch."""
+        shots, count = [self.of(camera, like) for camera in cameras], len(cameras)
+        # Centres first: Triton compiles anew for what does not begin at a multiple of 16 bytes.
+        parts = [getattr(shot, kind).view(-1) for kind in ("centre", "pose", "intrinsics") for shot in shots]
+        numbers = torch.cat(parts)
+        centres, poses, intrinsics = numbers[: 3 * count], numbers[3 * count : 19 * count], numbers[19 * count :]
+        return gsplat_direct.Shot(
+            poses.view(-1, 4, 4), intrinsics.view(-1, 3, 3), centres.view(-1, 3), shots[0].width, shots[0].height
+        )
 
 
 def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -317,7 +383,7 @@ def _pose_numbers(pose: Tensor) -> list[float]:
 
 
 def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tensor | None) -> None:
-    """Let the backward pass leave what it finds for gsplat's centres, (1, n, 2) or packed (v, 2), in our (n, 2)."""
+    """Let the backward pass leave what it finds for gsplat's centres, (b, n, 2) or packed (v, 2), in ours."""
     theirs: Any = found["means2d"]
     ids: Tensor | None = found["gaussian_ids"] if theirs.ndim == 2 else None  # (v,)
     # The backward pass leaves absolute gradients with the tensor that gsplat made, which has to live as long as ours.
@@ -334,7 +400,7 @@ def _hand_over_gradients(found: dict[str, Any], means2d: Tensor, absgrad2d: Tens
 
         def unpacked(values: Tensor) -> Tensor:
             if ids is None:
-                return values[0]
+                return values.reshape(held.shape)
             return torch.zeros_like(held).index_copy_(0, ids, values)
 
         held.grad = unpacked(gradient).clone()

@@ -1,9 +1,9 @@
-"""One view by gsplat's kernels, called directly.
+"""One view, or several of one size, by gsplat's kernels, called directly.
 
 `gsplat.rasterization` is a chain of five differentiable functions with everything between them in PyTorch: some
 seventy launches and twenty autograd nodes in a training iteration. Up to a megapixel that is what an iteration takes,
-whatever is rendered. Here a view is one autograd node: gsplat's projection, tiles and blending as they are, and the
-rest in three kernels of `gsplat_triton`.
+whatever is rendered. Here a render is one autograd node: gsplat's projection, tiles and blending as they are, and the
+rest in three kernels of `gsplat_triton`. Several views take as many launches as one.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import math
 import weakref
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ LARGEST_DIFFERENCE = 1e-3
 
 
 class Shot(NamedTuple):
-    """A camera on the device that renders: pose (1, 4, 4), intrinsics (1, 3, 3), centre (3,) and the image's size."""
+    """c cameras on the device that renders: poses (c, 4, 4), intrinsics (c, 3, 3), centres (c, 3), the images' size."""
 
     pose: Tensor
     intrinsics: Tensor
@@ -44,25 +45,25 @@ class Shot(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What gsplat found of a field's Gaussians on the way to an image; n Gaussians, one camera."""
+    """What gsplat found of a field's Gaussians on the way to images; n Gaussians, c cameras."""
 
-    radii: Tensor  # (1, n, 2)
-    means2d: Tensor  # (1, n, 2)
-    depths: Tensor  # (1, n)
-    conics: Tensor  # (1, n, 3)
-    colors: Tensor  # (n, 3)
+    radii: Tensor  # (c, n, 2)
+    means2d: Tensor  # (c, n, 2)
+    depths: Tensor  # (c, n)
+    conics: Tensor  # (c, n, 3)
+    colors: Tensor  # (c, n, 3)
     scales: Tensor  # (n, 3)
-    opacities: Tensor  # (n,)
-    offsets: Tensor  # (1, tiles down, tiles across)
+    opacities: Tensor  # (c, n), the same for every camera
+    offsets: Tensor  # (c, tiles down, tiles across)
     flat: Tensor  # Gaussians of pairs with tiles
-    alphas: Tensor  # (1, h, w, 1)
-    last: Tensor  # (1, h, w)
-    shown_radii: Tensor  # (n,) the larger of both, 0 where culled
-    centres: Tensor  # (n, 2) as `RenderResult` has them
+    alphas: Tensor  # (c, h, w, 1)
+    last: Tensor  # (c, h, w)
+    shown_radii: Tensor  # (c, n) the larger of both, 0 where culled
+    centres: Tensor  # (c, n, 2) as `RenderResult` has them
 
 
 Listeners = list[weakref.ref[Tensor]]
-"""Where a backward pass leaves its gradients by centres and their absolute values, (n, 2) each.
+"""Where a backward pass leaves its gradients by centres and their absolute values, (n, 2) or (c, n, 2) each.
 
 Weakly: who has not kept the result of a render is told nothing, and nothing holds itself.
 """
@@ -74,17 +75,18 @@ def render(
     """A field of at least one Gaussian, float32 on the device.
 
     Args:
-        gaussians: on the camera's device.
-        shot: the camera.
+        gaussians: on the cameras' device.
+        shot: one camera or several.
         background: (3,) on the device.
         degree: highest SH degree to evaluate.
         describes: fill in `Seen.shown_radii` and `Seen.centres`, which are empty otherwise.
         absgrad: work out absolute gradients of the centres in the backward pass.
 
     Returns:
-        The image (3, h, w), what was seen, and a list that takes the tensors to leave gradients in.
+        The image (3, h, w), or (c, 3, h, w) of several cameras, what was seen, and a list that takes the tensors to
+        leave gradients in.
     """
-    of, background = gaussians, background.contiguous()
+    of, background = gaussians, _of_every(background, len(shot.pose))
     parameters = of.means, of.quaternions, of.log_scales, of.opacity_logits, of.sh
     means, quaternions, log_scales, logits, sh = (value.contiguous() for value in parameters)  # kernels count on it
     listeners: Listeners = []
@@ -97,11 +99,16 @@ def render(
         images, seen = _forward(
             means, quaternions, log_scales, logits, sh, shot, background, degree, of.signed, describes
         )
-    return images[0].permute(2, 0, 1), seen, listeners
+    return _planes(images), seen, listeners
+
+
+def _planes(images: Tensor) -> Tensor:
+    """(c, h, w, 3) as (c, 3, h, w), and of one camera as (3, h, w), without copying."""
+    return images[0].permute(2, 0, 1) if len(images) == 1 else images.permute(0, 3, 1, 2)
 
 
 class _View(torch.autograd.Function):
-    """(field, camera) -> image (3, h, w), contiguous."""
+    """(field, cameras) -> image (3, h, w), or images (c, 3, h, w) of several; contiguous."""
 
     @staticmethod
     def forward(
@@ -114,7 +121,7 @@ class _View(torch.autograd.Function):
         ctx.size, ctx.degree, ctx.signed, ctx.absgrad = shot[3:], degree, signed, absgrad
         ctx.listeners = listeners
         box.append(seen)
-        return images[0].permute(2, 0, 1).contiguous()
+        return _planes(images).contiguous()
 
     @staticmethod
     @once_differentiable
@@ -123,10 +130,12 @@ class _View(torch.autograd.Function):
 
         means, quaternions, sh, background, pose, intrinsics, centre, *rest = ctx.saved_tensors
         seen, (width, height), compiled = Seen(*rest), ctx.size, compiled_functions()
+        several = len(pose) > 1
+        by_images = by_image.movedim(-3, -1).contiguous().view(*seen.alphas.shape[:-1], 3)
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = compiled.rasterize_to_pixels_3dgs_bwd(
-            seen.means2d, seen.conics, seen.colors[None], seen.opacities[None], background[None], None,
+            seen.means2d, seen.conics, seen.colors, seen.opacities, background, None,
             width, height, TILE, seen.offsets, seen.flat, seen.alphas, seen.last,
-            by_image.permute(1, 2, 0).contiguous()[None], _zeros(seen.alphas.shape, means.device), ctx.absgrad,
+            by_images, _zeros(seen.alphas.shape, means.device), ctx.absgrad,
         )  # fmt: skip
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, seen.scales, pose, intrinsics, width, height, PIXEL_VARIANCE,
@@ -137,7 +146,9 @@ class _View(torch.autograd.Function):
             means, centre, sh, ctx.degree, ctx.signed, seen.radii, seen.colors, seen.scales, seen.opacities,
             by_colors, by_means, by_scales, by_opacities,
         )  # fmt: skip
-        _tell(ctx.listeners, by_means2d[0], by_absolute[0] if ctx.absgrad else None)
+        if not several:
+            by_means2d, by_absolute = by_means2d[0], by_absolute[0] if ctx.absgrad else None
+        _tell(ctx.listeners, by_means2d, by_absolute if ctx.absgrad else None)
         return by_means, by_quaternions, by_scales, by_opacities[0], by_sh, *[None] * 8
 
 
@@ -145,31 +156,36 @@ def _forward(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor,
     shot: Shot, background: Tensor, degree: int, signed: bool, describes: bool,
 ) -> tuple[Tensor, Seen]:  # fmt: skip
-    """Images (1, h, w, 3), and what is known of the Gaussians."""
+    """Images (c, h, w, 3), and what is known of the Gaussians; the background is that of every camera, (c, 3)."""
     from lapgs_plugin.rasterizers.gsplat_triton import activated, colors_of_shown
 
-    size = shot.width, shot.height
+    size, count = (shot.width, shot.height), len(shot.pose)
     scales, opacities = activated(log_scales, logits)
     radii, means2d, depths, conics = project(means, quaternions, scales, opacities, shot.pose, shot.intrinsics, size)
     colors, shown_radii, centres = colors_of_shown(
         means, shot.centre, sh, degree, signed, radii, means2d if describes else None
     )
-    projected = radii, means2d, depths, conics
-    images, alphas, last, offsets, flat = blend(projected, colors[None], opacities[None], background[None], size)
+    projected, opacities = (radii, means2d, depths, conics), _of_every(opacities, count)
+    images, alphas, last, offsets, flat = blend(projected, colors, opacities, background, size, count)
     seen = Seen(
         radii, means2d, depths, conics, colors, scales, opacities, offsets, flat, alphas, last, shown_radii, centres
     )
     return images, seen
 
 
+def _of_every(values: Tensor, cameras: int) -> Tensor:
+    """(k,) of each camera, (c, k) as kernels read them."""
+    return values.expand(cameras, -1).contiguous()  # nothing is copied for one
+
+
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, pose: Tensor, intrinsics: Tensor,
     size: tuple[int, int],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Radii (1, n, 2), centres (1, n, 2), depths (1, n) and conics (1, n, 3) of activated Gaussians, at least one.
+    """Radii (c, n, 2), centres (c, n, 2), depths (c, n) and conics (c, n, 3) of activated Gaussians, at least one.
 
     Args:
-        pose, intrinsics: (1, 4, 4) and (1, 3, 3).
+        pose, intrinsics: (c, 4, 4) and (c, 3, 3).
         size: (width, height) of the image.
     """
     compiled = compiled_functions()
@@ -188,8 +204,8 @@ def blend(
 
     Args:
         projected: what `project` gives; or of several images in one list, without the leading dimension.
-        colors, opacities: (1, n, 3) and (1, n), or (n, 3) and (n,) in such a list.
-        background: (1, 3), None for black.
+        colors, opacities: (count, n, 3) and (count, n), or (n, 3) and (n,) in such a list.
+        background: (count, 3), None for black.
         size: (width, height) of all images.
         count, of_image: how many images there are, and in a list the number (n,) of each Gaussian's.
 
@@ -212,7 +228,7 @@ def blend(
 
 
 def _tell(listeners: Listeners, by_centre: Tensor, by_absolute: Tensor | None) -> None:
-    """Leave the gradients by centres (n, 2) where a `RenderResult` has them."""
+    """Leave the gradients by centres, (n, 2) or (c, n, 2), where a `RenderResult` has them."""
     held = [listener() for listener in listeners]
     if held and held[0] is not None:
         held[0].grad = by_centre
@@ -249,13 +265,19 @@ def works() -> bool:
 
 
 def _largest_difference(device: torch.device) -> float:
-    """From gsplat's way to render, relative to the largest value, of images, gradients and what densification sees."""
+    """From gsplat's way to render, relative to the largest value, of images, gradients and what densification sees.
+
+    Of one camera, and of two at once.
+    """
     from lapgs_plugin.fields.camera import Camera
     from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
 
     generator = torch.Generator().manual_seed(0)
     count = 500
     camera = Camera(70, 45, 60.0, 61.0, 34.0, 23.0, torch.eye(4))
+    aside = torch.eye(4)
+    aside[0, 3], aside[2, 3] = 0.4, 1.0
+    other = replace(camera, world_to_camera=aside)
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     differences = []
     for signed, degree in ((False, 3), (True, 2)):
@@ -267,19 +289,22 @@ def _largest_difference(device: torch.device) -> float:
             torch.randn(count, generator=generator),
             torch.randn(count, 16, 3, generator=generator) * 0.3,
         )
-        weights = torch.randn(3, camera.height, camera.width, generator=generator).to(device)
+        weights = torch.randn(2, 3, camera.height, camera.width, generator=generator).to(device)
         found = []
         for direct in (False, True):
             leaves = [value.to(device).requires_grad_() for value in values]
             gaussians = GaussianField(leaves[0], leaves[1], leaves[2], leaves[3], leaves[4], signed)
             rasterizer = GsplatRasterizer(device, own_radii=True, direct=direct)
-            result = rasterizer(gaussians, camera, background=background, sh_degree=degree)
-            (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            if signed:
+                result = rasterizer.render_batch(gaussians, [camera, other], background=background, sh_degree=degree)
+            else:
+                result = rasterizer(gaussians, camera, background=background, sh_degree=degree)
+            (result.image * weights[: len(weights) if signed else 1]).sum().backward()  # type: ignore[no-untyped-call]  # torch's
             assert result.absgrad2d is not None
             assert result.means2d.grad is not None
             shown = (result.radii > 0).float()
             found.append(
                 [result.image, shown, result.means2d, result.means2d.grad, result.absgrad2d, *(x.grad for x in leaves)]
             )
-        differences += [(one - other).abs() / other.abs().max() for other, one in zip(*found, strict=True)]
+        differences += [(one - theirs).abs() / theirs.abs().max() for theirs, one in zip(*found, strict=True)]
     return largest(differences)

@@ -19,7 +19,7 @@ GAUSSIANS = 128
 
 # Compiled anew, for half a second each, is what differs in the number of coefficients alone: the degree in use grows
 # while a stage is trained, and bases and residuals come by turns.
-OF_ANY_VALUE = ("n", "active", "signed")
+OF_ANY_VALUE = ("n", "cameras", "active", "signed")
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -186,20 +186,24 @@ def _activate_kernel(
 def _color_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, pixels: tl.tensor,
     colors: tl.tensor, shown_radii: tl.tensor, shown_pixels: tl.tensor,
-    n: int, active: int, signed: int, coefficients: tl.constexpr, describes: tl.constexpr, block: tl.constexpr,
+    n: int, cameras: int, active: int, signed: int,
+    coefficients: tl.constexpr, describes: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
+    # Cameras of one block follow each other, so that its coefficients are still in the cache.
+    camera = tl.program_id(0) % cameras
+    rows = tl.program_id(0) // cameras * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
     here = rows < n
-    across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
+    seen = rows + camera.to(tl.int64) * n  # in what there is of every camera
+    across, down = tl.load(radii + 2 * seen, here, 0), tl.load(radii + 2 * seen + 1, here, 0)
     shown = (across > 0) & (down > 0)
-    color = _colored(means, centre, sh, rows, channel, shown, active, signed, coefficients, block)
-    tl.store(colors + rows * 3 + channel, color, here & (channel < 3))
+    color = _colored(means, centre + 3 * camera, sh, rows, channel, shown, active, signed, coefficients, block)
+    tl.store(colors + seen * 3 + channel, color, here & (channel < 3))
     if describes:
-        tl.store(shown_radii + rows, tl.where(shown, tl.maximum(across, down), 0), here)
+        tl.store(shown_radii + seen, tl.where(shown, tl.maximum(across, down), 0), here)
         for side in tl.static_range(2):
-            centred = tl.load(pixels + 2 * rows + side, shown, 0.5) - 0.5
-            tl.store(shown_pixels + 2 * rows + side, centred, here)
+            centred = tl.load(pixels + 2 * seen + side, shown, 0.5) - 0.5
+            tl.store(shown_pixels + 2 * seen + side, centred, here)
 
 
 @triton.jit(do_not_specialize=(*OF_ANY_VALUE, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -228,38 +232,46 @@ def _gradient_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
     scales: tl.tensor, opacities: tl.tensor,
     by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor, by_sh: tl.tensor,
-    n: int, active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
+    n: tl.tensor, cameras: int, active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
     here, in_channel = rows < n, (rows < n) & (channel < 3)
-    shown = (tl.load(radii + 2 * rows, here, 0) > 0) & (tl.load(radii + 2 * rows + 1, here, 0) > 0)
-    x, y, z, inverse = _towards(means, centre, rows, shown)
-    flow = tl.load(by_color + 3 * rows + channel, shown & (channel < 3), 0.0)  # (g, 4)
-    color = tl.load(colors + 3 * rows + channel, shown & (channel < 3), 0.0)
-    flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
-    along_x, along_y, along_z = tl.zeros_like(flow), tl.zeros_like(flow), tl.zeros_like(flow)
-    for k in tl.static_range(coefficients):
-        there = (rows * coefficients + k) * 3 + channel
-        used = tl.where(k < active, flow, 0.0)
-        tl.store(by_sh + there, _basis(k, x, y, z) * used, in_channel)
-        weighed = used * tl.load(sh + there, shown & (channel < 3) & (k < active), 0.0)
-        along_x += _basis_x(k, x, y, z) * weighed
-        along_y += _basis_y(k, x, y, z) * weighed
-        along_z += _basis_z(k, x, y, z) * weighed
-    if coefficients > 1:
-        in_x = tl.sum(along_x, 1)[:, None]
-        in_y = tl.sum(along_y, 1)[:, None]
-        in_z = tl.sum(along_z, 1)[:, None]
-        radial = in_x * x + in_y * y + in_z * z  # a direction does not change along itself
-        mean = by_mean + 3 * rows
-        tl.store(mean, tl.load(mean, shown, 0.0) + (in_x - radial * x) * inverse, shown)
-        tl.store(mean + 1, tl.load(mean + 1, shown, 0.0) + (in_y - radial * y) * inverse, shown)
-        tl.store(mean + 2, tl.load(mean + 2, shown, 0.0) + (in_z - radial * z) * inverse, shown)
+    of_opacity = tl.zeros((block, 1), tl.float32)
+    for camera in range(cameras):
+        seen = rows + camera * n.to(tl.int64)  # in what there is of every camera
+        shown = (tl.load(radii + 2 * seen, here, 0) > 0) & (tl.load(radii + 2 * seen + 1, here, 0) > 0)
+        x, y, z, inverse = _towards(means, centre + 3 * camera, rows, shown)
+        flow = tl.load(by_color + 3 * seen + channel, shown & (channel < 3), 0.0)  # (g, 4)
+        color = tl.load(colors + 3 * seen + channel, shown & (channel < 3), 0.0)
+        flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
+        along_x, along_y, along_z = tl.zeros_like(flow), tl.zeros_like(flow), tl.zeros_like(flow)
+        first = camera == 0
+        for k in tl.static_range(coefficients):
+            there = (rows * coefficients + k) * 3 + channel
+            used = tl.where(k < active, flow, 0.0)
+            # Of the cameras before; the first one writes every row, later ones what they show.
+            before = tl.load(by_sh + there, shown & (channel < 3) & (camera > 0), 0.0)
+            tl.store(by_sh + there, before + _basis(k, x, y, z) * used, in_channel & (shown | first))
+            weighed = used * tl.load(sh + there, shown & (channel < 3) & (k < active), 0.0)
+            along_x += _basis_x(k, x, y, z) * weighed
+            along_y += _basis_y(k, x, y, z) * weighed
+            along_z += _basis_z(k, x, y, z) * weighed
+        if coefficients > 1:
+            in_x = tl.sum(along_x, 1)[:, None]
+            in_y = tl.sum(along_y, 1)[:, None]
+            in_z = tl.sum(along_z, 1)[:, None]
+            radial = in_x * x + in_y * y + in_z * z  # a direction does not change along itself
+            mean = by_mean + 3 * rows
+            tl.store(mean, tl.load(mean, shown, 0.0) + (in_x - radial * x) * inverse, shown)
+            tl.store(mean + 1, tl.load(mean + 1, shown, 0.0) + (in_y - radial * y) * inverse, shown)
+            tl.store(mean + 2, tl.load(mean + 2, shown, 0.0) + (in_z - radial * z) * inverse, shown)
+        of_opacity += tl.load(by_opacity + seen, here, 0.0)
+        tl.debug_barrier()  # the next camera's threads read what others of this block have written
     there = 3 * rows + channel
     tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
     opacity = tl.load(opacities + rows, here, 0.0)
-    tl.store(by_opacity + rows, tl.load(by_opacity + rows, here, 0.0) * opacity * (1.0 - opacity), here)
+    tl.store(by_opacity + rows, of_opacity * opacity * (1.0 - opacity), here)
 
 
 def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor]:
@@ -272,30 +284,31 @@ def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tenso
 def colors_of_shown(
     means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours of the Gaussians that a camera shows, and what densification looks at.
+    """Colours of the Gaussians that each of c cameras shows, and what densification looks at.
 
     Args:
         means: (n, 3).
-        centre: (3,) of the camera.
+        centre: (c, 3) of the cameras.
         sh: (n, k, 3).
         degree: highest to evaluate.
         signed: whether colours are the raw values.
-        radii: (n, 2) gsplat's, int32; 0 where culled.
-        pixels: (n, 2) gsplat's centres, or None where nobody looks at them.
+        radii: (c, n, 2) gsplat's, int32; 0 where culled.
+        pixels: (c, n, 2) gsplat's centres, or None where nobody looks at them.
 
     Returns:
-        (n, 3) colours, 0 where culled; (n,) radii and (n, 2) centres as `RenderResult` has them, both empty where
-        `pixels` is None.
+        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as `RenderResult` has them, both empty
+        where `pixels` is None.
     """
-    n, describes = len(means), pixels is not None
-    colors = torch.empty_like(means)
-    shown_radii = radii.new_empty(n if describes else 0)
-    shown_pixels = means.new_empty(n if describes else 0, 2)
+    (cameras, n), describes = radii.shape[:2], pixels is not None
+    colors = means.new_empty(cameras, n, 3)
+    shown_radii = radii.new_empty(cameras, n if describes else 0)
+    shown_pixels = means.new_empty(cameras, n if describes else 0, 2)
     _launch(
         _color_kernel,
         n,
         (means, centre, sh, radii, means if pixels is None else pixels, colors, shown_radii, shown_pixels),
-        ((degree + 1) ** 2, int(signed)),
+        (cameras, (degree + 1) ** 2, int(signed)),
+        programs=cameras,
         coefficients=sh.shape[1],
         describes=describes,
     )
@@ -314,7 +327,8 @@ def place_seen(
     """Put what a camera sees of one field, and its colours, where the fields of a view are in one list.
 
     Args:
-        means, centre, sh, signed: as `colors_of_shown` takes them; all coefficients are evaluated.
+        means, sh, signed: as `colors_of_shown` takes them; all coefficients are evaluated.
+        centre: (3,) of the camera.
         found: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
         placed: the same of all fields, and colours (m, 3); written from row `start` on.
     """
@@ -331,25 +345,29 @@ def finish_gradients(
     means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
     scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
 ) -> Tensor:  # fmt: skip
-    """The gradient by SH (n, k, 3); those by mean, scale and opacity become by mean, logarithm and logit in place.
+    """The gradient by SH (n, k, 3), summed over c cameras; others become by mean, logarithm and logit in place.
 
     Args:
         means, centre, sh, degree, signed, radii: as `colors_of_shown` took them.
         colors: what it gave.
         scales, opacities: what `activated` gave.
-        by_color, by_mean, by_scale: (n, 3) gradients; by_mean without the way over the direction of view.
-        by_opacity: (n,).
+        by_color: (c, n, 3) gradients of each camera.
+        by_mean, by_scale: (n, 3) gradients, summed over cameras; by_mean without the way over the direction of view.
+        by_opacity: (c, n) of each camera; the first row becomes the sum by logits.
     """
     by_sh = torch.empty_like(sh)
     _launch(
         _gradient_kernel,
         len(means),
         (means, centre, sh, radii, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity, by_sh),
-        ((degree + 1) ** 2, int(signed)),
+        (len(radii), (degree + 1) ** 2, int(signed)),
         coefficients=sh.shape[1],
     )
     return by_sh
 
 
-def _launch(kernel: Any, n: int, given: tuple[Tensor, ...], numbers: tuple[int, ...] = (), **constants: int) -> None:
-    kernel[(triton.cdiv(n, GAUSSIANS),)](*given, n, *numbers, block=GAUSSIANS, **constants)
+def _launch(
+    kernel: Any, n: int, given: tuple[Tensor, ...], numbers: tuple[int, ...] = (), programs: int = 1, **constants: int
+) -> None:
+    """Start a kernel with so many programs for each block of Gaussians."""
+    kernel[(triton.cdiv(n, GAUSSIANS) * programs,)](*given, n, *numbers, block=GAUSSIANS, **constants)

@@ -112,7 +112,9 @@ class ActiveStage:
 
     @property
     def resets_opacities(self) -> bool:
-        """Whether the checkout may. What it is for, floaters near the cameras, was done before a nested level."""
+        """Whether the checkout may. What it is for, floaters near the cameras, was done in the base's stage."""
+        if self.stage.signed:
+            return self._options.residual_resets
         return not self.window.continues_field
 
     # What the replaced symbols ask for.

@@ -276,7 +276,7 @@ class HierarchyDriver:
         for stage in plan:
             options = self._options
             window = StageWindow(
-                stage, start, plan.iterations, plan.levels, options.color_factor, options.coarse_factor
+                stage, start, plan.iterations, plan.levels, options.color_factor, options.threshold_factor(stage)
             )
             active = ActiveStage(self._context, call, scene, archive, window, tuple(finished), before, path)
             self._active = active
@@ -395,5 +395,11 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     settings.pop("images_on", None)
-    # Runs of the first weeks do not say what all of them were.
-    return {"hierarchy": Hierarchy.LAPLACIAN.value, "prune": 0.0, **values, **settings, **backbone}
+    # Earlier runs do not say what all of them were.
+    residuals = Hierarchy.LAPLACIAN.value
+    before = {
+        "hierarchy": residuals,
+        "prune": 0.0,
+        "residual_resets": settings.get("hierarchy", residuals) == residuals,
+    }
+    return {**before, **values, **settings, **backbone}

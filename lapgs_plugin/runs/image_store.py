@@ -20,7 +20,7 @@ import os
 import shutil
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -191,18 +191,15 @@ class ImageStore:
             KeyError: it was never put.
             RunFolderError: its file cannot be read any more.
         """
-        image = self._images[name]
-        if self._at_hand(image):
-            assert image.stored is not None
-            return _decode(image.stored, image)
-        self.prefetch(name)
-        arrival = self._coming.pop(name).result()
-        if arrival.event is not None:
-            stream = torch.cuda.current_stream(self._device)
-            stream.wait_event(arrival.event)
-            # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
-            arrival.stored.record_stream(stream)
-        return _decode(arrival.stored, image)
+        return _decode(self._arrived(name), self._images[name])
+
+    def get_batch(self, names: Sequence[str]) -> Tensor:
+        """(b, c, h, w) several images of one size; see `get`. Those that are encoded alike are decoded together."""
+        images = [self._images[name] for name in names]
+        first = images[0]
+        if any(image.low != first.low or image.divisor is not first.divisor for image in images):
+            return torch.stack([self.get(name) for name in names])
+        return _decode(torch.stack([self._arrived(name) for name in names]), first)
 
     @property
     def where(self) -> str:
@@ -251,6 +248,21 @@ class ImageStore:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _arrived(self, name: str) -> Tensor:
+        """The stored bytes of an image on the device, for the stream that is current."""
+        image = self._images[name]
+        if self._at_hand(image):
+            assert image.stored is not None
+            return image.stored
+        self.prefetch(name)
+        arrival = self._coming.pop(name).result()
+        if arrival.event is not None:
+            stream = torch.cuda.current_stream(self._device)
+            stream.wait_event(arrival.event)
+            # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
+            arrival.stored.record_stream(stream)
+        return arrival.stored
 
     def _at_hand(self, image: _Image) -> bool:
         """Whether the stored bytes lie on the device already."""

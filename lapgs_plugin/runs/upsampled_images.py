@@ -6,6 +6,8 @@ to the device.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -53,3 +55,8 @@ class UpsampledImages:
     def close(self) -> None:
         """Forget everything and remove the files."""
         self.store.close()
+
+    @torch.no_grad()
+    def get_batch(self, names: Sequence[str]) -> Tensor:
+        """(b, c, h, w) Up of several images of one size, in as many launches as for one; see `get`."""
+        return upsample(self.pyramid, self.store.get_batch(names), self._sizes[names[0]])

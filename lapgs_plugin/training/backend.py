@@ -54,7 +54,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         rasterizer = gsplat.GsplatRasterizer(
             antialiasing=settings.antialiased,
             packed=settings.packed,
-            absgrad=settings.densification.absgrad,
+            absgrad=settings.densification.absgrad or settings.densification.strategy == "multiview",
             own_radii=True,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})

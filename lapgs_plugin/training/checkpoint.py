@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveInt, TypeAdapter, ValidationError
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError
@@ -41,6 +41,7 @@ class ProgressState(TypedDict):
     loss: float
     peak_gaussians: NonNegativeInt
     gaussian_steps: NonNegativeInt
+    most_views: NotRequired[PositiveInt | None]
 
 
 class ModelState(TypedDict):

@@ -1,10 +1,10 @@
-"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC."""
+"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC. A third is `multiview`'s."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
@@ -17,6 +17,9 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.self_check import matches_reference
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, StageSchedule
+
+if TYPE_CHECKING:
+    from lapgs_plugin.training.multiview import ViewScores
 
 MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
 """Of a base field that starts from points: a tenth of the size and half opaque, as MCMC's authors start it."""
@@ -37,14 +40,34 @@ class DensityControl(Protocol):
         """Whether `after_step` of that iteration wants to know more of a render than its image."""
         ...
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
-        """Accumulate the statistics of one render and edit the field when the schedule says so.
+    def scored_at(self, iteration: int) -> bool:
+        """Whether `after_step` of that iteration wants the scores of several views."""
+        ...
+
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Add the statistics of a render that is not the last one of a step.
+
+        Args:
+            result: after `backward()` by the sum of its views' losses; of several views, with a leading dimension.
+            camera: it was rendered from, or any of those cameras.
+        """
+        ...
+
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
+        """Accumulate the statistics of a step's last render and edit the field when the schedule says so.
 
         Args:
             model: edited in place; its parameters are new tensors afterwards when something changed.
-            iteration: counts from 1 within the stage.
-            result: the render, after `backward()`; it may be None where `needs_statistics` says so.
-            camera: it was rendered from.
+            iteration: of the step's last view, from 1 within the stage.
+            result, camera: as `accumulate` takes them; the result may be None where `needs_statistics` says so.
+            scores: of the field before the edit; None except where `scored_at` says so.
 
         Returns:
             Whether Gaussians were added, removed or reset.
@@ -58,7 +81,10 @@ class DensityControl(Protocol):
 
 def density_control(schedule: StageSchedule, settings: Densification, extent: float) -> DensityControl:
     """The strategy that the settings name; arguments as `Densifier` takes them."""
-    return (McmcDensifier if settings.strategy == "mcmc" else Densifier)(schedule, settings, extent)
+    from lapgs_plugin.training.multiview import MultiviewDensifier
+
+    kinds: dict[str, type[Densifier] | type[McmcDensifier]] = {"mcmc": McmcDensifier, "multiview": MultiviewDensifier}
+    return kinds.get(settings.strategy, Densifier)(schedule, settings, extent)
 
 
 class Densifier:
@@ -86,51 +112,60 @@ class Densifier:
         """See `DensityControl`."""
         return iteration < self._schedule.densify_until
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+    def scored_at(self, iteration: int) -> bool:
+        """See `DensityControl`."""
+        return False
+
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
         """See `DensityControl`."""
         if not self.needs_statistics(iteration):
             return False
         assert result is not None, "looked at in this iteration"
-        if _refines(self._schedule, iteration):
+        if refines(self._schedule, iteration):
             info = self._info(result, camera)
             self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
         else:
-            self._accumulate(result, camera)
+            self.accumulate(result, camera)
         reset = iteration % self._schedule.reset_every == 0
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
             reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
-        return reset or _refines(self._schedule, iteration)
+        return reset or refines(self._schedule, iteration)
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
         """A render as gsplat's strategies look at it."""
-        means2d: Any = result.means2d.detach()[None]  # (1, n, 2)
-        means2d.grad = means2d.absgrad = self._gradient(result)[None]
+        n = result.means2d.shape[-2]
+        means2d: Any = result.means2d.detach().view(-1, n, 2)  # (b, n, 2)
+        means2d.grad = means2d.absgrad = self._gradient(result).view(-1, n, 2)
         return {
             "means2d": means2d,
-            "radii": result.radii[None, :, None].expand(1, -1, 2),  # (1, n, 2)
+            "radii": result.radii.view(-1, n, 1).expand(-1, -1, 2),  # (b, n, 2)
             "width": camera.width,
             "height": camera.height,
-            "n_cameras": 1,
+            "n_cameras": 1,  # what gsplat multiplies by, for the mean of the views' losses; ours is their sum
             "gaussian_ids": None,
         }
 
-    def _accumulate(self, result: RenderResult, camera: Camera) -> None:
-        """What gsplat's strategy does between two refinements, for all Gaussians: it selects visible ones, and to learn
-        how many there are the processor waits for a GPU."""
-        gradient = self._gradient(result)  # (n, 2)
-        if self.state["grad2d"] is None:
-            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(len(gradient)) for _ in range(2))
-        given = gradient, result.radii, (camera.width, camera.height), self.state["grad2d"], self.state["count"]
-        if gradient.device.type == "cuda" and statistics_in_triton():
-            from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Add what gsplat's strategy adds between two refinements; see `DensityControl`.
 
-            add_statistics(*given)
-        else:
-            _add_statistics(*given)
+        For all Gaussians: gsplat selects visible ones, and to learn how many there are the processor waits for a GPU.
+        """
+        gradient = self._gradient(result)  # (n, 2) or (b, n, 2)
+        if self.state["grad2d"] is None:
+            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
+        size = camera.width, camera.height
+        add_up(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
 
     def _gradient(self, result: RenderResult) -> Tensor:
-        """(n, 2), by the centres on the image, absolute where so asked."""
+        """(n, 2) or (b, n, 2), by the centres on the image, absolute where so asked."""
         gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
         assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
         return gradient
@@ -140,14 +175,31 @@ class Densifier:
         return None
 
 
+def add_up(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
+    """Add the norms of gradients by centres, in normalised device coordinates, and 1 where a Gaussian is shown.
+
+    Args:
+        gradient: (n, 2) in loss per pixel; of several views (b, n, 2).
+        radii: (n,) or (b, n), 0 where it is not shown.
+        size: (width, height) of the image.
+        norms, counts: (n,) what is added to.
+    """
+    if gradient.device.type == "cuda" and statistics_in_triton():
+        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
+
+        add_statistics(gradient, radii, size, norms, counts)
+    else:
+        _add_statistics(gradient, radii, size, norms, counts)
+
+
 def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
     """`densification_triton.add_statistics` in PyTorch's operations."""
-    shown = radii > 0
-    scaled = gradient.clone()
-    scaled[:, 0] *= size[0] / 2.0
-    scaled[:, 1] *= size[1] / 2.0
-    norms += torch.where(shown, scaled.norm(dim=-1), 0.0)
-    counts += shown
+    scaled = gradient.clone().view(-1, len(norms), 2)
+    scaled[..., 0] *= size[0] / 2.0
+    scaled[..., 1] *= size[1] / 2.0
+    for of_view, shown in zip(scaled, (radii > 0).view(-1, len(norms)), strict=True):
+        norms += torch.where(shown, of_view.norm(dim=-1), 0.0)
+        counts += shown
 
 
 @lru_cache(maxsize=1)
@@ -157,8 +209,8 @@ def statistics_in_triton() -> bool:
     def difference() -> float:
         from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
 
-        gradient = torch.linspace(-1, 1, 600, device="cuda").view(300, 2)
-        radii = torch.arange(300, dtype=torch.int32, device="cuda") % 3
+        gradient = torch.linspace(-1, 1, 1200, device="cuda").view(2, 300, 2)
+        radii = torch.arange(600, dtype=torch.int32, device="cuda").view(2, 300) % 7
         sums = [torch.ones(2, 300, device="cuda") for _ in range(2)]
         for add, both in zip((add_statistics, _add_statistics), sums, strict=True):
             add(gradient, radii, (8, 6), both[0], both[1])
@@ -195,13 +247,25 @@ class McmcDensifier:
         """Never: it goes by opacities."""
         return False
 
-    def after_step(self, model: TrainableField, iteration: int, result: RenderResult | None, camera: Camera) -> bool:
+    def scored_at(self, iteration: int) -> bool:
         """See `DensityControl`."""
-        # Positions get their noise beside a step: none while gradients still wait for those of other views.
-        waits = model.params["means"].grad is not None
-        rate = 0.0 if waits else model.optimizers["means"].param_groups[0]["lr"]
+        return False
+
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Nothing: it looks at no render."""
+
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
+        """See `DensityControl`."""
+        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step that was taken, scaled for its views
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
-        return iteration < self._schedule.densify_until and _refines(self._schedule, iteration)
+        return iteration < self._schedule.densify_until and refines(self._schedule, iteration)
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """What drives Gaussians that are not needed towards transparent and small."""
@@ -219,5 +283,5 @@ def mcmc_start(field: GaussianField) -> GaussianField:
     )
 
 
-def _refines(schedule: StageSchedule, iteration: int) -> bool:
+def refines(schedule: StageSchedule, iteration: int) -> bool:
     return iteration > schedule.densify_start and iteration % schedule.densify_every == 0

@@ -6,17 +6,19 @@ cache, and the fields that they are made of step with the residual.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from dataclasses import field as dataclass_field
+from typing import Any, cast
 
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.training.model import TrainableField
 
@@ -38,27 +40,52 @@ class JointFields:
     rasterizer: Rasterizer
     background: Tensor
     pyramid: Pyramid
+    _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
     def predict(self, name: str) -> Tensor:
         """(3, h, w) Up of what the fields make of a view, at the size of the level below them, with gradients."""
+        return self._predict(
+            [name], lambda field, cameras, background: render_image(self.rasterizer, field, cameras[0], background)
+        )
+
+    def predict_batch(self, names: Sequence[str]) -> Tensor:
+        """(b, 3, h, w) `predict` of two views or more of one size, each field's in one set of launches."""
+        rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
+
+        def render(field: GaussianField, cameras: Sequence[Camera], background: Tensor) -> Tensor:
+            return rasterizer.render_batch(field, cameras, background=background, describes=False).image
+
+        return self._predict(names, render)
+
+    def _predict(
+        self, names: Sequence[str], render: Callable[[GaussianField, Sequence[Camera], Tensor], Tensor]
+    ) -> Tensor:
         composed: Tensor | None = None
         for level, model in self.models.items():
-            camera = level_camera(self.cameras[name], level)
+            cameras = [self._camera(name, level) for name in names]
             background = self.background.new_zeros(3) if model.signed else self.background
-            image = render_image(self.rasterizer, model.field, camera, background)
+            image = render(model.field, cameras, background)
             composed = image if composed is None else upsample_add(self.pyramid, composed, image)
         assert composed is not None
-        camera = level_camera(self.cameras[name], min(self.models) - 1)
+        camera = self._camera(names[0], min(self.models) - 1)
         return upsample(self.pyramid, composed, (camera.height, camera.width))
 
-    def step(self, means_rate: float) -> None:
+    def _camera(self, name: str, level: int) -> Camera:
+        """A view's camera, always the same object: a rasterizer may know it by that."""
+        if (name, level) not in self._level_cameras:
+            self._level_cameras[name, level] = level_camera(self.cameras[name], level)
+        return self._level_cameras[name, level]
+
+    def step(self, means_rate: float, sh_rest_factor: float = 1.0, scale: StepScale = ONE_VIEW) -> None:
         """One Adam step on every field, after backward passes through what `predict` gave.
 
         Args:
-            means_rate: step size of the positions, in world units.
+            means_rate: step size of the positions for one view, in world units.
+            sh_rest_factor: on the step size of SH above degree 0.
+            scale: how the step differs from one for a single view.
         """
         for model in self.models.values():
-            model.step(means_rate)
+            model.step(means_rate, sh_rest_factor=sh_rest_factor, scale=scale)
 
     @property
     def fields(self) -> dict[int, GaussianField]:

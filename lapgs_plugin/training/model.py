@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats, splats_from_field
-from lapgs_plugin.ops.adam import ADAM_EPS, GpuFieldAdam, adam_in_triton, step_together
+from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, adam_in_triton, step_together
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.training.settings import LearningRates
 
@@ -30,12 +30,14 @@ class TrainableField:
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
         sparse: whether a step moves those Gaussians alone that have a gradient.
+        sh_rest_rate: step size of SH above degree 0 before a step's factor.
     """
 
     params: dict[str, torch.nn.Parameter]
     optimizers: dict[str, Any]
     signed: bool
     sparse: bool = False
+    sh_rest_rate: float = 0.0
 
     @classmethod
     def create(
@@ -62,7 +64,7 @@ class TrainableField:
         optimizers = {
             name: make(param, rate[name], SH_REST_SCALE if name == "sh" else 1.0) for name, param in params.items()
         }
-        return cls(params, optimizers, field.signed)
+        return cls(params, optimizers, field.signed, sh_rest_rate=rate["sh"] * SH_REST_SCALE)
 
     @classmethod
     def _in_two(cls, field: GaussianField, rates: LearningRates, extent: float, sparse: bool) -> TrainableField:
@@ -74,7 +76,7 @@ class TrainableField:
         rate = _rates(field, rates, extent)
         rate |= {"sh0": rate["sh"], "shN": rate["sh"] * SH_REST_SCALE}
         optimizers = {name: gpu_adam(param, rate[name], sparse) for name, param in params.items()}
-        return cls(params, optimizers, field.signed, sparse)
+        return cls(params, optimizers, field.signed, sparse, rate["shN"])
 
     def __len__(self) -> int:
         return int(self.params["means"].shape[0])
@@ -84,27 +86,70 @@ class TrainableField:
         """The current parameters, sharing their memory and gradients."""
         return field_from_splats(self.params, self.signed)
 
-    def step(self, means_rate: float, active_coefficients: int | None = None) -> None:
+    def step(
+        self,
+        means_rate: float,
+        active_coefficients: int | None = None,
+        sh_rest_factor: float = 1.0,
+        scale: StepScale = ONE_VIEW,
+    ) -> None:
         """One Adam step on every parameter, then clear the gradients.
 
         Args:
-            means_rate: step size of the positions, already scaled by the extent.
+            means_rate: step size of the positions for one view, already scaled by the extent. The positions' optimizer
+                keeps it, scaled for this step.
             active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
+            sh_rest_factor: on the step size of SH above degree 0.
+            scale: how the step differs from one for a single view.
         """
+        groups = [optimizer.param_groups[0] for optimizer in self.optimizers.values()]
         self.optimizers["means"].param_groups[0]["lr"] = means_rate
+        self._scale_rest_of_sh(sh_rest_factor)
+        rates = [group["lr"] for group in groups]
+        for group in groups:
+            group["lr"] *= scale.rate
+        self._step_scaled(active_coefficients, scale)
+        for (name, optimizer), rate in zip(self.optimizers.items(), rates, strict=True):
+            if name != "means":
+                optimizer.param_groups[0]["lr"] = rate
+        for param in self.params.values():
+            param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
+
+    def _step_scaled(self, active_coefficients: int | None, scale: StepScale) -> None:
+        """`step` with step sizes as the optimizers have them."""
         if isinstance(self.optimizers.get("sh"), FieldAdam):
             every = self.params["sh"].shape[1]
             self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
         optimizers = list(self.optimizers.values())
         if all(isinstance(optimizer, GpuFieldAdam) for optimizer in optimizers):
-            step_together(optimizers)
-        elif all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
-            fused_steps(optimizers)
-        else:
-            for optimizer in optimizers:
-                optimizer.step(*([self._touched] if self.sparse else []))
-        for param in self.params.values():
-            param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
+            step_together(optimizers, scale)
+            return
+        if scale.gradient != 1.0:
+            torch._foreach_mul_([p.grad for p in self.params.values() if p.grad is not None], scale.gradient)
+        if all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
+            fused_steps(optimizers, scale.views)
+            return
+        for optimizer in optimizers:
+            group = optimizer.param_groups[0]
+            if self.sparse:
+                betas = group["betas"]
+                group["betas"] = tuple(beta**scale.views for beta in betas)
+                optimizer.step(self._touched)
+                group["betas"] = betas
+            else:
+                group["views"] = scale.views
+                optimizer.step()
+
+    def _scale_rest_of_sh(self, factor: float) -> None:
+        """Let SH above degree 0 learn at their own rate times `factor`."""
+        if "shN" in self.optimizers:
+            self.optimizers["shN"].param_groups[0]["lr"] = self.sh_rest_rate * factor
+            return
+        optimizer, scale = self.optimizers["sh"], SH_REST_SCALE * factor
+        if isinstance(optimizer, GpuFieldAdam):
+            optimizer.param_groups[0]["rest_scale"] = scale
+        elif isinstance(optimizer, FieldAdam):
+            optimizer.param_groups[0]["column_scale"][1:] = scale
 
     @property
     def _touched(self) -> Tensor:
@@ -208,25 +253,31 @@ def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
 
 
 @torch.no_grad()
-def fused_steps(optimizers: Sequence[torch.optim.Adam]) -> None:
+def fused_steps(optimizers: Sequence[torch.optim.Adam], views: int = 1) -> None:
     """One step of each, with the bits of its own `step`, in an eighth of the time that the processor takes for those.
 
     Args:
         optimizers: as `gpu_adam` makes them: fused, of one tensor each.
+        views: of a `StepScale`.
     """
     started = []
     for optimizer in optimizers:
         group = optimizer.param_groups[0]
         param = group["params"][0]
-        if not optimizer.state[param]:
-            optimizer.step()  # makes the moments
-        elif param.grad is not None:
-            started.append((group, param, optimizer.state[param]))
+        if param.grad is None:
+            continue
+        state = optimizer.state[param]
+        if not state:  # as `step` makes them
+            state["step"] = torch.zeros((), device=param.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
+        started.append((group, param, state))
     if started:
-        torch._foreach_add_([state["step"] for _, _, state in started], 1)
+        torch._foreach_add_([state["step"] for _, _, state in started], views)
     for group, param, state in started:
-        beta1, beta2 = group["betas"]
+        beta1, beta2 = (beta**views for beta in group["betas"])
+        # The kernel takes these betas to the power of the count: of views, where it is to be one of steps.
+        count = state["step"] if views == 1 else state["step"] / views
         torch._fused_adam_(
-            [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+            [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [count],
             lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=0.0, eps=group["eps"], amsgrad=False, maximize=False,
         )  # fmt: skip

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -13,17 +14,22 @@ from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_image
+from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, render_image
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
+from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.settings import StageSchedule, TrainSettings
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
+from lapgs_plugin.training.settings import PIXELS_OF_A_LAUNCH, StageSchedule, TrainSettings
 from lapgs_plugin.training.views import LevelImages, LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
@@ -44,6 +50,7 @@ class StageProgress:
         loss: smoothed loss, NaN before the first iteration.
         peak_gaussians: most Gaussians optimized at once in this stage.
         gaussian_steps: Gaussians optimized, summed over the iterations.
+        most_views: what the GPU's memory has turned out to hold of views in one launch; None while it has held all.
     """
 
     iteration: int = 0
@@ -51,6 +58,28 @@ class StageProgress:
     loss: float = math.nan
     peak_gaussians: int = 0
     gaussian_steps: int = 0
+    most_views: int | None = None
+
+
+@dataclass(frozen=True)
+class _Launch:
+    """Views of a step that were rendered together, after their backward pass.
+
+    Attributes:
+        result: of the render but for its image, where density control looks at it.
+        camera: of the last view.
+        loss: mean of the views' losses.
+        iteration: of the last view.
+        views: how many there are.
+        gaussians: how many were optimized.
+    """
+
+    result: RenderResult | None
+    camera: Camera
+    loss: Tensor
+    iteration: int
+    views: int
+    gaussians: int
 
 
 @dataclass
@@ -70,6 +99,8 @@ class StageRun:
         unfreeze: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: those fields while they are being trained; None before.
         breakdown: told which part of an iteration begins.
+        say: takes a line for the user.
+        step_views: how many views the last step took.
 
     The field, the images and the background are on one device, where the stage is trained.
     """
@@ -91,13 +122,16 @@ class StageRun:
     joint: JointFields | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     progress: StageProgress = field(default_factory=StageProgress)
-    _unread: list[Tensor] = field(default_factory=list)
+    say: Callable[[str], None] = print
+    step_views: int = 1
+    _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
+    _context: StageContext | None = None  # of the last view that was rendered
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
-        """Train from where `progress` stands to the end of the stage.
+        """Train from where `progress` stands to the end of the stage. An iteration is a view; steps may take several.
 
         Args:
-            after_iteration: called after every iteration, outside the timed region; may raise to stop the run.
+            after_iteration: called after every step, outside the timed region; may raise to stop the run.
 
         Raises:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
@@ -105,10 +139,11 @@ class StageRun:
         while self.progress.iteration < self.stage.iterations:
             start = time.perf_counter()
             self.breakdown.mark("other")
-            self._iterate(self.progress.iteration + 1)
+            self.step_views = self.schedule.views_of_step(self.progress.iteration)
+            self._step(self._next(self.progress.iteration))
             self.breakdown.pause()
             self.progress.seconds += time.perf_counter() - start
-            self.progress.iteration += 1
+            self.progress.iteration += self.step_views
             if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
@@ -122,12 +157,17 @@ class StageRun:
         if not self._unread:
             return
         start = time.perf_counter()
-        losses, self._unread = torch.stack(self._unread).tolist(), []
+        waiting, self._unread = self._unread, []
+        losses = torch.stack([loss for loss, _, _ in waiting]).tolist()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         self.progress.seconds += time.perf_counter() - start
-        for back, loss in zip(range(len(losses) - 1, -1, -1), losses, strict=True):
-            self._note_loss(loss, self.progress.iteration - back)
+        for loss, (_, iteration, views) in zip(losses, waiting, strict=True):
+            self._note_loss(loss, iteration, views)
+
+    def passed(self, every: int) -> bool:
+        """Whether the last step took the stage to or past a multiple of so many iterations, or to its end."""
+        return self.progress.iteration % every < self.step_views or self.progress.iteration == self.stage.iterations
 
     @property
     def num_optimized(self) -> int:
@@ -144,106 +184,244 @@ class StageRun:
         """How many losses wait to be read."""
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
-    def _iterate(self, iteration: int) -> None:
-        if iteration == self.joint_from:
-            assert self.unfreeze is not None, "a stage that trains finished fields can have them"
-            self.joint = self.unfreeze(None)
-        view = self._view(iteration)
-        target, coarse_target = self.images.get(view.name)
-        context = StageContext(
-            stage=self.stage,
-            iteration=iteration,
-            view=view.name,
-            target=target,
-            accumulated=self._prediction(view),
-            coarse_target=coarse_target,
-        )
-        self._prefetch_next(iteration)
-        degree = self.schedule.active_sh_degree(iteration)
-        self.progress.gaussian_steps += self.num_optimized
-        self.hooks.before_render(context)
-        self.breakdown.mark("forward")
-        gaussians = self.model.field
-        rendered, result = self._render(gaussians, view, iteration, degree)
-        self.breakdown.mark("loss")
-        image = self.hooks.compose(context, rendered)
-        loss = self.hooks.loss(context, image)
-        self._keep_loss(loss.detach(), iteration)
-        regularization = self.densifier.regularization(gaussians)
-        self.breakdown.mark("backward")
-        (loss if regularization is None else loss + regularization).backward()  # type: ignore[no-untyped-call]  # torch's
+    @cached_property
+    def _batching(self) -> BatchRasterizer | None:
+        """What renders several views at once; None where nothing does. Asking a protocol in each step takes long."""
+        return self.rasterizer if isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch else None
+
+    def _next(self, done: int) -> range:
+        """The iterations of the step that comes after `done` ones."""
+        return range(done + 1, done + 1 + self.schedule.views_of_step(done))
+
+    def _launches(self, iterations: range) -> list[list[int]]:
+        """The iterations of a step by what is rendered together: one size, one degree of SH, no more than fit."""
+        if self._batching is None or len(iterations) == 1:
+            return [[iteration] for iteration in iterations]
+        alike: dict[tuple[bool, int, int, int], list[int]] = {}
+        for iteration in iterations:
+            camera, degree = self._view(iteration).camera, self.schedule.active_sh_degree(iteration)
+            key = (self._trains_along(iteration), camera.width, camera.height, degree)
+            alike.setdefault(key, []).append(iteration)
+        launches = []
+        for (_, width, height, _), group in alike.items():
+            most = max(1, round(PIXELS_OF_A_LAUNCH / (width * height)))
+            count = math.ceil(len(group) / min(most, self.progress.most_views or most))
+            size = math.ceil(len(group) / count)
+            launches += [group[start : start + size] for start in range(0, len(group), size)]
+        return launches
+
+    def _step(self, iterations: range) -> None:
+        """Render, compare and go back through all views of a step, and let the optimizers step once for them."""
+        launches = self._run_launches(iterations)
+        last = iterations[-1]
+        for launch in launches:
+            self.progress.gaussian_steps += launch.gaussians * launch.views
         self.breakdown.mark("other")
+        context, self._context = self._context, None
+        assert context is not None
         self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
-        if self.schedule.steps(iteration):
-            means_rate = self.schedule.means_learning_rate(iteration) * self.extent
-            self.model.step(means_rate, (degree + 1) ** 2)
-            if self.joint is not None:
-                self.joint.step(means_rate)
+        means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
+        scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
+        self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
+        if self.joint is not None:
+            self.joint.step(means_rate, rest, scale)
         self.breakdown.mark("densification")
-        self._densify(context, result, view)
+        for launch in launches[:-1]:
+            if launch.result is not None:
+                self.densifier.accumulate(launch.result, launch.camera)
+        self._densify(context, last, launches[-1])
         self.breakdown.mark("other")
-        if iteration % FINITE_CHECK_EVERY == 0 or iteration == self.stage.iterations:
-            self._require_finite(iteration)
+        if last % FINITE_CHECK_EVERY < len(iterations) or last == self.stage.iterations:
+            self._require_finite(last)
+
+    def _run_launches(self, iterations: range) -> list[_Launch]:
+        """All launches of a step, smaller ones from its beginning where the GPU's memory does not hold them."""
+        while True:
+            planned = self._launches(iterations)
+            following = self._launches(self._next(iterations[-1]))[:1] if iterations[-1] < self.stage.iterations else []
+            try:
+                thens = [*planned[1:], *following, []]
+                done = [self._launch(each, then) for each, then in zip(planned, thens, strict=False)]
+            except torch.cuda.OutOfMemoryError:
+                most = max(map(len, planned))
+                if most == 1:
+                    raise
+            else:
+                if self._losses_at_once > 1:
+                    self._unread += [(launch.loss, launch.iteration, launch.views) for launch in done]
+                return done
+            # Out here, where the error holds nothing of what was rendered any more.
+            self._forget_gradients()
+            self.progress.most_views = most // 2
+            self.say(
+                f"level {self.stage.level}: no memory for {most} views at once; from here on {most // 2} are rendered "
+                "together, and steps take as many as before"
+            )
+
+    def _forget_gradients(self) -> None:
+        self._context = None
+        models = [self.model] if self.joint is None else [self.model, *self.joint.models.values()]
+        for model in models:
+            for param in model.params.values():
+                param.grad = None
+
+    def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
+        """Render some of a step's views and go back through their losses; `then` are the iterations after these."""
+        last = iterations[-1]
+        if self._trains_along(last) and self.joint is None:
+            assert self.unfreeze is not None, "a stage that trains finished fields can have them"
+            self.joint = self.unfreeze(None)
+        views = [self._view(iteration) for iteration in iterations]
+        contexts = self._contexts(iterations, [view.name for view in views])
+        self._announce(then)
+        for context in contexts:
+            self.hooks.before_render(context)
+        self.breakdown.mark("forward")
+        gaussians = self.model.field
+        rendered, result = self._render(gaussians, [view.camera for view in views], last)
+        self.breakdown.mark("loss")
+        images = [rendered] if len(contexts) == 1 else rendered.unbind()
+        losses = [
+            self.hooks.loss(context, self.hooks.compose(context, image))
+            for context, image in zip(contexts, images, strict=True)
+        ]
+        loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
+        kept = loss.detach()
+        if self._losses_at_once == 1:  # on a CPU read at once, before a loss that is not finite does harm
+            self._note_loss(kept.item(), last, len(views))
+        regularization = self.densifier.regularization(gaussians)
+        self.breakdown.mark("backward")
+        total = loss if regularization is None else loss + regularization
+        # The sum of the views' losses: of one, this is what `backward` does without it.
+        total.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
+        self.breakdown.mark("other")
+        self._context = contexts[-1]
+        if result is not None:  # the images of all views of a step would fill a GPU
+            result = replace(result, image=kept, transmittance=None)
+        return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
+
+    def _contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
+        """What hooks are told: a context a view, or one for all where every hook takes all at once."""
+        several = len(names) > 1
+        target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
+        context = StageContext(
+            stage=self.stage,
+            iteration=iterations[-1],
+            view=names[-1],
+            target=target,
+            accumulated=self._prediction(names),
+            coarse_target=coarse_target,
+        )
+        if not several or self.hooks.takes_batches:
+            return [context]
+
+        def of(images: Tensor | None, index: int) -> Tensor | None:
+            return None if images is None else images[index]
+
+        return [
+            replace(
+                context,
+                iteration=iteration,
+                view=name,
+                target=target[index],
+                accumulated=of(context.accumulated, index),
+                coarse_target=of(coarse_target, index),
+            )
+            for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
+        ]
 
     def _render(
-        self, gaussians: GaussianField, view: LevelView, iteration: int, degree: int
+        self, gaussians: GaussianField, cameras: Sequence[Camera], iteration: int
     ) -> tuple[Tensor, RenderResult | None]:
-        """The image, and what else is known of the render where somebody looks at it."""
-        if self.densifier.needs_statistics(iteration):
-            result = self.rasterizer(gaussians, view.camera, background=self.background, sh_degree=degree)
+        """The image, or images of several cameras, and what else is known of the render where somebody looks at it."""
+        looks, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
+        if len(cameras) > 1:
+            assert self._batching is not None
+            result = self._batching.render_batch(
+                gaussians, cameras, background=self.background, sh_degree=degree, describes=looks
+            )
+            return result.image, result if looks else None
+        if looks:
+            result = self.rasterizer(gaussians, cameras[0], background=self.background, sh_degree=degree)
             return result.image, result
-        return render_image(self.rasterizer, gaussians, view.camera, self.background, degree), None
+        return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
+
+    def _trains_along(self, iteration: int) -> bool:
+        """Whether finished fields are trained along in an iteration."""
+        return self.joint_from is not None and iteration >= self.joint_from
 
     def _view(self, iteration: int) -> LevelView:
         return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
 
-    def _prediction(self, view: LevelView) -> Tensor | None:
-        """What the finished levels predict for a view."""
+    def _prediction(self, names: Sequence[str]) -> Tensor | None:
+        """What the finished levels predict for a view, or for several."""
+        several = len(names) > 1
         if self.joint is not None:
             self.breakdown.mark("forward")
-            return self.joint.predict(view.name)
-        return None if self.accumulated is None else self.accumulated.get(view.name)
+            return self.joint.predict_batch(names) if several else self.joint.predict(names[0])
+        if self.accumulated is None:
+            return None
+        return self.accumulated.get_batch(names) if several else self.accumulated.get(names[0])
 
-    def _prefetch_next(self, iteration: int) -> None:
-        """Let the next iteration's images come while this one renders."""
-        if iteration == self.stage.iterations:
-            return
-        name = self._view(iteration + 1).name
-        self.images.prefetch(name)
-        if self.accumulated is not None and self.joint is None:
-            self.accumulated.prefetch(name)
+    def _announce(self, iterations: Sequence[int]) -> None:
+        """Let the images of the next launch come while this one renders."""
+        for iteration in iterations[:AHEAD]:
+            name = self._view(iteration).name
+            self.images.prefetch(name)
+            if self.accumulated is not None and self.joint is None:
+                self.accumulated.prefetch(name)
 
-    def _densify(self, context: StageContext, result: RenderResult | None, view: LevelView) -> None:
-        changed = self.densifier.after_step(self.model, context.iteration, result, view.camera)
-        if (share := self.settings.prune) and context.iteration == self.schedule.prunes_after:
+    def _densify(self, context: StageContext, iteration: int, launch: _Launch) -> None:
+        scores = self._scores(iteration) if self.densifier.scored_at(iteration) else None
+        changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
+        if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
             self._prune(share)
             changed = True
         if changed:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _prune(self, share: float) -> None:
-        """Remove what training views hardly see."""
+    def _scores(self, iteration: int) -> ViewScores:
+        """What some training views say about each Gaussian; the same views whenever a run comes here."""
+        place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
+        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
+        degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
+
+        def asked(view: LevelView) -> ScoredView:
+            with torch.no_grad():
+                field = self.model.field.detach()
+                image = render_image(self.rasterizer, field, view.camera, self.background, degree)
+                below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
+                self.breakdown.mark("densification")
+                whole = image if below is None else image + below
+                loss = photometric_loss(whole, target, self.settings.ssim_weight)
+            return ScoredView(
+                render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
+            )
+
+        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        return view_scores(views, grey, self.settings.densification.error_threshold)
+
+    def _grey(self) -> tuple[GaussianField, Tensor]:
+        """The field with all colours zero, and the coefficients (n, 1, 3) that say so, with gradients."""
         seen = self.model.field.detach()
         grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
-        plain = replace(seen, sh=grey, signed=True)
+        return replace(seen, sh=grey, signed=True), grey
+
+    def _prune(self, share: float) -> None:
+        """Remove what training views hardly see."""
+        plain, grey = self._grey()
         images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
         pixels = blended_pixels(images, grey)
         remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))
 
-    def _keep_loss(self, loss: Tensor, iteration: int) -> None:
-        """On a CPU read it at once, before a loss that is not finite does harm."""
-        if self._losses_at_once == 1:
-            self._note_loss(loss.item(), iteration)
-        else:
-            self._unread.append(loss)
-
-    def _note_loss(self, loss: float, iteration: int) -> None:
+    def _note_loss(self, loss: float, iteration: int, views: int) -> None:
+        """Smooth the mean loss of some views; `iteration` is that of the last one."""
         if not math.isfinite(loss):
             raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
-        past = self.progress.loss
-        self.progress.loss = loss if math.isnan(past) else LOSS_SMOOTHING * past + (1 - LOSS_SMOOTHING) * loss
+        past, kept = self.progress.loss, LOSS_SMOOTHING**views
+        self.progress.loss = loss if math.isnan(past) else kept * past + (1 - kept) * loss
 
     def _require_finite(self, iteration: int) -> None:
         try:

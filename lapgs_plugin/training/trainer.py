@@ -15,7 +15,7 @@ from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInp
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
@@ -24,6 +24,7 @@ from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
+from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
@@ -40,7 +41,7 @@ from lapgs_plugin.training.densification import density_control, mcmc_start, sta
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import StageSchedule, TrainSettings
+from lapgs_plugin.training.settings import StageSchedule, TrainSettings, views_per_step
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
 
@@ -52,12 +53,21 @@ LOG_TICKS = 200
 """About how often a run writes to its history and updates its progress display."""
 
 
-def make_plan(size: tuple[int, int], settings: TrainSettings) -> StagePlan:
+def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None = None) -> StagePlan:
     """Return the stages of a run on images of this size (width, height), which is `Scene.smallest_size`.
 
+    Args:
+        size: (width, height).
+        settings: of the run.
+        views: number of training views; None where that is not known.
+
     Raises:
-        UserInputError: levels, split and image size do not go together.
+        UserInputError: levels, split and image size do not go together, or a step takes more views than there are.
     """
+    if views is not None and (asked := settings.asked_views or 1) > views:
+        raise UserInputError(
+            f"--views-per-step {asked}: the scene has {views} training views; give at most as many, or auto"
+        )
     return StagePlan.create(size, settings.iterations, settings.levels, settings.shares, settings.kind)
 
 
@@ -88,6 +98,10 @@ def warm_up(
     image = result.image + render_image(rasterizer, model.field, camera, black)
     photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
+    if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch:
+        images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
+        photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
+        model.step(0.0, 1, scale=StepScale.of(2))
     if torch.device(device).type == "cuda":
         statistics_in_triton()
     coarse = torch.zeros(3, 8, 8, device=device)
@@ -130,7 +144,7 @@ class Trainer:
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
-        self.plan = make_plan(self.scene.smallest_size, self.settings)
+        self.plan = make_plan(self.scene.smallest_size, self.settings, len(self.scene.train))
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)
@@ -225,13 +239,15 @@ class Trainer:
                 model.adopt_moments(self._moments(stage.level + 1, field), torch.arange(len(field)))
                 return model
             if not stage.signed:
-                points = field_from_points(self.scene.points, self.scene.colors, self.settings.sh_degree)
+                degree = self.settings.sh_degree_of(stage)
+                points = field_from_points(self.scene.points, self.scene.colors, degree)
                 if self.settings.densification.strategy == "mcmc":
                     points = mcmc_start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
             coarser = self.archive.field(stage.level + 1)
-            field, kept = inherit(coarser, self.settings.inherit_mode, self.settings.inherit_ratio, generator)
+            mode, ratio = self.settings.inherit_mode, self.settings.inherit_ratio
+            field, kept = inherit(coarser, mode, ratio, generator, self.settings.sh_degree)
             model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
             if self.settings.inherit_mode == "full":
                 model.adopt_moments(self._moments(stage.level + 1, coarser), kept)
@@ -243,9 +259,19 @@ class Trainer:
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
+        batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         schedule = StageSchedule.create(
-            self.settings, stage, coarser if continues_field(stage, self.plan.levels) else 0
+            self.settings,
+            stage,
+            coarser if continues_field(stage, self.plan.levels) else 0,
+            views_per_step(self.settings, stage, len(self.scene.train), batches),
         )
+        sizes = {(view.camera.width, view.camera.height) for view in self.scene.train}
+        if schedule.views > 1 and batches and len(sizes) > 1:
+            self.monitor.say(
+                f"level {stage.level}: steps for {schedule.views} views; the training views have {len(sizes)} sizes, "
+                "and those of one size are rendered together"
+            )
         if self._images is not None:
             self._images.close()
         with self._overhead.timed("pyramid"):
@@ -274,6 +300,7 @@ class Trainer:
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
+            say=self.monitor.say,
         )
 
     def _unfreeze(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
@@ -348,11 +375,11 @@ class Trainer:
         shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
 
     def _after_iteration(self, run: StageRun, stop: StopRequest) -> None:
-        """Log, measure, save and stop, whatever is due; none of it counts as optimization time."""
+        """Log, measure, save and stop, whatever became due with the last step; none of it is optimization time."""
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
-        due_test = last if self.test_every is None else (last or iteration % self.test_every == 0)
-        due_tick = last or iteration % max(1, self.plan.iterations // LOG_TICKS) == 0
+        due_test = last if self.test_every is None else run.passed(self.test_every)
+        due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
         if due_test or due_tick or stop.requested:
             run.settle()  # what follows is not to be charged for iterations that are still under way
         psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
@@ -362,7 +389,7 @@ class Trainer:
             run.settle()
             with self._overhead.timed("view"):
                 self.watcher.look(run.stage, iteration, lambda: _fields(run), lambda: stop.requested)
-        if stop.requested or self._due_checkpoint(iteration):
+        if stop.requested or self._due_checkpoint(run):
             self._save_checkpoint(run)
         if stop.requested:
             raise TrainingStoppedError(
@@ -370,9 +397,9 @@ class Trainer:
                 f"a checkpoint is in {self.archive.path()}, the same command with --resume continues"
             )
 
-    def _due_checkpoint(self, iteration: int) -> bool:
+    def _due_checkpoint(self, run: StageRun) -> bool:
         if self.checkpoint_every is not None:
-            return iteration % self.checkpoint_every == 0
+            return run.progress.iteration % self.checkpoint_every < run.step_views
         return time.monotonic() - self._last_checkpoint >= CHECKPOINT_SECONDS
 
     def _tick(self, run: StageRun, psnr: float | None) -> None:

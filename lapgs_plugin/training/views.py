@@ -77,6 +77,14 @@ class LevelImages:
         target = self._held[name] if self._targets is None else self._targets.get(name)
         return target, None if self._coarse is None else self._coarse.get(name)
 
+    def get_batch(self, names: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+        """What `get` gives of several views of one size, (b, 3, h, w)."""
+        if self._targets is None:
+            target = torch.stack([self._held[name] for name in names])
+        else:
+            target = self._targets.get_batch(names)
+        return target, None if self._coarse is None else self._coarse.get_batch(names)
+
     @property
     def bytes_on_device(self) -> int:
         """Bytes of them on a GPU."""

@@ -36,10 +36,11 @@ def lapgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path: Path) -> None:
-    done = lapgs("train", scene, "-o", tmp_path / "run", "--eval", *SHORT)
+    done = lapgs("train", scene, "-o", tmp_path / "run", "--eval", "--views-per-step", "3", *SHORT)
     assert done.returncode == 0, done.stderr
     archive = RunArchive.open(tmp_path / "run")
     assert archive.manifest.complete
+    assert archive.manifest.settings["views_per_step"] == "3"
     assert archive.manifest.settings["hierarchy"] == "nested", "unless told otherwise"
     assert [record.signed for record in archive.manifest.records] == [False, False]
     assert read_preview(tmp_path / "run") is not None
@@ -70,11 +71,14 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
-        (("--strategy", "luck"), "expected default or mcmc"),
+        (("--strategy", "luck"), "expected default, mcmc or multiview"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),
         (("--cache", "gpu", "--rasterizer", "cpu"), "--images-on gpu: expected memory or disk"),
         (("--cache", "tape"), "--images-on tape: expected auto, gpu, memory, disk"),
         (("--cache-precision", "int4"), "--prediction-precision int4: expected auto, float32, float16, uint8"),
+        (("--views-per-step", "some"), "--views-per-step some: expected auto, or a number of views"),
+        (("--views-per-step", "0"), "--views-per-step 0: expected auto, or at least 1"),
+        (("--views-per-step", "11"), "--views-per-step 11: the scene has 10 training views; give at most as many"),
         (("--resolution", "8k"), "expected 1k, 2k, 4k"),
         (("--background", "2,0,0"), "from 0 to 1"),
         (("--resume",), "is not a run"),

@@ -203,9 +203,7 @@ def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Pat
 
 @pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_nested_levels_after_the_first_reset_no_opacities(
-    name: str, hierarchy: str, scene: Path, tmp_path: Path
-) -> None:
+def test_stages_after_the_first_reset_no_opacities(name: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
     """Neither at the interval nor, over white, where densification may begin."""
     more = ("--opacity_reset_interval", 8, "--white_background")
     asked: dict[int, int] = {}
@@ -224,7 +222,26 @@ def test_nested_levels_after_the_first_reset_no_opacities(
         model.training_setup, model.reset_opacity = training_setup, reset_opacity
         drive(adapter, hierarchy=hierarchy, **THIRDS)
     assert asked[30] > 1
-    assert (asked[60] == 0) == (hierarchy == "nested")
+    assert asked[60] == 0
+
+
+def test_residuals_reset_opacities_where_that_is_asked_for(scene: Path, tmp_path: Path) -> None:
+    more = ("--opacity_reset_interval", 8)
+    reset: set[int] = set()
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *more) as adapter:
+        model = adapter.train.GaussianModel
+        setup = model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            self.stage_iterations = training_args.iterations
+            setup(self, training_args)
+
+        def reset_opacity(self: Any) -> None:
+            reset.add(self.stage_iterations)
+
+        model.training_setup, model.reset_opacity = training_setup, reset_opacity
+        drive(adapter, hierarchy="laplacian", residual_resets=True, **THIRDS)
+    assert reset == {30, 60}
 
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:

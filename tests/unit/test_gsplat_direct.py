@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import gc
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers import gsplat_direct
 from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.training.backend import training_rasterizer
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import ring_scene
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
@@ -28,6 +38,12 @@ def gaussians(degree: int, signed: bool, count: int = 2000) -> GaussianField:
         signed,
     )
     return field.to("cuda")
+
+
+def moved(by: float) -> Camera:
+    pose = torch.eye(4)
+    pose[0, 3] = by
+    return replace(CAMERA, world_to_camera=pose)
 
 
 def test_it_is_used() -> None:
@@ -102,3 +118,90 @@ def test_nothing_is_kept_of_renders_that_nobody_differentiates() -> None:
         assert torch.cuda.memory_allocated() <= before
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("views", [2, 5, 8])
+@pytest.mark.parametrize(("degree", "active", "signed"), [(3, 3, False), (3, 1, True), (0, 0, False)])
+def test_several_views_are_those_of_single_calls(views: int, degree: int, active: int, signed: bool) -> None:
+    background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
+    weights = torch.randn(views, 3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
+    cameras = [moved(0.1 * index) for index in range(views)]
+    rasterizer = GsplatRasterizer(direct=True, own_radii=True)
+    together, alone = gaussians(degree, signed), gaussians(degree, signed)
+    for value in (*together.parameters.values(), *alone.parameters.values()):
+        value.requires_grad_()
+    batch = rasterizer.render_batch(together, cameras, background=background, sh_degree=active)
+    (batch.image * weights).sum().backward()
+    each = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
+    torch.stack([(one.image * weight).sum() for one, weight in zip(each, weights, strict=True)]).sum().backward()
+    pairs = {
+        "image": (batch.image, torch.stack([one.image for one in each])),
+        "radii": (batch.radii.float(), torch.stack([one.radii for one in each]).float()),
+        "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in each])),
+        "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in each])),
+        "absgrad2d": (batch.absgrad2d, torch.stack([one.absgrad2d for one in each])),
+        **{name: (value.grad, alone.parameters[name].grad) for name, value in together.parameters.items()},
+    }
+    worst = {}
+    for name, (one, other) in pairs.items():
+        worst[name] = float((one - other).abs().max() / other.abs().max())
+    print(views, degree, active, signed, {name: f"{value:.1e}" for name, value in worst.items()})
+    assert worst["radii"] == 0
+    assert max(worst.values()) < 2e-4, worst  # as for one view: sums in another order, in both
+    plain = rasterizer.render_batch(together, cameras, background=background, sh_degree=active, describes=False)
+    torch.testing.assert_close(plain.image, batch.image, rtol=0, atol=1e-5)
+    plain.image.sum().backward()
+
+
+def test_several_views_take_less_time_than_single_calls() -> None:
+    """Printed; what is asserted is that a batch is no slower than its views one by one."""
+    field = gaussians(3, False, 100_000)
+    for value in field.parameters.values():
+        value.requires_grad_()
+    background, rasterizer = torch.zeros(3, device="cuda"), GsplatRasterizer(direct=True, own_radii=True)
+    cameras = [moved(0.05 * index).resized(400, 267) for index in range(8)]
+
+    def milliseconds(views: int, once: Callable[[], Tensor]) -> float:
+        for count in (5, 30):  # warm, then measured
+            torch.cuda.synchronize()
+            start = time.perf_counter()
+            for _ in range(count):
+                once().sum().backward()
+            torch.cuda.synchronize()
+        return (time.perf_counter() - start) * 1e3 / 30 / views
+
+    alone = milliseconds(1, lambda: rasterizer(field, cameras[0], background=background).image)
+    found = {
+        views: milliseconds(
+            views, lambda n=views: rasterizer.render_batch(field, cameras[:n], background=background).image
+        )
+        for views in (2, 4, 8)
+    }
+    print(f"1 view {alone:.3f} ms", {views: f"{took:.3f} ms a view" for views, took in found.items()})
+    assert found[8] < 1.1 * alone
+
+
+def test_a_run_for_several_views_a_step(tmp_path: Path) -> None:
+    """On the GPU, base and residual, base trained along and views gathered: as good as single views, and resumable."""
+    scene = ring_scene(train=8, size=(112, 80))
+    calm = Densification(start=20, until=600, every=50, reset_every=100_000)
+    found = {}
+    for views in (1, 4):
+        settings = TrainSettings(
+            iterations=1200,
+            hierarchy="laplacian",
+            sh_degree=2,
+            joint=0.2,
+            views_per_step=str(views),
+            densification=calm,
+        )
+        reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+        manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
+        placed = training_rasterizer("gsplat", settings)
+        start = time.perf_counter()
+        with RunArchive.create(tmp_path / str(views), manifest) as archive:
+            Trainer(scene, settings, archive, placed.rasterizer, placed.device).run()
+        found[views] = archive.history()[-1]["psnr"]
+        counts = [record.num_gaussians for record in archive.manifest.records]
+        print(f"{views} a step: {found[views]:.2f} dB, {counts} Gaussians, {time.perf_counter() - start:.1f} s")
+    assert abs(found[4] - found[1]) < 1.5

@@ -105,9 +105,11 @@ def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(sc
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
     assert TrainSettings.from_manifest(manifest).for_manifest() == settings.for_manifest()
-    since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy")
+    since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy", "base_sh_degree")
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
+    for name in ("sh_rest_factor", "sh_rest_decay"):
+        older["learning_rates"].pop(name)
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
     density = replace(SETTINGS.densification, grow_grad2d=2e-4)  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
@@ -220,6 +222,37 @@ def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
         assert not torch.equal(value, field.parameters[name])
 
 
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_factor_scales_the_steps_of_higher_harmonics_alone(signed: bool) -> None:
+    """Adam's first step is as long as its rate, whatever the gradient."""
+    field = replace(blob_field(20), sh=torch.randn(20, 4, 3), signed=signed)
+    moved = {}
+    for factor in (None, 1.0, 8.0):
+        for make in (TrainableField.create, lambda *given: TrainableField._in_two(*given, sparse=False)):
+            model = make(field, LearningRates(), 4.0)
+            model.field.sh.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            for value in model.params.values():
+                value.grad = torch.ones_like(value) if value.grad is None else value.grad
+            model.step(1e-3, 4, *([] if factor is None else [factor]))
+            moved.setdefault(factor, []).append(model.field.sh.detach() - field.sh)
+    rate = LearningRates().residual_sh if signed else LearningRates().sh
+    for one, plain, eightfold in zip(moved[None], moved[1.0], moved[8.0], strict=True):
+        assert torch.equal(one, plain), "a factor of 1 changes no bit"
+        torch.testing.assert_close(plain[:, 1:].abs(), torch.full((20, 3, 3), rate / 20), rtol=2e-3, atol=0)
+        torch.testing.assert_close(eightfold[:, 1:], 8 * plain[:, 1:], rtol=2e-3, atol=0)  # worst seen 3e-4
+        assert torch.equal(eightfold[:, 0], plain[:, 0])
+
+
+def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -> None:
+    rates = LearningRates(sh_rest_factor=4.0, sh_rest_decay=True)
+    settings = replace(SETTINGS, sh_degree=2, base_sh_degree=1, joint=0.5, learning_rates=rates)
+    archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
+    assert [archive.field(level).sh_degree for level in (1, 0)] == [1, 2]
+    assert all(bool((archive.field(level).sh[:, 1:] != 0).any()) for level in (1, 0))
+    assert archive.history()[-1]["psnr"] > archive.history()[0].get("psnr", 0)
+    assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
+
+
 def test_fused_steps_have_the_bits_of_the_optimizers_own() -> None:
     generator = torch.Generator().manual_seed(3)
     start = [torch.randn(20, width, generator=generator) for width in (3, 4, 1)]
@@ -310,8 +343,9 @@ def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor,
     return new_opacities, scales * (opacities / denominators)[:, None]
 
 
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
 def test_mcmc_moves_adds_and_stays_under_its_limit(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hierarchy: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ops, "compute_relocation", relocated)
 
@@ -319,9 +353,11 @@ def test_mcmc_moves_adds_and_stays_under_its_limit(
         return _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], None
 
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
-    density = Densification(start=3, until=55, every=5, strategy="mcmc", cap_max=120)
-    archive = train(tmp_path / "run", scene, replace(SETTINGS, densification=density), CpuRasterizer())
-    assert [record.num_gaussians for record in archive.manifest.records] == [120, 120]
+    density = Densification(start=3, until=55, every=5, strategy="mcmc", cap_max=120, base_cap_max=110)
+    settings = replace(SETTINGS, hierarchy=hierarchy, densification=density)
+    archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
+    assert [record.num_gaussians for record in archive.manifest.records] == [110, 120]
+    assert [record.signed for record in archive.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (archive.history()[i]["loss"] for i in (0, -1))
     assert last < first
 

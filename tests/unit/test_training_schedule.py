@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,15 +13,32 @@ from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
-from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.training.settings import (
+    Densification,
+    LearningRates,
+    StageSchedule,
+    TrainSettings,
+    views_per_step,
+)
 from lapgs_plugin.training.views import view_index
 
 
 def schedules(**values: Any) -> list[StageSchedule]:
     """Of a base and its residuals."""
+    if values.get("levels", 2) == 2:
+        values.setdefault("split", "1/2,1/2")
     settings = TrainSettings(hierarchy="laplacian", **values)
     plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, settings.shares, settings.kind)
     return [StageSchedule.create(settings, stage) for stage in plan]
+
+
+def steps(schedule: StageSchedule) -> list[int]:
+    """The iterations after which the optimizers step."""
+    found = [0]
+    while found[-1] < schedule.iterations:
+        found.append(found[-1] + schedule.views_of_step(found[-1]))
+    return found[1:]
 
 
 def test_a_single_stage_of_30000_has_the_published_constants() -> None:
@@ -36,8 +54,9 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
     base, residual = schedules(levels=2, split="1/3,2/3")
     assert (base.densify_until, residual.densify_until) == (5000, 10_000)
+    assert base.reset_every == 3000
     for schedule in (base, residual):
-        assert (schedule.densify_start, schedule.densify_every, schedule.reset_every) == (500, 100, 3000)
+        assert (schedule.densify_start, schedule.densify_every) == (500, 100)
         assert schedule.means_learning_rate(schedule.iterations) == pytest.approx(1.6e-6)
 
 
@@ -51,16 +70,16 @@ def test_given_constants_are_kept_in_short_runs() -> None:
 
 
 def test_late_in_a_stage_eight_views_make_a_step() -> None:
-    base, residual = schedules(iterations=30_000, split="1/2,1/2")
+    base, residual = schedules(iterations=30_000)
     for schedule in (base, residual):
         assert (schedule.gather_from, schedule.gather) == (11_251, 8)
-        stepping = [i for i in range(1, 15_001) if schedule.steps(i)]
+        stepping = steps(schedule)
         assert stepping[:11_250] == list(range(1, 11_251))
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
-    assert schedules(iterations=3000, split="1/2,1/2")[1].gather == 8
-    assert schedules(iterations=2560, split="1/2,1/2")[1].gather == 8  # 40 steps of the last 320 iterations
-    assert schedules(iterations=2550, split="1/2,1/2")[1].gather == 1
+    assert schedules(iterations=3000)[1].gather == 8
+    assert schedules(iterations=2560)[1].gather == 8  # 40 steps of the last 320 iterations
+    assert schedules(iterations=2550)[1].gather == 1
     assert schedules(iterations=2550, split="1/2,1/2", gather=4)[1].gather == 4
     assert all(schedule.gather == 1 for schedule in schedules(gather=1))
 
@@ -71,7 +90,7 @@ def test_pruning_waits_for_the_end_of_densification() -> None:
         return [schedule.prunes_after for schedule in found]
 
     assert prunes() == [15_000]
-    assert prunes(levels=2) == [5000, 10_000]
+    assert prunes(levels=2) == [7500, 7500]
     assert prunes(until=25_001) == [25_001]
     assert prunes(until=30_000) == [None]
     assert prunes(until=500) == prunes(until=0) == [None]
@@ -93,19 +112,117 @@ def test_every_seed_orders_views(seed: int, level: int, epoch: int) -> None:
 def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, begins: int) -> None:
     """A refinement in between would throw the gradients away that wait for those of other views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
-    assert next(i for i in range(1, 30_001) if not schedule.steps(i)) == begins
+    stepping = steps(schedule)
+    assert stepping[: begins - 1] == list(range(1, begins))
+    assert stepping[begins - 1] == begins + 7
+    assert [schedule.gathers(i) for i in (begins - 1, begins)] == [False, True]
 
 
 @pytest.mark.parametrize("until", [29_681, 30_000, 40_000])
 def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
     """What is left is too short for 40 steps of 8 views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
-    assert all(schedule.steps(i) for i in range(1, 30_001))
+    assert steps(schedule) == list(range(1, 30_001))
+
+
+@pytest.mark.parametrize("views", [2, 3, 8, 250])
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_steps_for_several_views_end_where_something_is_due(views: int, strategy: str) -> None:
+    density = Densification(until=3333, every=70, reset_every=None if strategy == "mcmc" else 1100, strategy=strategy)
+    settings = TrainSettings(iterations=6000, densification=density, gather=5)
+    (stage,) = StagePlan.create((1600, 1066), 6000, 1)
+    schedule = StageSchedule.create(settings, stage, views=views)
+    stepping = steps(schedule)
+    lengths = [end - begin for begin, end in zip([0, *stepping], stepping, strict=False)]
+    early = [length for end, length in zip(stepping, lengths, strict=True) if end <= 4500]
+    assert max(early) == views, "at 250 after densification alone"
+    assert len(early) < 1.5 * 4500 / views or views > 70
+    due = {*range(70, 3333, 70), 3332, 3333, 4500, 6000}
+    due |= {1100, 2200, 3300} if strategy == "default" else set()
+    assert due <= set(stepping)
+    assert all(length == 5 for end, length in zip(stepping, lengths, strict=True) if end > 4500)
+    # A resumed run takes the steps that an uninterrupted one takes: they are a function of where one ended.
+    assert all(schedule.views_of_step(end - length) == length for end, length in zip(stepping, lengths, strict=True))
+
+
+def test_how_many_views_a_step_takes() -> None:
+    plan = StagePlan.create((978, 545), 30_000, 2)
+
+    def views(asked: int | None, training: int = 219, batches: bool = True) -> list[int]:
+        return [
+            views_per_step(
+                TrainSettings(views_per_step="auto" if asked is None else str(asked)), stage, training, batches
+            )
+            for stage in plan
+        ]
+
+    assert views(1) == [1, 1]
+    assert views(3) == [3, 3]
+    assert views(None) == [8, 2]  # 133k and 533k pixels of a million
+    assert views(None, training=5) == [5, 2]
+    assert views(None, batches=False) == [1, 1]
+    (large,) = StagePlan.create((3429, 3390), 30_000, 1)
+    assert views_per_step(TrainSettings(views_per_step="auto"), large, 45, batches=True) == 1
+
+
+@pytest.mark.parametrize("views", [1, 2, 8])
+def test_the_root_of_the_views_scales_steps(views: int) -> None:
+    scale = StepScale.of(views)
+    assert scale.rate == pytest.approx(math.sqrt(views))
+    assert scale.gradient == pytest.approx(1 / math.sqrt(views))
+    assert scale.views == views
+    if views == 1:
+        assert scale == ONE_VIEW
 
 
 def test_opacities_are_never_reset_where_that_is_asked_for() -> None:
     for schedule in schedules(densification=Densification(reset_every=0)):
         assert not any(i % schedule.reset_every == 0 for i in range(1, schedule.iterations + 1))
+
+
+@pytest.mark.parametrize(("given", "resets"), [(None, []), (0, []), (4000, [4000, 8000, 12_000])])
+def test_a_residual_resets_no_opacities_unless_told_otherwise(given: int | None, resets: list[int]) -> None:
+    base, residual = schedules(densification=Densification(reset_every=given))
+    assert [i for i in range(1, residual.iterations + 1) if i % residual.reset_every == 0] == resets
+    assert [i for i in range(1, 5000) if i % base.reset_every == 0] == ([] if given == 0 else [given or 3000])
+
+
+def test_the_rate_of_higher_harmonics_may_decay_to_what_it_is_otherwise() -> None:
+    plain, kept, fading = (
+        schedules(learning_rates=rates)[1]
+        for rates in (
+            LearningRates(),
+            LearningRates(sh_rest_factor=8.0),
+            LearningRates(sh_rest_factor=8.0, sh_rest_decay=True),
+        )
+    )
+    assert {plain.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
+    assert {kept.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {8.0}
+    assert fading.sh_rest_factor_at(7500) == pytest.approx(8**0.5)  # half way: the geometric mean
+    assert (fading.sh_rest_factor_at(0), fading.sh_rest_factor_at(15_000)) == (8.0, 1.0)
+
+
+def test_a_base_may_densify_longer() -> None:
+    for share, until in ((None, 7500), (0.8, 12_000), (0.0, 0)):
+        base, residual = schedules(densification=Densification(base_share=share))
+        assert (base.densify_until, residual.densify_until) == (until, 7500)
+
+
+def test_a_base_may_have_fewer_harmonics() -> None:
+    base, residual = schedules(base_sh_degree=1)
+    assert [schedule.active_sh_degree(9000) for schedule in (base, residual)] == [1, 3]
+
+
+def test_thresholds_and_limits_of_stages() -> None:
+    density = Densification(strategy="multiview")
+    settings = TrainSettings(levels=3, hierarchy="laplacian", residual_threshold=1.5, densification=density)
+    plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
+    found = [settings.densification_of(stage) for stage in plan]
+    assert [one.grow_grad2d for one in found] == pytest.approx([2e-4, 3e-4, 3e-4])
+    assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
+    mcmc = Densification(strategy="mcmc", cap_max=9, base_cap_max=5)
+    capped = replace(settings, residual_threshold=1.0, densification=mcmc)
+    assert [capped.densification_of(stage).cap_max for stage in plan] == [5, 9, 9]
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
@@ -135,8 +252,34 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             "--absgrad, --coarse-threshold with --strategy mcmc",
         ),
         ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
+        ({"densification": Densification(base_cap_max=7)}, "--base-cap-max 7: only --strategy mcmc"),
+        ({"densification": Densification(error_pixels=7.0)}, "--error-pixels 7.0: only --strategy multiview"),
+        (
+            {"densification": Densification(error_threshold=1.0, strategy="multiview")},
+            "--error-threshold 1.0: expected a share",
+        ),
+        (
+            {"densification": Densification(absgrad=True, strategy="multiview")},
+            "--absgrad with --strategy multiview",
+        ),
+        (
+            {"hierarchy": "laplacian", "residual_threshold": 2.0, "densification": Densification(strategy="mcmc")},
+            "--residual-threshold with --strategy mcmc",
+        ),
+        ({"hierarchy": "laplacian", "residual_threshold": 0.0}, "--residual-threshold 0"),
+        ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
+        ({"densification": Densification(grow_grad2d=-1.0)}, "--densify-threshold -1.0: expected a positive gradient"),
+        ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
+        ({"densification": Densification(base_share=0.5), "levels": 1}, "one level has no base"),
+        ({"learning_rates": LearningRates(sh_rest_factor=math.inf)}, "--sh-rate-factor inf"),
+        ({"learning_rates": LearningRates(sh_rest_decay=True)}, "--sh-rate-decay: there is nothing to decay from"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 4}, "--base-sh-degree 4: expected 0 to --sh-degree, 3"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 1, "inherit": "full"}, "with --inherit full"),
+        ({"hierarchy": "laplacian", "base_sh_degree": 1, "levels": 1}, "one level has no base"),
+        ({"hierarchy": "nested", "base_sh_degree": 1}, "--base-sh-degree 1: is about residuals"),
         ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
         ({"inherit": "most"}, "--inherit 'most': expected geometry"),
+        ({"views_per_step": "0"}, "--views-per-step 0: expected auto, or at least 1"),
         ({"seed": -1}, "--seed -1: expected 0 to 4294967295"),
         ({"seed": 2**32}, "--seed 4294967296"),
     ],

@@ -23,40 +23,53 @@ def close(found, expected, absolute=1e-5, relative=1e-4):
 torch.set_default_device(DEVICE)
 torch.manual_seed(0)
 n = 300
-centre = torch.tensor([0.3, -0.2, 0.5])
-for degree, active, signed in ((3, 3, False), (3, 3, True), (3, 1, False), (2, 2, True), (3, 0, False), (0, 0, True)):
+centres_of_three = torch.tensor([[0.3, -0.2, 0.5], [-1.0, 0.4, 0.2], [0.1, 2.0, -0.7]])
+cases = ((3, 3, False), (3, 3, True), (3, 1, False), (2, 2, True), (3, 0, False), (0, 0, True))
+for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, case) for case in cases[:4]]:
     means, log_scales = (torch.randn(n, 3, requires_grad=True) for _ in range(2))
     logits = torch.randn(n, requires_grad=True)
     sh = (torch.randn(n, (degree + 1) ** 2, 3) / 2).requires_grad_()
-    radii, pixels = torch.randint(0, 3, (n, 2), dtype=torch.int32), torch.randn(n, 2)
+    centre = centres_of_three[:cameras]
+    radii, pixels = torch.randint(0, 3, (cameras, n, 2), dtype=torch.int32), torch.randn(cameras, n, 2)
     shown = (radii > 0).all(-1)
     scales, opacities = activated(log_scales.detach(), logits.detach())
     close(scales, log_scales.exp())
     close(opacities, logits.sigmoid())
     given = means.detach(), centre, sh.detach(), active, signed, radii
     colors, largest, centres = colors_of_shown(*given, pixels)
-    seen = sh_to_color(sh, torch.nn.functional.normalize(means - centre, dim=-1), active, signed=signed)
+    directions = [torch.nn.functional.normalize(means - each, dim=-1) for each in centre]
+    seen = torch.stack([sh_to_color(sh, each, active, signed=signed) for each in directions])
     close(colors[shown], seen[shown])
     assert (largest == torch.where(shown, radii.amax(-1), 0)).all()
-    close(centres, torch.where(shown[:, None], pixels - 0.5, 0.0))
+    close(centres, torch.where(shown[..., None], pixels - 0.5, 0.0))
     assert colors_of_shown(*given, None)[1].numel() == 0
-    if active == degree:
-        found = radii, pixels, torch.randn(n), torch.randn(n, 3)
-        placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors)]
+    if active == degree and cameras == 1:
+        found = radii[0], pixels[0], torch.randn(n), torch.randn(n, 3)
+        placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors[0])]
         place_seen(means.detach(), centre, sh.detach(), signed, found, placed, 30)
-        for part, whole in zip((*found, colors), placed, strict=True):
+        for part, whole in zip((*found, colors[0]), placed, strict=True):
             assert (whole[30 : 30 + n] == part).all()
             assert (whole[:30] == -7).all()
             assert (whole[30 + n :] == -7).all()
 
-    by_color, by_mean, by_scale = (torch.randn(n, 3) * shown[:, None] for _ in range(3))
-    by_opacity = torch.randn(n)
+    by_color = torch.randn(cameras, n, 3) * shown[..., None]
+    by_mean, by_scale = (torch.randn(n, 3) * shown.any(0)[:, None] for _ in range(2))
+    by_opacity = torch.randn(cameras, n)
     loss = (seen * by_color).sum() + (means * by_mean).sum()
     loss = loss + (log_scales.exp() * by_scale).sum() + (logits.sigmoid() * by_opacity).sum()
     expected = torch.autograd.grad(loss, (means, log_scales, logits, sh))
     by_sh = finish_gradients(*given, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity)
-    for found, wanted in zip((by_mean, by_scale, by_opacity, by_sh), expected, strict=True):
+    for found, wanted in zip((by_mean, by_scale, by_opacity[0], by_sh), expected, strict=True):
         close(found, wanted)
+
+    if cameras == 3:
+        norms, counts = torch.rand(n), torch.rand(n)
+        each = (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1)
+        expected = norms + torch.where(shown, each, 0.0).sum(0), counts + shown.sum(0)
+        add_statistics(pixels, torch.where(shown, 5, 0).int(), (40, 30), norms, counts)
+        close(norms, expected[0])
+        close(counts, expected[1])
+pixels, shown = pixels[0].contiguous(), shown[0]
 
 prediction, target = torch.randn(3, 31, 45, requires_grad=True), torch.randn(3, 31, 45)
 losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()

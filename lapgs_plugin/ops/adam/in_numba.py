@@ -86,6 +86,8 @@ class FieldAdam(torch.optim.Optimizer):
         active_columns: only the first so many entries of dimension 1 are updated, such as the SH coefficients up to the
             current degree; None for all. The rest costs nothing. While their gradients are and have been zero, skipping
             them is exact: Adam would not move them either.
+        views: by how much a step raises the count of steps, and to which power it takes the betas; 1. See
+            `training.settings.StepScale`.
 
     Args:
         params: float32 or float64 tensors on the CPU.
@@ -108,7 +110,14 @@ class FieldAdam(torch.optim.Optimizer):
             raise UserInputError(f"lr {lr}, betas {betas}, eps {eps}: expected lr and eps >= 0 and betas in [0, 1)")
         super().__init__(
             params,
-            {"lr": lr, "betas": betas, "eps": eps, "column_scale": column_scale, "active_columns": active_columns},
+            {
+                "lr": lr,
+                "betas": betas,
+                "eps": eps,
+                "column_scale": column_scale,
+                "active_columns": active_columns,
+                "views": 1,
+            },
         )
 
     @torch.no_grad()
@@ -131,9 +140,10 @@ class FieldAdam(torch.optim.Optimizer):
             state["step"] = torch.tensor(0.0)
             state["exp_avg"] = torch.zeros_like(parameter)
             state["exp_avg_sq"] = torch.zeros_like(parameter)
-        state["step"] += 1
+        state["step"] += group["views"]
         step, (beta1, beta2) = state["step"].item(), group["betas"]
         step_size, correction = group["lr"] / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
+        beta1, beta2 = beta1 ** group["views"], beta2 ** group["views"]
         rates = np.array([1 - beta1, beta2, 1 - beta2, step_size, correction, group["eps"]], scale.dtype)
         if parameter.numel() == 0:
             return

@@ -17,7 +17,8 @@ from torch import Tensor
 from lapgs_plugin.ops.adam import ADAM_EPS
 
 BLOCK = 512
-BETA1, BETA2, EPS = tl.constexpr(0.9), tl.constexpr(0.999), tl.constexpr(ADAM_EPS)
+BETAS = 0.9, 0.999
+EPS = tl.constexpr(ADAM_EPS)
 LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(0.9)), tl.constexpr(math.log(0.999))
 
 
@@ -26,7 +27,7 @@ class AdamSlot(NamedTuple):
 
     Attributes:
         values, gradient, mean, square: (n, ...) the tensor, its gradient, and Adam's first and second moment.
-        step: scalar, how many steps there have been with this one.
+        step: scalar, how many steps there have been with this one; views, where steps are for several.
         rate: step size of the first three columns.
         rest: step size of all further columns.
     """
@@ -43,9 +44,14 @@ class AdamSlot(NamedTuple):
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _move(
     values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor, step: tl.tensor,
-    rate: float, rest: float, n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
+    rate: float, rest: float, scale: float, keep1: float, take1: float, keep2: float, take2: float,
+    n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    """The rows of this program of one tensor: `columns` times `block` numbers that lie beside each other."""
+    """The rows of this program of one tensor: `columns` times `block` numbers that lie beside each other.
+
+    keep1 and take1 are the shares of the first moment and of the gradient in the next one, keep2 and take2 those of the
+    second moment and of the gradient's square.
+    """
     t = tl.load(step).to(tl.float64)
     unbias1 = 1.0 / (1.0 - tl.exp(t * LOG_BETA1)).to(tl.float32)
     unbias2 = 1.0 / tl.sqrt(1.0 - tl.exp(t * LOG_BETA2)).to(tl.float32)
@@ -53,9 +59,9 @@ def _move(
     for part in range(columns):
         places = start + part * block + tl.arange(0, block)
         here = places < n.to(tl.int64) * columns
-        gradient = tl.load(gradients + places, here, 0.0)
-        mean = BETA1 * tl.load(means + places, here, 0.0) + (1 - BETA1) * gradient
-        square = BETA2 * tl.load(squares + places, here, 0.0) + (1 - BETA2) * gradient * gradient
+        gradient = scale * tl.load(gradients + places, here, 0.0)
+        mean = keep1 * tl.load(means + places, here, 0.0) + take1 * gradient
+        square = keep2 * tl.load(squares + places, here, 0.0) + take2 * gradient * gradient
         size = rate * unbias1
         if columns > 4:
             size = tl.where(places % columns < 3, rate, rest) * unbias1
@@ -77,17 +83,26 @@ def _kernel(
     rate3: float, rest3: float, columns3: tl.constexpr,
     values4: tl.tensor, gradients4: tl.tensor, means4: tl.tensor, squares4: tl.tensor, step4: tl.tensor,
     rate4: float, rest4: float, columns4: tl.constexpr,
-    n: int, block: tl.constexpr,
+    scale: float, k1: float, t1: float, k2: float, t2: float, n: int, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    _move(values0, gradients0, means0, squares0, step0, rate0, rest0, n, columns0, block)
-    _move(values1, gradients1, means1, squares1, step1, rate1, rest1, n, columns1, block)
-    _move(values2, gradients2, means2, squares2, step2, rate2, rest2, n, columns2, block)
-    _move(values3, gradients3, means3, squares3, step3, rate3, rest3, n, columns3, block)
-    _move(values4, gradients4, means4, squares4, step4, rate4, rest4, n, columns4, block)
+    _move(values0, gradients0, means0, squares0, step0, rate0, rest0, scale, k1, t1, k2, t2, n, columns0, block)
+    _move(values1, gradients1, means1, squares1, step1, rate1, rest1, scale, k1, t1, k2, t2, n, columns1, block)
+    _move(values2, gradients2, means2, squares2, step2, rate2, rest2, scale, k1, t1, k2, t2, n, columns2, block)
+    _move(values3, gradients3, means3, squares3, step3, rate3, rest3, scale, k1, t1, k2, t2, n, columns3, block)
+    _move(values4, gradients4, means4, squares4, step4, rate4, rest4, scale, k1, t1, k2, t2, n, columns4, block)
 
 
-def step_five(tensors: Sequence[AdamSlot]) -> None:
-    """One step of the five tensors of a field, of n rows each, whose `step` has been counted up already."""
+def step_five(tensors: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
+    """One step of the five tensors of a field, of n rows each, whose `step` has been counted up already.
+
+    Args:
+        tensors: what moves.
+        views, gradient: of a `StepScale`.
+    """
     n = len(tensors[0].values)
+    keep1, keep2 = (beta**views for beta in BETAS)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
-    launch(*(value for one in tensors for value in (*one, one.values[:1].numel())), n, block=BLOCK)
+    launch(
+        *(value for one in tensors for value in (*one, one.values[:1].numel())),
+        gradient, keep1, 1 - keep1, keep2, 1 - keep2, n, block=BLOCK,
+    )  # fmt: skip

@@ -11,28 +11,34 @@ from torch import Tensor
 BLOCK = 512
 
 
-@triton.jit(do_not_specialize=("half_width", "half_height", "n"))  # type: ignore[untyped-decorator]  # no types
+@triton.jit(do_not_specialize=("half_width", "half_height", "n", "views"))  # type: ignore[untyped-decorator]  # no types
 def _kernel(
     gradient: tl.tensor, radii: tl.tensor, norms: tl.tensor, counts: tl.tensor,
-    half_width: float, half_height: float, n: int, block: tl.constexpr,
+    half_width: float, half_height: float, n: tl.tensor, views: int, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
-    shown = (rows < n) & (tl.load(radii + rows, rows < n, 0) > 0)
-    x = tl.load(gradient + 2 * rows, shown, 0.0) * half_width
-    y = tl.load(gradient + 2 * rows + 1, shown, 0.0) * half_height
-    tl.store(norms + rows, tl.load(norms + rows, shown, 0.0) + tl.sqrt(x * x + y * y), shown)
-    tl.store(counts + rows, tl.load(counts + rows, shown, 0.0) + 1.0, shown)
+    here = rows < n
+    norm, count = tl.load(norms + rows, here, 0.0), tl.load(counts + rows, here, 0.0)
+    for view in range(views):
+        seen = rows + view * n.to(tl.int64)  # in what there is of every view
+        shown = here & (tl.load(radii + seen, here, 0) > 0)
+        x = tl.load(gradient + 2 * seen, shown, 0.0) * half_width
+        y = tl.load(gradient + 2 * seen + 1, shown, 0.0) * half_height
+        norm += tl.sqrt(x * x + y * y)
+        count += tl.where(shown, 1.0, 0.0)
+    tl.store(norms + rows, norm, here)
+    tl.store(counts + rows, count, here)
 
 
 def add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
     """Add the norms of screen-space gradients, in half images a pixel, and 1 where a Gaussian was shown; in place.
 
     Args:
-        gradient: (n, 2) by the centre in pixels.
-        radii: (n,) int32, above 0 where shown.
+        gradient: (n, 2) by the centre in pixels; of several views (b, n, 2).
+        radii: (n,) or (b, n) int32, above 0 where shown.
         size: (width, height) of the image.
         norms, counts: (n,) sums so far.
     """
     n = len(norms)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
-    launch(gradient, radii, norms, counts, size[0] / 2.0, size[1] / 2.0, n, block=BLOCK)
+    launch(gradient, radii, norms, counts, size[0] / 2.0, size[1] / 2.0, n, radii.numel() // n, block=BLOCK)

@@ -20,15 +20,18 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     where that is installed, else from plain PyTorch.
 
     Args:
-        prediction, target: (3, h, w), the target without gradient.
+        prediction, target: (3, h, w), or (b, 3, h, w) of several views; the target without gradient.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
-        The loss, a scalar.
+        The loss, a scalar: of several views the mean of theirs.
     """
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
+        if prediction.ndim == 4:
+            each = zip(prediction.unbind(), target.unbind(), strict=True)
+            return torch.stack([photometric_loss_cpu(*pair, ssim_weight) for pair in each]).mean()
         return photometric_loss_cpu(prediction, target, ssim_weight)
     fused = fused_ssim()
     if fused is None or prediction.dtype != torch.float32:
@@ -38,9 +41,14 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
 
         # Numbers that only scale others cost a launch each, and another on the way back.
         rest = weighted_l1(prediction.contiguous(), target.contiguous(), 1.0 - ssim_weight, ssim_weight)
-        return torch.sub(rest, fused(prediction[None], target[None]), alpha=ssim_weight)
+        return torch.sub(rest, fused(*_batches(prediction, target)), alpha=ssim_weight)
     l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(prediction[None], target[None]))
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(*_batches(prediction, target)))
+
+
+def _batches(*images: Tensor) -> tuple[Tensor, ...]:
+    """Return each (3, h, w) or (b, 3, h, w) as (b, 3, h, w)."""
+    return tuple(image if image.ndim == 4 else image[None] for image in images)
 
 
 @lru_cache(maxsize=1)

@@ -29,11 +29,12 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     clamped (Wang et al. 2004, equation 13).
 
     Args:
-        prediction, target: (3, h, w), any float type.
+        prediction, target: (3, h, w), any float type; or (b, 3, h, w), whose mean is that of all images.
     """
+    prediction, target = (image.reshape(-1, *image.shape[-2:]) for image in (prediction, target))  # (3 b, h, w)
     products = torch.stack(
         [prediction, target, prediction * prediction, target * target, prediction * target]
-    )  # (5, 3, h, w)
+    )  # (5, 3 b, h, w)
     mean_p, mean_t, mean_pp, mean_tt, mean_pt = _window_mean(products)
     var_p, var_t, covariance = mean_pp - mean_p**2, mean_tt - mean_t**2, mean_pt - mean_p * mean_t
     luminance = (2 * mean_p * mean_t + SSIM_C1) / (mean_p**2 + mean_t**2 + SSIM_C1)
