@@ -1,7 +1,7 @@
-"""Add to the site the pages that are not in docs/: README, map, patches, changelog, and the reference of all commands.
+"""Add the pages to the site that are not in docs/: README, map, patches, changelog, and a reference of all commands.
 
-mkdocs calls `on_files` and `on_page_markdown`. Links between documents are written for the repository; here they are
-changed to lead to the same documents on the site. Files that are no documents are copied to `source/`.
+mkdocs calls `on_files` and `on_page_markdown`. Documents link to each other by their places in the repository; here each
+link is changed to the place on the site. Other files that are linked are copied to `source/`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to where their documents are on the site."""
+    """Change links to the places of their targets on the site."""
     here = page.file.src_uri
     if here == COMMANDS:
         return markdown
@@ -61,6 +61,8 @@ def _linked(file: File) -> set[str]:
 
 def _document_of(page: str) -> str:
     """Return the path in the repository of the document that a page is made from."""
+    if page.startswith(COPIES):
+        return page.removeprefix(COPIES)
     return next((document for document, name in ELSEWHERE.items() if name == page), f"docs/{page}")
 
 
