@@ -1,6 +1,6 @@
 """Add the pages to the site that are not in docs/: README, map, patches, changelog, and a reference of all commands.
 
-mkdocs calls `on_files` and `on_page_markdown`. Documents link to each other by their places in the repository; here each
+mkdocs calls `on_files` and `on_page_markdown`. Documents link to each other by their places in the repository; each
 link is changed to the place on the site. Other files that are linked are copied to `source/`.
 """
 

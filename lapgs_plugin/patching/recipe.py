@@ -32,9 +32,9 @@ class _EditEntry(TypedDict):
     file: str
     find: str
     function: NotRequired[str]
-    unless: NotRequired[list[str]]
     before: NotRequired[str]
     replace: NotRequired[str]
+    unless: NotRequired[list[str]]
 
 
 class _CheckEntry(TypedDict):
@@ -254,7 +254,7 @@ def _edit(item: dict[str, Any]) -> Edit:
     if not put.isascii():
         raise ValueError(f"edit {item['name']!r}: expected ASCII, the same in every encoding a source may have")
     unless = item.get("unless", [])
-    if not all(text.startswith("#") for text in unless):
+    if not (isinstance(unless, list) and all(isinstance(text, str) and text.startswith("#") for text in unless)):
         raise ValueError(f"edit {item['name']!r}: unless = {unless!r}, expected a list of directives that start with #")
     return Edit(item["set"], item["name"], anchor, put, kind == "replace", tuple(unless))
 
