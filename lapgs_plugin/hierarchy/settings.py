@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, RESIDUAL_SPLIT, Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import option
 
@@ -39,6 +39,22 @@ ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate", "re
 """Fields that nested levels have no use for."""
 
 
+PROTOCOLS = ("default", "paper")
+PAPER: Mapping[str, object] = {
+    "hierarchy": Hierarchy.LAPLACIAN.value,
+    "supervision": RECONSTRUCTED,
+    "inherit": "xyz",
+    "joint": 0.0,
+    "residual_color_rate": 1.0,
+    "residual_threshold": 1.0,
+    "residual_resets": True,
+    "coarse_threshold": 1.0,
+    "prune": 0.0,
+}
+"""Settings of the paper's main tables, besides the split of two levels. Other settings classes add their own."""
+PAPER_SPLIT = "1/3,2/3"
+
+
 @dataclass(frozen=True)
 class HierarchySettings:
     """Choose the levels of a run and how they are trained.
@@ -56,11 +72,16 @@ class HierarchySettings:
         "as one plain PLY.",
         panel=PANEL,
     )
+    protocol: str = option(
+        "default",
+        "paper: exactly the settings of the paper's main tables. An option that contradicts them is refused. default: "
+        "this program's own.",
+        panel=PANEL,
+    )
     levels: int = option(2, "Number of levels; 1 trains a plain single field, the baseline.", panel=PANEL)
     split: str | None = option(
         None,
-        "Share of the iterations of each stage, coarsest first, such as 1/3,2/3. Default: 1/2,1/2 nested, 1/3,2/3 with "
-        "residuals.",
+        "Share of the iterations of each stage, coarsest first, such as 1/3,2/3. Default of two levels: 1/2,1/2.",
         panel=PANEL,
     )
     supervision: str = option(
@@ -128,6 +149,9 @@ class HierarchySettings:
     seed: int = option(0, "Seed of every random choice that lapgs makes.")
 
     def __post_init__(self) -> None:
+        _require("--protocol", self.protocol, PROTOCOLS)
+        if self.protocol == "paper":
+            self._follow_the_paper()
         kind = self.kind
         SUPERVISIONS[self.supervision]  # raises what is to be said of an unknown one
         _require("--grid", self.grid, GRIDS)
@@ -157,6 +181,21 @@ class HierarchySettings:
                 raise UserInputError(f"{name} {factor}: expected a positive factor")
         if kind is Hierarchy.NESTED:
             self._refuse_residual_settings()
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """What `--protocol paper` sets, by field."""
+        return {**PAPER, **({"split": PAPER_SPLIT} if self.levels == 2 else {})}
+
+    def _follow_the_paper(self) -> None:
+        """Take the paper's settings, and refuse others that are given."""
+        defaults = {each.name: each.default for each in fields(self)}
+        for name, value in self.paper_settings.items():
+            if (given := getattr(self, name)) not in (defaults[name], value):
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} {given} with --protocol paper: the paper has {value}; leave one out"
+                )
+            object.__setattr__(self, name, value)  # frozen for everybody else
 
     def _refuse_residual_settings(self) -> None:
         idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0, "residual_threshold": 1.0}
@@ -213,8 +252,7 @@ class HierarchySettings:
         """Share of the iterations of each stage, coarsest first; None leaves them to `StagePlan`."""
         if self.split is not None:
             return parse_split(self.split)
-        two_levels = self.levels == len(RESIDUAL_SPLIT)
-        return RESIDUAL_SPLIT if two_levels and not self.nested else DEFAULT_SPLITS.get(self.levels)
+        return DEFAULT_SPLITS.get(self.levels)
 
     def resolved(self) -> dict[str, Any]:
         """Return all fields with nothing left to the hierarchy's defaults, for manifests: these may change."""

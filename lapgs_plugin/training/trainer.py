@@ -265,6 +265,7 @@ class Trainer:
             stage,
             coarser if continues_field(stage, self.plan.levels) else 0,
             views_per_step(self.settings, stage, len(self.scene.train), batches),
+            len(self.scene.train),
         )
         sizes = {(view.camera.width, view.camera.height) for view in self.scene.train}
         if schedule.views > 1 and batches and len(sizes) > 1:
