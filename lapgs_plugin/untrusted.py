@@ -120,7 +120,12 @@ def parse_json(
 
 
 def read_toml(
-    path: Path, kind: Any = Any, *, error: type[UserInputError] = UserInputError, advice: str = "correct it"
+    path: Path,
+    kind: Any = Any,
+    *,
+    error: type[UserInputError] = UserInputError,
+    advice: str = "correct it",
+    finite: bool = True,
 ) -> Any:
     """Read a TOML file; arguments as `read_json` takes them. Dates are no values that this package knows."""
     text = read_text(path, error=error, advice=advice)
@@ -131,7 +136,7 @@ def read_toml(
     except (ValueError, RecursionError) as cause:
         reason = "nested too deep" if isinstance(cause, RecursionError) else cause
         raise error(f"{path} is not TOML: {reason}; {advice}") from None
-    return checked(value, kind, str(path), error=error, advice=advice)
+    return checked(value, kind, str(path), error=error, advice=advice, finite=finite)
 
 
 def read_text(path: Path, *, error: type[UserInputError] = UserInputError, advice: str = "restore it") -> str:

@@ -62,19 +62,19 @@ def view(
 
 def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, device: str, rasterizer: str) -> None:
     """Show the runs, as they are and as they grow, until Ctrl-C."""
-    from lapgs_plugin.viewer.following import FollowedRun, Following
-    from lapgs_plugin.viewer.server import Viewer
+    from lapgs_plugin.viewer.following import FollowedRun, RunFollower
+    from lapgs_plugin.viewer.viewer import Viewer
 
     shown, other = (None if folder is None else FollowedRun(folder, device, rasterizer) for folder in (run, baseline))
     assert shown is not None, "it is a required argument"
     viewer, stop = Viewer(page), threading.Event()
-    following = Following(viewer, page, shown, other, scene, say=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, scene, report=lambda line: print(line, flush=True))
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)
     watching.start()
     try:
-        viewer.serve(at_rest=following.keep_preview)
+        viewer.serve(at_rest=following.save_preview)
     finally:
         stop.set()
         watching.join()

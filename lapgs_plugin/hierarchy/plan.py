@@ -9,6 +9,11 @@ from fractions import Fraction
 
 from lapgs_plugin.errors import UserInputError
 
+REFERENCE_ITERATIONS = 30_000
+"""Iterations of a run that 3DGS's published schedule is made for; shorter runs shrink its constants in proportion."""
+REFERENCE_DENSIFY_FROM = 500
+"""First densification in that schedule."""
+
 MIN_LEVEL_SIDE = 16
 """Smallest side, in pixels, of a level that is trained: SSIM's window is 11 wide, and a tile 16."""
 

@@ -9,7 +9,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
+from lapgs_plugin.hierarchy.plan import (
+    REFERENCE_DENSIFY_FROM,
+    REFERENCE_ITERATIONS,
+    Hierarchy,
+    Stage,
+    nested_densify_until,
+)
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import check_bounds, option
 from lapgs_plugin.untrusted import STRICT, checked
@@ -35,8 +41,6 @@ PIXELS_OF_A_LAUNCH = 1 << 22
 LEAST_STEPS = 40
 """In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views
 lost 0.08 dB, of one field 0.13."""
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
 STRATEGIES = ("default", "mcmc", "multiview")
 GROW_THRESHOLD = 2e-4
@@ -87,7 +91,11 @@ class Densification:
     __pydantic_config__: ClassVar[Any] = STRICT
 
     start: int | None = option(
-        None, "First densification. Default: 500 of 30000.", panel=SCHEDULE, names=("--densify-from",), least=0
+        None,
+        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        panel=SCHEDULE,
+        names=("--densify-from",),
+        least=0,
     )
     until: int | None = option(
         None,
@@ -208,7 +216,7 @@ class TrainSettings(HierarchySettings):
     __pydantic_config__: ClassVar[Any] = STRICT
 
     iterations: int = option(
-        30_000, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
     )
     gather: int = option(
         8,
@@ -527,7 +535,7 @@ class StageSchedule:
         late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         return cls(
             iterations=stage.iterations,
-            densify_start=constant(given.start, 500, 1),
+            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
             densify_until=densify_until,
             densify_every=given.every,
             reset_every=resets,

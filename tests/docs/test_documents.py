@@ -84,6 +84,12 @@ def test_links_lead_to_files(document: Path) -> None:
         assert (document.parent / target).exists(), target
 
 
+def test_documents_that_the_code_names_exist() -> None:
+    for path in (ROOT / "lapgs_plugin").rglob("*.py"):
+        for named in re.findall(r"(?<![\w/])(?:docs|patches)/[\w./-]+\.md", path.read_text(encoding="utf-8")):
+            assert (ROOT / named).is_file(), (path, named)
+
+
 def test_limits_are_those_of_the_code() -> None:
     in_code = {
         limit.variable: f"{limit.default:,}" for limit in vars(limits).values() if isinstance(limit, limits.Limit)

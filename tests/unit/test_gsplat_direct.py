@@ -135,7 +135,7 @@ def test_several_views_are_those_of_single_calls(views: int, degree: int, active
     each = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
     torch.stack([(one.image * weight).sum() for one, weight in zip(each, weights, strict=True)]).sum().backward()
     pairs = {
-        "image": (batch.image, torch.stack([one.image for one in each])),
+        "image": (batch.image.detach(), torch.stack([one.image.detach() for one in each])),
         "radii": (batch.radii.float(), torch.stack([one.radii for one in each]).float()),
         "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in each])),
         "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in each])),

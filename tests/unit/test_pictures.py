@@ -1,4 +1,4 @@
-"""Pictures of views: cut-outs lie where edges are, whole pictures lie on each other."""
+"""Test pictures of views: cut-outs lie on edges, and whole pictures are aligned."""
 
 from __future__ import annotations
 
