@@ -102,7 +102,7 @@ def _stability(
     from rich.table import Table
 
     from lapgs_plugin.evaluation.stability import evaluate_stability
-    from lapgs_plugin.rendering.paths import path_cameras
+    from lapgs_plugin.rendering.run import path_cameras
     from lapgs_plugin.runs.archive import STABILITY, RunArchive
 
     archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)

@@ -13,8 +13,9 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import METRICS, LevelRecord, Manifest, RunArchive

@@ -21,9 +21,10 @@ from lapgs_plugin.evaluation.figures import require_complete
 from lapgs_plugin.evaluation.metrics import SMALLEST_MSE
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.depth import DepthImage, render_depth
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 

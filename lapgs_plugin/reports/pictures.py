@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.ops.composition import to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.scenes.images import resize_image, write_image
 from lapgs_plugin.scenes.scene import View

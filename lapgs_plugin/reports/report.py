@@ -15,7 +15,7 @@ from lapgs_plugin.files import atomic_write, one_line_errors
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.reports.charts import (
     INSET_AT,

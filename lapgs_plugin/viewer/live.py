@@ -17,7 +17,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive

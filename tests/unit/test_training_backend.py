@@ -18,8 +18,8 @@ from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDi
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
 from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference

@@ -16,8 +16,8 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw, side_by_side
 from lapgs_plugin.viewer.poses import Pose
 from tests.training_scene import blob_field, ring_camera
@@ -75,7 +75,7 @@ def test_each_band_has_its_own_time_wherever_its_field_waits(run: ShownRun) -> N
             time.sleep(0.05 if field.signed else 0.0)
             return super().render_images(field, *args, **kwargs)
 
-    away = replace(run.renderer, rasterizer=SlowDetail(), residence=Elsewhere(torch.device("cpu")))
+    away = replace(run.renderer, rasterizer=SlowDetail(), offload=Elsewhere(torch.device("cpu")))
     times = picture(replace(run, renderer=away), PictureSettings()).milliseconds
     assert times.keys() == {1, 0}
     assert times[0] >= 50.0
