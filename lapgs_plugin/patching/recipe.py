@@ -34,6 +34,7 @@ class _EditEntry(TypedDict):
     function: NotRequired[str]
     before: NotRequired[str]
     replace: NotRequired[str]
+    unless: NotRequired[list[str]]
 
 
 class _CheckEntry(TypedDict):
