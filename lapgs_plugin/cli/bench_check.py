@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import typer
 
 from lapgs_plugin.cli.rehearsal import Rehearsal
+from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.experiments.commands import LAPGS
 from lapgs_plugin.experiments.expansion import SceneSpec, Selection
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import SceneReference
     from lapgs_plugin.training.settings import TrainSettings
 
-_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
-"""click's UsageError, wherever this version of typer has click."""
 READS_SCENES = ("OpenImageIO", "pycolmap")
 """Packages without which no scene can be read."""
 ANY_SIZE = (1 << 20, 1 << 20)
@@ -88,8 +87,8 @@ def check_runs(
             mistakes.add(keys["scene"], str(error))
         except LapgsError as error:
             _note(mistakes, keys, str(error))
-        except _USAGE_ERROR as error:
-            _note(mistakes, keys, cast(Any, error).format_message().rstrip("."))
+        except USAGE_ERROR as error:
+            _note(mistakes, keys, usage_message(error))
 
 
 def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:
