@@ -75,7 +75,7 @@ def test_one_line_and_nothing_written(
         ("train scene", "lapgs: missing option '--out' / '-o'; see `lapgs train --help`"),
         ("train scene --out", "lapgs: option '--out' requires an argument; see `lapgs train --help`"),
         ("bench raster --repeats 0", "lapgs: --repeats 0: expected at least 1; see `lapgs bench raster --help`"),
-        ("view run --ports 1", "lapgs: no such option: --ports (Possible options: --host, --port); see `lapgs view --help`"),
+        ("view run --nothing 1", "lapgs: no such option: --nothing; see `lapgs view --help`"),
         ("nothing", "lapgs: no such command 'nothing'; see `lapgs --help`"),
         ("--nothing", "lapgs: no such option: --nothing; see `lapgs --help`"),
         ("patch nothing", "lapgs: no such command 'nothing'; see `lapgs patch --help`"),

@@ -59,7 +59,8 @@ def work(
     plain: Annotated[int, typer.Option(help="Declared in the signature.")] = 3,
 ) -> None:
     """Work on TARGET."""
-    CALLS.append({"target": target, "settings": settings, "extra": extra, "plain": plain, "given": given_options(context)})
+    given = given_options(context)
+    CALLS.append({"target": target, "settings": settings, "extra": extra, "plain": plain, "given": given})
 
 
 def _run(*words: str) -> Result:
