@@ -61,10 +61,11 @@ def options(
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Train 3D Gaussian Splatting from coarse to fine: nested levels, or the paper's Laplacian frequency hierarchy.
+    """Train 3D Gaussian Splatting coarse to fine, on your scenes or inside an existing 3DGS codebase.
 
-    A scene comes from `lapgs sample` or `lapgs prepare`, `lapgs train` makes a run folder of it, and `lapgs eval`,
-    `lapgs render` and `lapgs report` look at that. `lapgs doctor` says what this machine can do.
+    Get a scene with `lapgs sample` or `lapgs prepare`. Train it with `lapgs train`, or with the train.py of a checkout
+    through `lapgs run`. Then use `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` on the run folder.
+    `lapgs doctor` checks this machine.
     """
 
 

@@ -1,4 +1,4 @@
-"""`lapgs doctor`: what this machine has, what will be used, and what is missing."""
+"""Check this machine: `lapgs doctor`."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     from lapgs_plugin.environment import Finding, Probe
 
 IMPORTED = ("OpenImageIO", "pycolmap")
-"""Packages with compiled parts that no other probe imports."""
-NOT_IN_THE_WAY = ("Kernel cache",)
-"""What may be broken while training still works."""
-ON_THE_CPU = "`lapgs train --rasterizer cpu` does without"
+"""Packages with compiled code that no other probe imports."""
+NOT_NEEDED = ("Kernel cache",)
+"""Findings that do not prevent training."""
+ON_THE_CPU = "`lapgs train --rasterizer cpu` works without it"
 MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold red]!![/bold red]"}
 
 
 def doctor(
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print everything as JSON, for scripts and bug reports.")
+        bool, typer.Option("--json", help="Print all findings as JSON, for scripts and bug reports.")
     ] = False,
 ) -> None:
-    """Look at Python, PyTorch, GPU, compilers, packages and the current folder; say what `lapgs train` will use.
+    """Check Python, PyTorch, GPU, compilers and packages, and say what `lapgs train` will use.
 
-    Nothing is changed, nothing is downloaded, and the exit code is always 0. Lines marked !! stand in the way of
-    something and say what to do; lines marked -- are not there and not needed.
+    The command changes and downloads nothing, and its exit code is always 0. Lines marked !! are problems and say what
+    to do. Lines marked -- are optional parts that are not installed.
     """
     import json
     from dataclasses import asdict
@@ -41,7 +41,7 @@ def doctor(
 
 
 def examine() -> dict[str, list[Finding]]:
-    """All findings by section, the conclusion last. Slow probes run side by side."""
+    """Return all findings by section, the conclusion last. Slow probes run in parallel."""
     from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
@@ -76,24 +76,24 @@ def examine() -> dict[str, list[Finding]]:
 
 
 def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
-    """Whether it is a checkout, and what `lapgs run` would train it on."""
+    """Say whether the current folder is a checkout, and where `lapgs run` would train it."""
     from lapgs_plugin.environment import Finding
 
     if checkout is None:
-        return Finding("Current folder", "absent", "not a 3DGS checkout that is known")
+        return Finding("Current folder", "absent", "not a known 3DGS checkout")
     detail = f"a checkout of {checkout.name}"
     if checkout.key is not None:
-        place = "the GPU, with its own extensions" if has_gpu else "the CPU, on stand-ins of its extensions"
+        place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
         detail += f"; `lapgs run train.py ...` trains it on {place}"
     return Finding("Current folder", "ok", detail)
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
-    """What `lapgs train` will use, or what stands in its way, by the rule of `training.backend.choose_rasterizer`."""
+    """Say what `lapgs train` will use, as `training.backend.choose_rasterizer` decides, or what prevents it."""
     from lapgs_plugin.environment import Finding, gpus_are_hidden
 
     needed = [*sections["System"], *sections["PyTorch"], *sections["CPU rasterizer"], *sections["Packages"]]
-    broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_IN_THE_WAY]
+    broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_NEEDED]
     if gpus_are_hidden():
         broken = [name for name in broken if name != "GPU"]
     advice = "see the lines !!"
@@ -105,7 +105,7 @@ def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Findin
             return [Finding("will use", "ok", f"gsplat on the GPU, {torch.facts['gpus'][0]}")]
         broken, advice = [gsplat.name], f"{gsplat.advice or gsplat.detail}; {ON_THE_CPU}"
     if broken:
-        return [Finding("will use", "problem", f"nothing until this is mended: {', '.join(broken)}", advice)]
+        return [Finding("will use", "problem", f"nothing until this is fixed: {', '.join(broken)}", advice)]
     return [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]
 
 

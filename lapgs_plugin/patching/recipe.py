@@ -34,7 +34,7 @@ class _EditEntry(TypedDict):
     function: NotRequired[str]
     before: NotRequired[str]
     replace: NotRequired[str]
-    unless: NotRequired[list[str]]
+    unless: NotRequired[Any]  # `_edit` checks it
 
 
 class _CheckEntry(TypedDict):

@@ -11,6 +11,8 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import check_bounds, option
+from lapgs_plugin.runs.options import PANEL as RUN
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.untrusted import STRICT, checked
 
 if TYPE_CHECKING:
@@ -42,7 +44,6 @@ ANTIALIASING = "antialiasing"
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
-RUN = "Run"
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that the manifest has fields of its own for."""
@@ -411,7 +412,7 @@ LEFT_OUT_ONCE: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class TrainingControl:
+class TrainingControl(MeasuringOptions):
     """How a run is carried out and watched; its result does not depend on it, but for the rasterizer's rounding."""
 
     rasterizer: str = option(
@@ -422,14 +423,6 @@ class TrainingControl:
     )
     threads: int | None = option(
         None, "Processor threads. Default: all this process may use.", panel=RUN, least=1, most=1024
-    )
-    test_every: int | None = option(
-        None, "Measure held-out PSNR this often. Default: at the end of each stage.", panel=RUN, least=1
-    )
-    breakdown: bool = option(
-        False,
-        "Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
-        panel=RUN,
     )
     checkpoint_every: int | None = option(
         None,

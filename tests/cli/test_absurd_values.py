@@ -71,7 +71,7 @@ def test_one_line_and_nothing_written(
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("train", "lapgs: missing argument 'scene'; see `lapgs train --help`"),
+        ("train", "lapgs: missing argument 'SCENE'; see `lapgs train --help`"),
         ("train scene", "lapgs: missing option '--out' / '-o'; see `lapgs train --help`"),
         ("train scene --out", "lapgs: option '--out' requires an argument; see `lapgs train --help`"),
         ("bench raster --repeats 0", "lapgs: --repeats 0: expected at least 1; see `lapgs bench raster --help`"),
