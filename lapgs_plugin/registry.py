@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
 from lapgs_plugin.errors import UserInputError
@@ -29,6 +28,8 @@ class Registry(Generic[T]):
     @cached_property
     def _found(self) -> Mapping[str, Any]:
         """Entry points by name; names of this package cannot be taken."""
+        from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
+
         entries = sorted(entry_points(group=self.group), key=lambda entry: (entry.name, entry.value))
         return {entry.name: entry for entry in entries if entry.name not in self._own}
 
