@@ -55,7 +55,7 @@ def _parameters(kind: Any) -> Iterator[inspect.Parameter]:
             continue
         name = parameter_name(each.name, declared)
         default = each.default_factory() if each.default_factory is not MISSING else each.default
-        numeric = {"min": declared.least, "max": declared.most}
+        numeric: dict[str, Any] = {"min": declared.least, "max": declared.most}
         names = declared.names or ((f"--{name.replace('_', '-')}",) if hint is bool else ())
         asked = typer.Option(*names, help=declared.help, rich_help_panel=declared.panel or None, **numeric)
         yield inspect.Parameter(

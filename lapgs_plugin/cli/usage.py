@@ -22,7 +22,7 @@ PLAIN = {
 
 def usage_message(error: Any) -> str:
     """Return the message of a usage error, with the value that was refused where one was."""
-    refused = getattr(error.__cause__, "errors", list)()  # pydantic's, whose message leaves out the value
+    refused: Any = getattr(error.__cause__, "errors", list)()  # pydantic's, whose message leaves out the value
     if refused and getattr(error, "param", None) is not None:
         expected = refused[0]["msg"]
         for said, plain in PLAIN.items():

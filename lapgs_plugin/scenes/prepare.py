@@ -17,14 +17,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import pycolmap
-import torch
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
 from lapgs_plugin.files import atomic_write
@@ -32,10 +30,12 @@ from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import check_image, read_image, write_image
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
+from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.undistort import lens_of, move_observations, undistort
 from lapgs_plugin.untrusted import read_json
 
-_T = TypeVar("_T")
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 MATCHERS = ("exhaustive", "sequential")
 CAMERA_MODELS = (
@@ -413,23 +413,10 @@ def _last_words(log: Path, code: int) -> str:
     return reasons[-1].strip() if reasons else f"exit code {code}"
 
 
-_Item = TypeVar("_Item")
-
-
-def _each_photo(job: _Job, title: str, work: Callable[[_Item], _T], items: Sequence[_Item]) -> list[_T]:
-    """Apply `work` to all items in parallel with a progress bar; raise the first error in order."""
+def _each_photo(job: _Job, title: str, work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """Apply `work` to all items in threads and record the time."""
     start = time.perf_counter()
-    bar = item_progress("photos") if job.progress else None
-    results = []
-    pool = ThreadPoolExecutor(min(MAX_DECODERS, os.cpu_count() or 1), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
-        task = bar.add_task(title, total=len(items)) if bar else None
-        try:
-            for future in [pool.submit(work, item) for item in items]:
-                results.append(future.result())
-                if bar and task is not None:
-                    bar.advance(task)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = min(MAX_DECODERS, os.cpu_count() or 1)
+    results = in_threads(title, "photos", work, items, threads=threads, progress=job.progress)
     job.seconds[title] = time.perf_counter() - start
     return results

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
@@ -18,15 +16,12 @@ from torch import Tensor
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
-from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
-
-ProgressCallback = Callable[[int, int], None]
-"""Called with the number of images read and their total."""
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1
@@ -252,26 +247,12 @@ def _load_views(
 ) -> list[View]:
     """Read all images in parallel, in the order of `frames`; raise the first error in that order."""
 
-    def load(frame: Frame, camera: Camera) -> View:
+    def load(posed: tuple[Frame, Camera]) -> View:
+        frame, camera = posed
         return View(frame.name, camera, read(frame.path, (camera.width, camera.height)))
 
-    bar = item_progress("images") if progress is True else None
-    task = bar.add_task("Reading images", total=len(frames)) if bar else None
-    views = []
-    # One thread an image: torch's own threads would compete with these.
-    pool = ThreadPoolExecutor(_workers(), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
-        try:
-            futures = [pool.submit(load, frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
-            for done, future in enumerate(futures, start=1):
-                views.append(future.result())
-                if bar and task is not None:
-                    bar.update(task, completed=done)
-                elif callable(progress):
-                    progress(done, len(frames))
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return views
+    items = list(zip(frames, cameras, strict=True))
+    return in_threads("Reading images", "images", load, items, threads=_workers(), progress=progress)
 
 
 def _workers() -> int:
