@@ -1,7 +1,7 @@
-"""Laplacian frequency hierarchies for 3D Gaussian Splatting codebases.
+"""Train 3D Gaussian Splatting codebases faster with Laplacian frequency hierarchies.
 
-The names below are what a training loop of one's own needs; `examples/` adds them to two. Importing this package pulls
-in neither torch nor a backbone, so that `lapgs --help` is instant: each name is imported when it is first looked at.
+The names below are for custom training loops; `examples/` shows two. Each is imported at its first use, so that
+importing this package, and with it `lapgs --help`, imports neither torch nor a backbone.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.camera import Camera
-    from lapgs_plugin.fields.gaussian_field import GaussianField
-    from lapgs_plugin.fields.splats import field_from_splats, splats_from_field
+    from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats, splats_from_field
     from lapgs_plugin.hierarchy.cameras import level_camera, level_intrinsics
     from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
     from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
     from lapgs_plugin.hierarchy.pyramid import Pyramid
     from lapgs_plugin.ops.photometric_loss import photometric_loss
-    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
     from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
     from lapgs_plugin.runs.image_store import ImageStore
 
@@ -50,13 +49,12 @@ _MODULES = {
     "runs.archive": ("LevelRecord", "Manifest", "RunArchive", "SceneReference"),
     "fields.camera": ("Camera",),
     "hierarchy.cameras": ("level_camera", "level_intrinsics"),
-    "fields.gaussian_field": ("GaussianField",),
+    "fields.gaussian_field": ("GaussianField", "field_from_splats", "splats_from_field"),
     "runs.image_store": ("ImageStore",),
     "hierarchy.inheritance": ("field_from_points", "inherit"),
     "hierarchy.plan": ("Stage", "StagePlan", "level_size"),
     "hierarchy.pyramid": ("Pyramid",),
-    "rendering.compose": ("HierarchyRenderer",),
-    "fields.splats": ("field_from_splats", "splats_from_field"),
+    "rendering.hierarchy_renderer": ("HierarchyRenderer",),
     "ops.photometric_loss": ("photometric_loss",),
 }
 

@@ -1,4 +1,4 @@
-"""`python -m lapgs_plugin`: the `lapgs` command of this interpreter, for whoever starts it as a process of its own."""
+"""Run the `lapgs` command with this interpreter: `python -m lapgs_plugin`."""
 
 from __future__ import annotations
 

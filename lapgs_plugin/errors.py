@@ -1,4 +1,4 @@
-"""Errors a user can cause, told apart from our own bugs (which are `assert`s)."""
+"""Define the errors that users can cause. Our own bugs are `assert`s."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import unicodedata
 from typing import ClassVar
 
 LONGEST_LINE = 1_200
-"""Characters of a message; more than that are left out of its middle."""
+"""Most characters of a message; the middle of longer ones is left out."""
 
 
 def printable(text: str) -> str:
-    r"""Make text safe for a terminal: names from files may hold escape sequences, newlines or reversed writing.
+    r"""Escape text for a terminal: names from files may hold control sequences, newlines or reversed writing.
 
     >>> printable("a\n\x1b[2J")
     'a\\n\\x1b[2J'
@@ -22,31 +22,31 @@ def printable(text: str) -> str:
 
 
 class LapgsError(Exception):
-    """Something went wrong that one clear line explains; the command line prints it and exits with `exit_code`.
+    """An error that one line explains; the command line prints it and exits with `exit_code`.
 
-    The message says what was wrong, the value received, what was expected and what to do next. It is one printable
-    line, whatever names it quotes.
+    The message says what was wrong, the value received, what was expected and what to do next. It is always one
+    printable line.
     """
 
     exit_code: ClassVar[int] = 2
 
     def __init__(self, message: str = "") -> None:
         line = printable(message)
-        if len(line) > LONGEST_LINE:  # it quotes a long value; file and advice stand at its ends
+        if len(line) > LONGEST_LINE:  # it quotes a long value; the file and the advice are at its ends
             line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
         super().__init__(line)
 
 
 class UserInputError(LapgsError, ValueError):
-    """An argument, file or scene is not usable as given."""
+    """An argument, file or scene cannot be used as given."""
 
 
 class SceneError(UserInputError):
-    """A scene folder, its sparse model or one of its images is not usable."""
+    """A scene folder, its sparse model or one of its images cannot be used."""
 
 
 class FieldError(UserInputError):
-    """A Gaussian field or its PLY file is not usable."""
+    """A Gaussian field or its PLY file cannot be used."""
 
 
 class RunFolderError(UserInputError):
@@ -54,7 +54,7 @@ class RunFolderError(UserInputError):
 
 
 class TrainingDivergedError(LapgsError):
-    """Training produced NaN or inf; the last good archive is kept."""
+    """Training produced NaN or inf; finished levels are kept."""
 
 
 class DeviceMemoryError(LapgsError):

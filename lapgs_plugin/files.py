@@ -1,4 +1,4 @@
-"""Writing a folder so that a reader never meets half a file and no two processes write at once."""
+"""Write files atomically, lock folders, and turn errors of the file system into one line."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from typing import BinaryIO
 from lapgs_plugin.errors import RunFolderError
 
 MANIFEST = "manifest.json"
-"""Name of the file that makes a folder a run."""
+"""File that makes a folder a run."""
 
 BARE_RECORD = "lapgs_record.json"
-"""Name of the file in which `lapgs run --off --record` notes what a script's own run took."""
+"""File in which `lapgs run --off --record` writes time and memory of a script's own run."""
 
 PREVIEW = "preview.jpg"
-"""Name of the picture of a run that the viewer begins with; here because it is read before torch is imported."""
+"""Picture of a run that the viewer shows first; named here because it is read before torch is imported."""
 
 LOCK = ".lock"
-"""Name of the file that `FolderLock` locks."""
+"""File that `FolderLock` locks."""
 
 TEMPORARY_PATTERN = ".*.tmp"
-"""Glob of the temporary names `atomic_write` uses beside its targets; what a killed process may leave."""
+"""Glob of the temporary files of `atomic_write`, which a killed process may leave."""
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path` and put it in `path`'s place when the block ends without an error.
+    """Open a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
-    The contents reach the disk before the name does, so after a crash `path` holds either the old bytes or all of the
-    new ones. When the block raises, the temporary file is removed and `path` is untouched.
+    The contents are on the disk before the rename: after a crash `path` holds either the old bytes or all new ones.
+    When the block raises, the temporary file is removed and `path` is unchanged.
 
     Raises:
         OSError: the folder cannot be written, or the disk is full.
@@ -53,7 +53,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename survive a power cut; Windows has no such call and needs none."""
+    """Make a rename survive a power cut. Windows has no such call and needs none."""
     if sys.platform == "win32":
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -65,12 +65,15 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def one_line_errors(path: Path, action: str = "written", *, training: bool = False) -> Iterator[None]:
-    """Turn an OSError about a file of a run into a RunFolderError: one line that says what to do.
+    """Turn an OSError about a file into a RunFolderError that says what to do.
 
     Args:
         path: of the file.
-        action: what cannot be done with it.
-        training: whether a run is being trained, which continues with --resume once the disk has space.
+        action: participle for the message, as in "cannot be written".
+        training: whether a run is being trained, which --resume can continue.
+
+    Raises:
+        RunFolderError: the block raised an OSError.
     """
     try:
         yield
@@ -85,7 +88,7 @@ def one_line_errors(path: Path, action: str = "written", *, training: bool = Fal
 
 
 def require_manifest(folder: Path) -> None:
-    """Check that there is a run in a folder, without reading it: quick enough to ask before anything is imported.
+    """Check that a folder holds a run, without reading it or importing anything heavy.
 
     Raises:
         RunFolderError: there is none.
@@ -98,10 +101,10 @@ def require_manifest(folder: Path) -> None:
 
 
 class FolderLock:
-    """The right to write to a folder, held until `release` or the end of the process, however it ends.
+    """An exclusive lock on a folder, held until `release` or the end of the process.
 
-    The operating system's lock on the folder's .lock decides, so that the file of a process that was killed, here or
-    on another machine, never stands in the way; its text (process id and host) is only there for the message.
+    It is the operating system's lock on the folder's .lock file, so a file that a killed process left never blocks
+    another one. The file's text (process id and host) is only used in messages.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -109,7 +112,7 @@ class FolderLock:
 
     @classmethod
     def acquire(cls, folder: Path) -> FolderLock:
-        """Take the lock.
+        """Lock a folder.
 
         Raises:
             RunFolderError: another process has it.
@@ -138,14 +141,14 @@ class FolderLock:
 
 
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
-"""What a file system without locks answers (some network mounts): training must work there, unguarded."""
+"""Errors of file systems without locks, such as some network mounts, on which training works without one."""
 
 
 if sys.platform == "win32":
     import msvcrt
 
     def _lock_file(stream: BinaryIO) -> bool:
-        stream.seek(1 << 30)  # Windows forbids reading what is locked, and the text must stay readable
+        stream.seek(1 << 30)  # beyond the text: Windows forbids reading locked bytes
         try:
             msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
         except OSError:
@@ -155,7 +158,7 @@ else:
     import fcntl
 
     def _lock_file(stream: BinaryIO) -> bool:
-        """Lock an open file without waiting; False when another process (or another open of it) has the lock."""
+        """Lock an open file without waiting; return False if another process, or another open of it, has the lock."""
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -26,6 +26,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import Supervision
+from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
 
@@ -102,7 +103,7 @@ class Composition(StageHook):
     """I_hat^l = Up(I_hat^(l+1)) + R_hat^l: adds what the finished levels predict to a rendered residual."""
 
     def compose(self, context: StageContext, image: Tensor) -> Tensor:
-        return image if context.accumulated is None else image + context.accumulated
+        return add_prediction(image, context.accumulated)
 
 
 class SupervisionLoss(StageHook):

@@ -1,16 +1,15 @@
-"""Ending on Ctrl-C and SIGTERM: one line, exit code 130 or 143, nothing half written.
+"""End on Ctrl-C and SIGTERM with one line, exit code 130 or 143, and nothing half written.
 
-`install` is called once, when the process starts. It is imported before anything heavy, so it imports little. What a
-signal does from then on depends on what the main thread is doing:
+`install` is called once, at the start of the process, before anything heavy is imported; so this module imports little.
+From then on the effect of a signal depends on the main thread:
 
-- Outside of a command (imports, parsing, the end of the process) there is nothing to clean up: the process writes its
-  line and ends at once.
-- In a command, `Interrupted` is raised, so that temporary files and child processes are cleaned up. It is never raised
-  while something is being imported, because it would pass through C++ frames that abort the process: a long import ends
-  the process at once, a short one is waited for.
-- In training, `stop_request` turns the first signal into a request that is honoured after the current iteration.
+- Outside a command (imports, parsing, exit) there is nothing to clean up: the process prints its line and ends.
+- In a command, `Interrupted` is raised, so that temporary files and child processes are cleaned up. It is not raised
+  during an import, because it would abort the process in C++ frames: a short import is waited for, a long one ends the
+  process.
+- In training, `stop_request` turns the first signal into a request to stop after the current iteration.
 
-A second signal ends the process at once with the code of the first.
+A second signal ends the process immediately with the exit code of the first.
 """
 
 from __future__ import annotations
@@ -30,29 +29,29 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 SAME_PRESS = 0.5
-"""Seconds in which another signal counts as the first one: wrappers pass on a Ctrl-C that the terminal sent to both."""
+"""Seconds in which another signal counts as the first: wrappers forward a Ctrl-C that the terminal sent to both."""
 
 IMPORT_PATIENCE, IMPORT_POLL = 0.3, 0.02
-"""Seconds to wait for the end of an import before giving up on cleaning up, and between two looks."""
+"""Seconds to wait for the end of an import before ending without cleanup, and between two checks."""
 
 SWALLOWED_AGAIN = 0.05
-"""Seconds until an interruption is raised again that a callback of C code could not pass on."""
+"""Seconds until an interruption is raised again that was lost in a callback of C code."""
 
-_SHOW_CURSOR = "\x1b[?25h"  # progress bars hide it
+_SHOW_CURSOR = "\x1b[?25h"  # progress bars hide the cursor
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM, on its way out of a command."""
+    """Ctrl-C or SIGTERM inside a command."""
 
 
 class _Interruption:
-    """What this process knows about the signals that it got.
+    """Handle the signals of this process.
 
     Attributes:
         number: the first signal; None before.
-        installed: whether this process ends as described above.
-        in_command: whether there may be something to clean up.
-        raised: whether `Interrupted` was raised, or is still to be.
+        installed: whether signals are handled as the module describes.
+        in_command: whether a command runs, which may have something to clean up.
+        raised: whether `Interrupted` was raised or will be.
     """
 
     def __init__(self) -> None:
@@ -73,7 +72,7 @@ class _Interruption:
             self.number, self._since = number, time.monotonic()
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Handler of both signals."""
+        """Handle either signal."""
         first = self.number is None
         self.note(number)
         if first:
@@ -82,31 +81,31 @@ class _Interruption:
             self.leave()
 
     def act(self, frame: FrameType | None) -> None:
-        """End the process, or the command that it is in, or come back when that is possible."""
+        """End the process or its command, or retry after an import."""
         if not self.in_command:
             self.leave()
         if _importing(frame):
             if time.monotonic() - self._since > IMPORT_PATIENCE or not hasattr(signal, "setitimer"):
                 self.leave()
-            self.come_back(IMPORT_POLL)
+            self.act_later(IMPORT_POLL)
             return
         self.raised = True
         raise Interrupted
 
-    def come_back(self, seconds: float) -> None:
-        """Act again after so many seconds."""
+    def act_later(self, seconds: float) -> None:
+        """Call `act` again after some seconds."""
         self.raised = True
         if hasattr(signal, "setitimer"):  # not on Windows
             signal.signal(signal.SIGALRM, lambda _, frame: self.act(frame))
             signal.setitimer(signal.ITIMER_REAL, seconds)
 
     def cancel(self) -> None:
-        """Do not act again."""
+        """Cancel `act_later`."""
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 
-    def say(self) -> None:
-        """Write the line, once. Written without Python's streams, which the signal may have interrupted."""
+    def print_line(self) -> None:
+        """Print the line, once, without Python's streams, which the signal may have interrupted."""
         if self._said:
             return
         self._said = True
@@ -116,8 +115,8 @@ class _Interruption:
             os.write(2, f"{show_cursor}lapgs: stopped by {name}\n".encode())
 
     def leave(self) -> None:
-        """End the process at once."""
-        self.say()
+        """End the process immediately."""
+        self.print_line()
         with suppress(Exception):  # the signal may have come in the middle of a write
             sys.stdout.flush()
         os._exit(self.exit_code)
@@ -127,27 +126,27 @@ _interruption = _Interruption()
 
 
 def install() -> None:
-    """Let this process end as the module's docstring says. Called in the main thread, before other threads start.
+    """Install the handlers. Call it in the main thread, before other threads start.
 
-    A signal that is ignored stays ignored, as for what a shell starts in the background.
+    An ignored signal stays ignored, as in processes that a shell starts in the background.
     """
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interruption.handle)
     _interruption.installed = True
-    # Registered first, so run last: when the interpreter takes itself apart, it would give the signals their default.
+    # Registered first, so run last: a finalizing interpreter would restore the default handlers.
     atexit.register(_ignore_signals)
     sys.unraisablehook = _unraisable
     if hasattr(signal, "pthread_sigmask"):
         for name in ("create_module", "exec_module"):
-            setattr(ExtensionFileLoader, name, _holding(getattr(ExtensionFileLoader, name)))
+            setattr(ExtensionFileLoader, name, _holding_signals(getattr(ExtensionFileLoader, name)))
 
 
 @contextmanager
 def command() -> Iterator[None]:
-    """Raise `Interrupted` on a signal inside; what then comes out ends the process with its code and the line.
+    """Raise `Interrupted` on a signal inside the block, then end the process with the line and its exit code.
 
-    A signal may come out as another exception, where C++ or a reader of damaged files translates it.
+    The signal may leave the block as another exception, if C++ or a reader of damaged files translated it.
     """
     if not _interruption.installed:
         yield
@@ -158,29 +157,29 @@ def command() -> Iterator[None]:
     except BaseException as error:
         _interruption.in_command = False
         stopped = isinstance(error, KeyboardInterrupt) or (_interruption.raised and isinstance(error, Exception))
-        if not stopped or getattr(error, "exit_code", None) == 130:  # an error that says how to go on
+        if not stopped or getattr(error, "exit_code", None) == 130:  # an error with a message of its own
             raise
-        _interruption.say()
+        _interruption.print_line()
         sys.exit(_interruption.exit_code)
     finally:
         _interruption.in_command = False
         _interruption.cancel()
-    if _interruption.raised:  # it was over before it could be interrupted, or went on all the same
-        _interruption.say()
+    if _interruption.raised:  # the command ended before the signal reached it, or swallowed it
+        _interruption.print_line()
         sys.exit(_interruption.exit_code)
 
 
 def exit_code(code: int) -> int:
-    """What to exit with after an error: 143 instead of 130 when it was SIGTERM that stopped the command."""
+    """Return the exit code after an error: 143 instead of 130 if SIGTERM stopped the command."""
     return _interruption.exit_code if code == 130 else code
 
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let signals wait until the block ends, in this thread and for good in the threads that are started inside.
+    """Block signals in this thread until the block ends, and permanently in threads started inside it.
 
-    Threads that no signal is meant for must not take one: in the moments in which pycolmap's handler of SIGTERM is in
-    place of ours, it would print a C++ stack.
+    Otherwise such a thread could receive a signal while pycolmap's SIGTERM handler is installed, which prints a C++
+    stack.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -193,7 +192,7 @@ def signals_held() -> Iterator[None]:
 
 
 class StopRequest:
-    """Whether somebody asked this process to stop."""
+    """A flag that is set by a request to stop."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -201,10 +200,9 @@ class StopRequest:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request that training honours after the current iteration.
+    """Turn the first Ctrl-C or SIGTERM into a request, which training follows after the current iteration.
 
-    A second one does what it would have done without. Outside the main thread, where Python delivers no signals,
-    nothing changes.
+    A second signal is handled as usual. Outside the main thread, where Python delivers no signals, nothing changes.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
@@ -243,18 +241,18 @@ def _ignore_signals() -> None:
 
 
 def _unraisable(unraisable: Any) -> None:
-    """Raise an interruption again that was lost in a callback of C code or a finalizer; report others as ever."""
+    """Raise an interruption again that was lost in a callback of C code or a finalizer; report others as usual."""
     if issubclass(unraisable.exc_type, Interrupted) and _interruption.in_command:
-        _interruption.come_back(SWALLOWED_AGAIN)
+        _interruption.act_later(SWALLOWED_AGAIN)
     else:
         sys.__unraisablehook__(unraisable)
 
 
-def _holding(load: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Let signals wait while a compiled module is loaded, and put our handlers back in their place.
+def _holding_signals(load: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Block signals while a compiled module is loaded, and restore our handlers afterwards.
 
-    Modules call Python from C++ while they are loaded, where raising aborts the process (OpenImageIO does); the threads
-    they start leave signals to the main thread; and pycolmap installs a handler of SIGTERM that prints a C++ stack.
+    Modules such as OpenImageIO call Python from C++ while they are loaded, where raising aborts the process. Threads
+    that they start leave signals to the main thread. pycolmap installs a SIGTERM handler that prints a C++ stack.
     """
 
     def held(self: Any, argument: Any) -> Any:

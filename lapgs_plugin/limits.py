@@ -1,6 +1,6 @@
-"""Limits on memory and time: a file or an option of a few bytes can ask for more than any machine has.
+"""Limit sizes that files and options can ask for, because a few bytes can ask for more than any machine has.
 
-The defaults lie above what photos and clips need; an environment variable sets another value.
+The defaults exceed the needs of photos and clips; an environment variable sets another value.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from lapgs_plugin.errors import UserInputError
 
 @dataclass(frozen=True)
 class Limit:
-    """The largest accepted number of something.
+    """A limit that an environment variable can change.
 
     Attributes:
         variable: environment variable that sets another value.
-        default: used unless it is set.
-        unit: of both, for the message.
+        default: the limit if the variable is not set.
+        unit: of the limit, for messages.
     """
 
     variable: str
@@ -31,7 +31,7 @@ class Limit:
         """The limit in force.
 
         Raises:
-            UserInputError: the variable is set to something else than a positive whole number.
+            UserInputError: the variable is not a positive whole number.
         """
         text = os.environ.get(self.variable, str(self.default))
         if not re.fullmatch(r"0*[1-9][0-9]{0,17}", text, re.ASCII):
@@ -41,16 +41,16 @@ class Limit:
         return int(text)
 
     def check(self, amount: int, subject: str, advice: str = "", error: type[UserInputError] = UserInputError) -> None:
-        """Refuse more than the limit.
+        """Check that an amount is within the limit.
 
         Args:
-            amount: what is asked for.
-            subject: start of the message, which says what asks for how much.
-            advice: what to do besides raising the limit, such as "choose a smaller --size".
-            error: what to raise.
+            amount: to check.
+            subject: start of the message, such as "--size 99999x9 is 899,991 pixels".
+            advice: an alternative to raising the limit, such as "choose a smaller --size".
+            error: class to raise.
 
         Raises:
-            UserInputError: it is more.
+            UserInputError: as `error`: the amount is above the limit.
         """
         if amount > (limit := self.value):
             raise error(
@@ -60,13 +60,13 @@ class Limit:
 
 
 PHOTO_PIXELS = Limit("LAPGS_MAX_PHOTO_PIXELS", 250_000_000, "pixels")
-"""Of an image file, before it is resized: phones have 200 million."""
+"""Of an image file before resizing; phone cameras have up to 200 million."""
 
 PHOTO_SIDE = Limit("LAPGS_MAX_PHOTO_SIDE", 65_536, "pixels a side")
-"""Of an image file: whole rows of it are in memory."""
+"""Of an image file, whose rows are read whole."""
 
 VIEW_PIXELS = Limit("LAPGS_MAX_VIEW_PIXELS", 128_000_000, "pixels")
-"""Of an image that is trained on or rendered, which is held as float32, 12 bytes a pixel."""
+"""Of an image that is trained on or rendered, which takes 12 bytes per pixel as float32."""
 
 FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
-"""Of a camera path: an hour of video has 86,400 at 24 frames a second."""
+"""Of a camera path; an hour of video at 24 frames a second has 86,400."""

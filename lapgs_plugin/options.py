@@ -1,6 +1,6 @@
-"""Declare an option of a command where it is used: as a field of a settings dataclass.
+"""Declare command-line options as fields of settings dataclasses.
 
-`cli/bridge.py` makes command lines from these declarations. Nothing here imports a command-line library.
+`cli/bridge.py` makes command lines from the declarations. This module imports no command-line library.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ KEY = "option"
 
 @dataclass(frozen=True)
 class Option:
-    """How a field is asked for on a command line.
+    """How a field appears on the command line.
 
     Attributes:
-        help: what it does, one or two sentences.
-        panel: title of the group that `--help` shows it in.
-        names: of the option; empty makes one from the field's name. The first is shown, the others are old names.
+        help: text of one or two sentences.
+        panel: title of its group in `--help`.
+        names: of the option, the current one first, then old ones; empty for a name made from the field's.
         least, most: bounds of a number.
     """
 
@@ -41,18 +41,18 @@ def option(
     least: float | None = None,
     most: float | None = None,
 ) -> Any:
-    """Declare a dataclass field that is also an option of every command that takes the dataclass."""
+    """Declare a dataclass field that is an option of every command that takes the dataclass."""
     return field(default=default, metadata={KEY: Option(help, panel, names, least, most)})
 
 
 def parameter_name(name: str, declared: Option) -> str:
-    """Return the name that a command's parameter has for a field: the option's, as an identifier."""
+    """Return the name of a field's command parameter: the option's name as an identifier."""
     shown = declared.names[0].split("/")[0] if declared.names else name
     return shown.lstrip("-").replace("-", "_")
 
 
 def option_values(settings: Any) -> Mapping[str, Any]:
-    """Return the values of all options of a settings object, those of dataclasses inside it too, by parameter name."""
+    """Return the option values of a settings object, including nested dataclasses, by parameter name."""
     values: dict[str, Any] = {}
     for each in fields(settings):
         value = getattr(settings, each.name)
@@ -64,10 +64,10 @@ def option_values(settings: Any) -> Mapping[str, Any]:
 
 
 def check_bounds(settings: Any) -> None:
-    """Check the numbers of a settings object against the bounds that its fields declare.
+    """Check the numbers of a settings object against their declared bounds.
 
     Raises:
-        UserInputError: one is outside.
+        UserInputError: a number is out of bounds.
     """
     for each in fields(settings):
         declared, value = each.metadata.get(KEY), getattr(settings, each.name)

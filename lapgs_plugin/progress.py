@@ -1,4 +1,4 @@
-"""The progress bar of everything that counts items: rate and time left, on stderr."""
+"""Show a progress bar with rate and remaining time on stderr."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rich.text import Text
 
 
 class RateColumn(ProgressColumn):
-    """Items a second, and seconds an item where that is below one."""
+    """Show items per second, or seconds per item if that is below one."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
@@ -22,7 +22,7 @@ class RateColumn(ProgressColumn):
 
 
 def item_progress(unit: str) -> Progress:
-    """A bar with count, rate in `unit` and time left, to be used as a context manager."""
+    """Return a bar with count, rate in `unit` and remaining time, for use as a context manager."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

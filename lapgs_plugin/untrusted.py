@@ -1,11 +1,10 @@
-"""Read JSON and TOML that may be damaged, edited by hand or made to do harm.
+"""Read JSON and TOML that may be damaged, edited by hand or malicious.
 
-Everything of this package that reads such a file reads it here: bounded in size, nesting and numbers before anything is
-made of it, then checked against the type that its values should have. Whatever is wrong ends in one line that names the
-file, the key, the value, what was expected and what to do.
+All of this package reads such files here. Size, nesting and numbers are limited first; then values are validated
+against a type. Every error is one line that names the file, the key, the value, what was expected and what to do.
 
-A type is anything that pydantic validates. Dataclasses and TypedDicts that set `STRICT` as their `__pydantic_config__`
-accept no other type than the one they name, no unknown key and no NaN.
+A type is anything that pydantic validates. Dataclasses and TypedDicts with `STRICT` as their `__pydantic_config__`
+accept no other types, no unknown keys and no NaN.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ if TYPE_CHECKING:
 
 MIB = 2**20
 JSON_MIB = 32
-"""Largest JSON file that is read, where cameras or a history are in it. Others may have an eighth of it."""
+"""Largest JSON file with cameras or a history, in MiB. Other JSON files may have an eighth of that."""
 BYTES_A_VALUE = 16
-"""The fewest on average in the largest file: values, not bytes, are what takes memory and time."""
+"""Least average of the largest file, which limits its number of values: these take memory and time."""
 JSON_MIB_VARIABLE = "LAPGS_JSON_MIB"
-"""Environment variable that raises `JSON_MIB`."""
+"""Environment variable that replaces `JSON_MIB`."""
 TEXT_BYTES = MIB
-"""Largest TOML file or other text that is read; people write them by hand."""
+"""Largest TOML or other text file; these are written by hand."""
 DEPTH = 100
 """Deepest nesting of tables and lists."""
 KEY_PARTS = 32
-"""Most parts of a dotted key in TOML. A parser takes memory for the square of them."""
+"""Most parts of a dotted TOML key; a parser's memory grows with their square."""
 LARGEST_INTEGER = 2**63
 
 STRICT: Any = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
@@ -66,9 +65,9 @@ def read_json(
     Args:
         path: of the file.
         kind: type of its value; Any accepts all JSON.
-        error: what is raised.
+        error: class to raise.
         advice: what to do about a damaged file; ends the message.
-        finite: refuse NaN and Infinity, which are no JSON; other programs write them where nobody looks.
+        finite: refuse NaN and Infinity, which are not JSON but which some programs write.
 
     Returns:
         A `kind`.
@@ -87,10 +86,10 @@ def read_json_lines(
     error: type[UserInputError] = UserInputError,
     advice: str = "delete that line",
 ) -> list[Any]:
-    """Read a file of one JSON value a line. What follows the last line break was never finished and is left out.
+    """Read a file with one JSON value per line. Text after the last line break is incomplete and ignored.
 
     Args, Raises:
-        As `read_json`; `kind` is of one line, and the message says which.
+        As `read_json`; `kind` is the type of one line, and messages name the line.
     """
     data = _read_json_bytes(path, 1, error, "remove it")
     lines = data.split(b"\n")[:-1]
@@ -109,7 +108,7 @@ def parse_json(
     advice: str,
     finite: bool = True,
 ) -> Any:
-    """As `read_json`, from text in memory that messages call `name`."""
+    """Parse JSON in memory, otherwise as `read_json`; messages call it `name`."""
     from pydantic_core import from_json
 
     try:
@@ -120,9 +119,14 @@ def parse_json(
 
 
 def read_toml(
-    path: Path, kind: Any = Any, *, error: type[UserInputError] = UserInputError, advice: str = "correct it"
+    path: Path,
+    kind: Any = Any,
+    *,
+    error: type[UserInputError] = UserInputError,
+    advice: str = "correct it",
+    finite: bool = True,
 ) -> Any:
-    """Read a TOML file; arguments as `read_json` takes them. Dates are no values that this package knows."""
+    """Read a TOML file; arguments and errors as in `read_json`. Dates are refused."""
     text = read_text(path, error=error, advice=advice)
     if (long := _LONG_KEY.search(text)) is not None:
         raise error(f"{path} has the key {shortened(long.group())}, expected at most {KEY_PARTS} parts; {advice}")
@@ -131,11 +135,11 @@ def read_toml(
     except (ValueError, RecursionError) as cause:
         reason = "nested too deep" if isinstance(cause, RecursionError) else cause
         raise error(f"{path} is not TOML: {reason}; {advice}") from None
-    return checked(value, kind, str(path), error=error, advice=advice)
+    return checked(value, kind, str(path), error=error, advice=advice, finite=finite)
 
 
 def read_text(path: Path, *, error: type[UserInputError] = UserInputError, advice: str = "restore it") -> str:
-    """Read a text file of at most `TEXT_BYTES`; arguments as `read_json` takes them."""
+    """Read a text file of at most `TEXT_BYTES`; arguments and errors as in `read_json`."""
     data = _read(path, TEXT_BYTES, "expected a file written by hand", error, advice)
     try:
         return data.decode("utf-8")
@@ -155,18 +159,18 @@ def checked(
     advice: str,
     finite: bool = True,
 ) -> Any:
-    """Make a `kind` of parsed values, such as a dataclass of a dictionary.
+    """Validate parsed values and convert them to `kind`, such as a dictionary to a dataclass.
 
     Args:
-        value: of dictionaries, lists, text, numbers, truth values and None.
-        kind: the type that it should have.
-        name: how the message calls where it comes from.
-        error: what is raised.
+        value: of dictionaries, lists, strings, numbers, booleans and None.
+        kind: type to convert to.
+        name: of the source, for messages.
+        error: class to raise.
         advice: what to do; ends the message.
         finite: refuse NaN and Infinity.
 
     Raises:
-        UserInputError: as `error`: it has another type, an unusual one, or a number out of range.
+        UserInputError: as `error`: it is not a `kind`, nested too deep, or holds a number out of range.
     """
     _require_plain(value, name, error, advice, finite)
     if kind is Any:
@@ -175,14 +179,14 @@ def checked(
     from pydantic_core import to_json
 
     try:
-        # As JSON, because strict validation of Python's values would refuse a list as a tuple.
+        # As JSON, because strict validation of Python objects would refuse a list for a tuple.
         return _adapter(kind).validate_json(to_json(value))
     except ValidationError as cause:
         raise error(f"{name} is damaged: {problem(cause)}; {advice}") from None
 
 
 def shortened(value: Any) -> str:
-    """A value for a message: its repr, at most about 80 characters of it."""
+    """Return a value's repr for a message, at most 80 characters."""
     brief = reprlib.Repr()
     brief.maxstring = brief.maxother = brief.maxlong = 60
     brief.maxlevel, brief.maxdict, brief.maxlist = 2, 2, 4
@@ -191,10 +195,10 @@ def shortened(value: Any) -> str:
 
 
 def usable_path(text: str) -> str:
-    """Check that text can name a file: no NUL in it, and nothing longer than file systems take.
+    """Check that text can be a path: without NUL, and not longer than file systems allow.
 
     Raises:
-        ValueError: it cannot.
+        ValueError: it is not a path.
     """
     if "\0" in text or len(os.fsencode(text)) >= 4096 or any(len(os.fsencode(part)) > 255 for part in text.split("/")):
         raise ValueError(f"{shortened(text)} is no path, expected one of at most 255 bytes a name and without NUL")
@@ -209,7 +213,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _read_json_bytes(path: Path, part: int, error: type[UserInputError], advice: str) -> bytes:
-    """A whole JSON file of at most one `part` of the limit, with no more values than fit into that."""
+    """Read a JSON file of at most one `part`-th of the limit, with no more values than fit into that."""
     whole = _json_bytes(error)
     how_to_raise = f"set {JSON_MIB_VARIABLE} to more than {whole // MIB} if it is right"
     data = _read(path, whole // part, how_to_raise, error, advice)
@@ -220,7 +224,7 @@ def _read_json_bytes(path: Path, part: int, error: type[UserInputError], advice:
 
 
 def _json_bytes(error: type[UserInputError]) -> int:
-    """The largest JSON file that is read."""
+    """Return the size of the largest JSON file that is read."""
     text = os.environ.get(JSON_MIB_VARIABLE, str(JSON_MIB))
     if not re.fullmatch("[1-9][0-9]{0,5}", text):
         raise error(f"{JSON_MIB_VARIABLE}={shortened(text)}: expected a number of MiB such as {4 * JSON_MIB}")
@@ -228,11 +232,11 @@ def _json_bytes(error: type[UserInputError]) -> int:
 
 
 def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError], advice: str) -> bytes:
-    """A whole file, unless it is larger than `limit` bytes."""
+    """Read a file of at most `limit` bytes."""
     data = bytearray()
     try:
         with path.open("rb") as stream:
-            # By parts: a single call takes memory for all that it is asked for.
+            # In parts: a single read would allocate all that it asks for.
             while len(data) <= limit and (part := stream.read(MIB)):
                 data += part
     except (OSError, ValueError) as cause:  # ValueError: a NUL in the path
@@ -244,7 +248,7 @@ def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError]
 
 
 def _require_plain(value: Any, name: str, error: type[UserInputError], advice: str, finite: bool) -> None:
-    """Refuse deep nesting, numbers that nothing can be computed with, and other types than JSON's."""
+    """Refuse deep nesting, unusable numbers and types other than JSON's."""
     layer = [value]
     for _ in range(DEPTH):
         inner: list[Any] = []
@@ -263,9 +267,9 @@ def _require_plain(value: Any, name: str, error: type[UserInputError], advice: s
 
 
 def _unusable(value: Any, finite: bool) -> str | None:
-    """What is wrong with a value that is no table and no list; None where nothing is."""
+    """Return what is wrong with a value that is neither table nor list; None if nothing is."""
     if isinstance(value, str):
-        # Half a character: of a file's name that is no UTF-8, or from an escape.
+        # A lone surrogate, from a file name that is not UTF-8 or from an escape.
         broken = not value.isascii() and re.search("[\ud800-\udfff]", value)
         return f"text {shortened(value)}, expected UTF-8" if broken else None
     if isinstance(value, float):
@@ -278,12 +282,12 @@ def _unusable(value: Any, finite: bool) -> str | None:
 
 
 def _digits(value: int) -> str:
-    """A large whole number for a message; Python refuses to write one of over 4,300 digits."""
+    """Describe a large integer; Python refuses to print more than 4,300 digits."""
     return f"of {value.bit_length()} bits" if value.bit_length() > 300 else shortened(value)
 
 
 def problem(error: ValidationError) -> str:
-    """Say the first thing that is wrong, with its place, its value and what was expected."""
+    """Describe the first problem: its key, its value and what was expected."""
     first = error.errors(include_url=False)[0]
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
     where = where if len(where) <= 120 else where[:117] + "..."

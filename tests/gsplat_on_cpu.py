@@ -17,7 +17,7 @@ from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.rasterizers import gsplat_direct
+from lapgs_plugin.rasterizers.gsplat import direct
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -225,14 +225,14 @@ class Compiled:
 
 
 class Finishing:
-    """The functions of `gsplat_triton` that a training render calls, in PyTorch's operations and by autograd."""
+    """The functions of `gsplat.kernels` that a training render calls, in PyTorch's operations and by autograd."""
 
     @staticmethod
-    def activated(log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+    def activate(log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         return log_scales.exp(), logits.sigmoid()
 
     @staticmethod
-    def colors_of_shown(
+    def visible_colors(
         means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         shown = (radii > 0).all(-1)  # (c, n)
@@ -252,7 +252,7 @@ class Finishing:
     ) -> Tensor:  # fmt: skip
         with torch.enable_grad():
             leaves = means.detach().clone().requires_grad_(), sh.detach().clone().requires_grad_()
-            values, *_ = Finishing.colors_of_shown(leaves[0], centre, leaves[1], degree, signed, radii, None)
+            values, *_ = Finishing.visible_colors(leaves[0], centre, leaves[1], degree, signed, radii, None)
             by_direction, by_sh = torch.autograd.grad((values * by_color).sum(), leaves, allow_unused=True)
         by_mean += 0.0 if by_direction is None else by_direction
         by_scale *= scales
@@ -262,9 +262,9 @@ class Finishing:
 
 @contextmanager
 def direct_on_cpu(finishing: Any = Finishing) -> Iterator[None]:
-    """Let `gsplat_direct` find these kernels, and `finishing` in place of `gsplat_triton`."""
+    """Let `gsplat.direct` find these kernels, and `finishing` in place of `gsplat.kernels`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gsplat_direct, "compiled_functions", Compiled)
+        patch.setattr(direct, "compiled_functions", Compiled)
         patch.setattr(torch.cuda, "device", lambda device: nullcontext())
-        patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat_triton", finishing)
+        patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", finishing)
         yield

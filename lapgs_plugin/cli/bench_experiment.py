@@ -132,7 +132,7 @@ def bench_experiment(
 
     from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.aggregate import check_table
-    from lapgs_plugin.experiments.commands import Places
+    from lapgs_plugin.experiments.commands import Locations
     from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
     from lapgs_plugin.experiments.launchers import check_order, launch
     from lapgs_plugin.experiments.mistakes import Mistakes
@@ -157,7 +157,7 @@ def bench_experiment(
             _require_place(folder.path)
         if evaluate:
             _require_measuring(lpips_weights or ())
-        places = Places(
+        places = Locations(
             {name: _folder(name, value) for name, value in _pairs(path, "--path").items()}, experiment.parent
         )
         weights = [word for file in lpips_weights or () for word in ("--lpips-weights", str(file.absolute()))]
@@ -325,6 +325,10 @@ def _write(
     Raises:
         RunsFailedError: some did.
     """
+    import shlex
+
+    from rich.console import Console
+    from rich.markdown import Markdown
     from rich.markup import escape
 
     from lapgs_plugin import __version__
@@ -358,13 +362,15 @@ def _write(
         exports.write_parquet(folder.path / exports.PARQUET, rows)
     except MissingExtraError as error:
         messages.print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
-    print(text)
+    console = Console()
+    console.print(Markdown(text)) if console.is_terminal else print(text)
     others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
     if others:
         messages.print(
             f"[yellow]some results were made by lapgs_plugin {', '.join(others)}; this is {__version__}[/yellow]"
         )
     print(f"{folder.path} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    print(f"next: lapgs report {shlex.quote(str(folder.path))} writes a page with curves and images")
     if failed := [o for o in outcomes.values() if o.state == FAILED]:
         raise RunsFailedError(
             f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "

@@ -61,8 +61,8 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers import gsplat
     from lapgs_plugin.rasterizers.extensions import installed_extensions
+    from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 
     found: dict[str, Callable[[], list[Subject]]] = {

@@ -8,7 +8,8 @@ import typer
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.registry import KnownCheckout
-    from lapgs_plugin.environment import Finding, Probe
+    from lapgs_plugin.environment.findings import Finding
+    from lapgs_plugin.environment.probes import Probe
 
 IMPORTED = ("OpenImageIO", "pycolmap")
 """Packages with compiled code that no other probe imports."""
@@ -45,29 +46,28 @@ def examine() -> dict[str, list[Finding]]:
     from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
-    from lapgs_plugin import environment
     from lapgs_plugin.adapters.registry import KNOWN_EXTENSIONS, recognise_checkout
+    from lapgs_plugin.environment import driver_version, findings
+    from lapgs_plugin.environment.probes import run_probe
 
-    requirements = environment.own_requirements()
+    requirements = findings.own_requirements()
     with ThreadPoolExecutor() as pool:
-        torch_probe = pool.submit(environment.run_probe, "torch")
-        raster_probe = pool.submit(environment.run_probe, "rasterizer")
-        driver = pool.submit(environment.driver_version)
-        imports = {name: pool.submit(environment.run_probe, "import", name) for name in IMPORTED}
-        extensions = [pool.submit(environment.extension_finding, *known) for known in KNOWN_EXTENSIONS.items()]
+        torch_probe = pool.submit(run_probe, "torch")
+        raster_probe = pool.submit(run_probe, "rasterizer")
+        driver = pool.submit(driver_version)
+        imports = {name: pool.submit(run_probe, "import", name) for name in IMPORTED}
+        extensions = [pool.submit(findings.extension_finding, *known) for known in KNOWN_EXTENSIONS.items()]
     torch = torch_probe.result()
-    compilers = environment.compiler_findings(torch.facts.get("cuda"))
+    compilers = findings.compiler_findings(torch.facts.get("cuda"))
     sections = {
-        "System": environment.system_findings(),
-        "PyTorch": environment.torch_findings(torch, driver.result()),
+        "System": findings.system_findings(),
+        "PyTorch": findings.torch_findings(torch, driver.result()),
         "Compilers": compilers,
-        "CPU rasterizer": environment.numba_findings(raster_probe.result()),
-        "Packages": environment.package_findings(
-            requirements, {name: probe.result() for name, probe in imports.items()}
-        ),
-        "Extras": environment.extra_findings(requirements),
+        "CPU rasterizer": findings.numba_findings(raster_probe.result()),
+        "Packages": findings.package_findings(requirements, {name: probe.result() for name, probe in imports.items()}),
+        "Extras": findings.extra_findings(requirements),
         "Backbones": [
-            environment.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
+            findings.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
             *(extension.result() for extension in extensions),
             _current_folder(recognise_checkout(Path.cwd()), bool(torch.facts.get("gpus"))),
         ],
@@ -77,7 +77,7 @@ def examine() -> dict[str, list[Finding]]:
 
 def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
     """Say whether the current folder is a checkout, and where `lapgs run` would train it."""
-    from lapgs_plugin.environment import Finding
+    from lapgs_plugin.environment.findings import Finding
 
     if checkout is None:
         return Finding("Current folder", "absent", "not a known 3DGS checkout")
@@ -90,7 +90,8 @@ def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
     """Say what `lapgs train` will use, as `training.backend.choose_rasterizer` decides, or what prevents it."""
-    from lapgs_plugin.environment import Finding, gpus_are_hidden
+    from lapgs_plugin.environment import gpus_are_hidden
+    from lapgs_plugin.environment.findings import Finding
 
     needed = [*sections["System"], *sections["PyTorch"], *sections["CPU rasterizer"], *sections["Packages"]]
     broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_NEEDED]

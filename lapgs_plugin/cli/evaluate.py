@@ -93,7 +93,7 @@ def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | 
     from rich.table import Table
 
     from lapgs_plugin.evaluation.stability import evaluate_stability
-    from lapgs_plugin.rendering.paths import path_cameras
+    from lapgs_plugin.rendering.run import path_cameras
     from lapgs_plugin.runs.archive import STABILITY, RunArchive
 
     archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lapgs_plugin.fields.camera import Camera
-    from lapgs_plugin.rendering.compose import HierarchyRenderer
+    from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
     from lapgs_plugin.scenes import Scene, View
 
 SPLITS = ("test", "train", "all")
@@ -107,8 +107,7 @@ def render(
     else:
         refuse({"--views": views, "--compare": compare or None}, "does not go with --trajectory, which has no photos")
     from lapgs_plugin.jit.threads import one_pool
-    from lapgs_plugin.rendering.paths import path_cameras
-    from lapgs_plugin.rendering.run import run_renderer, run_scene
+    from lapgs_plugin.rendering.run import path_cameras, run_renderer, run_scene
     from lapgs_plugin.runs.archive import RENDERS, RunArchive
 
     _require_one_of("--views", views, (None, *SPLITS))

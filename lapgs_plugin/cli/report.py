@@ -89,7 +89,7 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from lapgs_plugin.reports.comparison import comparison_rows, unlike
+    from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
     names = [escape(each.archive.path().name) for each in runs]
     table = Table("", *names, *(["change"] if len(runs) > 1 else []), box=box.SIMPLE_HEAD)
@@ -98,5 +98,5 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))
     console = Console()
     console.print(table)
-    if len(runs) > 1 and (differences := unlike(runs[0].archive.manifest, runs[1].archive.manifest)):
+    if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
         console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}", highlight=False)

@@ -62,19 +62,19 @@ def view(
 
 def _serve(page: Page, run: Path, baseline: Path | None, options: RenderOptions) -> None:
     """Show the runs and their new levels until Ctrl-C."""
-    from lapgs_plugin.viewer.following import FollowedRun, Following
-    from lapgs_plugin.viewer.server import Viewer
+    from lapgs_plugin.viewer.following import FollowedRun, RunFollower
+    from lapgs_plugin.viewer.viewer import Viewer
 
     shown = FollowedRun(run, options.device, options.rasterizer)
     other = None if baseline is None else FollowedRun(baseline, options.device, options.rasterizer)
     viewer, stop = Viewer(page), threading.Event()
-    following = Following(viewer, page, shown, other, options.scene, say=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, options.scene, report=lambda line: print(line, flush=True))
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)
     watching.start()
     try:
-        viewer.serve(at_rest=following.keep_preview)
+        viewer.serve(at_rest=following.save_preview)
     finally:
         stop.set()
         watching.join()

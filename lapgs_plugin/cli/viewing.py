@@ -91,7 +91,7 @@ def keep_preview(run: Path, device: str = "auto") -> None:
         device: where to render.
     """
     from lapgs_plugin.jit.threads import one_pool
-    from lapgs_plugin.viewer.preview import keep_preview_of
+    from lapgs_plugin.viewer.preview import save_run_preview
 
     with one_pool():
-        keep_preview_of(run, device)
+        save_run_preview(run, device)

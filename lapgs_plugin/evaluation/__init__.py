@@ -1,1 +1,1 @@
-"""Metrics, benchmarks and reports."""
+"""Metrics of runs, conformance of rasterizers, and the raster benchmark."""

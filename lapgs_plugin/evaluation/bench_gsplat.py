@@ -1,13 +1,13 @@
-"""gsplat's rasterizer in plain PyTorch, made to run on a CPU: a yardstick of speed for `lapgs bench raster`.
+"""Run gsplat's PyTorch rasterizer on a CPU, for comparison in `lapgs bench raster`.
 
-gsplat ships the same rasterizer twice, as CUDA kernels and as the PyTorch code its tests compare them with. The latter
-still calls CUDA at two places: a kernel that lists which Gaussian meets which pixel, and the scans of the package
-nerfacc. While one of our calls lasts, both are replaced by PyTorch code that does the same on a CPU; all else, with its
-Python loop that lists the tiles of each Gaussian, is gsplat's own.
+gsplat has its rasterizer twice: as CUDA kernels, and as the PyTorch code that its tests compare them with. The PyTorch
+code still calls CUDA in two places: a kernel that lists which Gaussian meets which pixel, and the scans of the package
+nerfacc. During a call both are replaced by PyTorch code that does the same on a CPU. Everything else, with its Python
+loop over the tiles of each Gaussian, is gsplat's own.
 
-Its images differ from ours by up to about 2e-2: it caps alpha at 0.999 instead of 0.99, cuts a footprint at 3.33 sigma
-along each axis of the image instead of 3 sigma of the longest, and measures the Jacobian's limit from the principal
-point instead of the image centre. Where none of that acts, the two agree to rounding.
+Its images differ a little from ours: it caps alpha at 0.999 instead of 0.99, cuts a footprint at 3.33 sigma along each
+image axis instead of 3 sigma of the longest, and measures the limit of the Jacobian from the principal point instead of
+the image centre. Elsewhere the two agree to rounding.
 """
 
 from __future__ import annotations
@@ -26,19 +26,17 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.reference_raster.oracle import MIN_ALPHA, MIN_TRANSMITTANCE, NEAR_DEPTH
 
 TILE = 16
-NEAR_DEPTH = 0.2
-MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4
 
 
 class GsplatTorchRasterizer:
-    """gsplat's `_torch_impl` behind `fields.rasterizer.Rasterizer`; unsigned fields in float32 on the CPU only.
+    """Render unsigned float32 fields on the CPU with gsplat's `_torch_impl`, as a `fields.rasterizer.Rasterizer`.
 
     Attributes:
-        tile_loop_seconds: what the last call spent in gsplat's listing of tiles, a Python loop over Gaussians.
+        tile_loop_seconds: seconds that the last call spent in gsplat's Python loop over Gaussians and tiles.
     """
 
     def __init__(self) -> None:
@@ -91,7 +89,7 @@ class GsplatTorchRasterizer:
 
 @contextmanager
 def _cuda_parts_replaced() -> Iterator[None]:
-    """Let gsplat find our index kernel and our nerfacc; afterwards it finds what it would have found before."""
+    """Replace gsplat's index kernel and nerfacc by ours, and restore them afterwards."""
     nerfacc = ModuleType("nerfacc")
     vars(nerfacc).update(render_weight_from_alpha=_weights_from_alphas, accumulate_along_rays=_sums_along_rays)
     kernel, module = _wrapper.rasterize_to_indices_in_range, sys.modules.get("nerfacc")
@@ -119,9 +117,9 @@ def _indices_in_range(
     offsets: Tensor,  # (1, rows, columns)
     gaussian_ids: Tensor,  # (i,)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Every pair of a Gaussian and a pixel that blends it: Gaussian, pixel and image (always 0), (m,) each.
+    """List every pair of a Gaussian and a pixel that blends it: Gaussian, pixel and image (always 0), (m,) each.
 
-    A pixel's pairs are contiguous and front to back. The names and the order of the arguments are gsplat's kernel's.
+    A pixel's pairs are contiguous and front to back. Names and order of the arguments are those of gsplat's kernel.
     """
     bounds = [*offsets.flatten().tolist(), len(gaussian_ids)]
     columns, batch = offsets.shape[2], tile_size * tile_size
@@ -153,11 +151,11 @@ def _indices_in_range(
 
 
 def _weights_from_alphas(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """nerfacc's function of a similar name: alpha_i T_i and T_i, (m,) each, for samples sorted by ray."""
+    """Return alpha_i T_i and T_i, (m,) each, for samples sorted by ray, as `nerfacc.render_weight_from_alpha`."""
     first = torch.cat([ray_indices.new_ones(1, dtype=torch.bool), ray_indices[1:] != ray_indices[:-1]])  # (m,)
     starts = torch.nonzero(first)[:, 0]  # (r,)
     lengths = torch.diff(starts, append=starts.new_tensor([len(alphas)]))  # (r,)
-    # One running sum over all rays, in float64 because it becomes large.
+    # One running sum over all rays; float64, because it becomes large.
     logs = torch.log1p(-alphas).double()  # (m,)
     before = torch.cumsum(logs, dim=0) - logs  # (m,)
     transmittances = torch.exp(before - before[starts].repeat_interleave(lengths)).to(alphas.dtype)  # (m,)
@@ -165,6 +163,6 @@ def _weights_from_alphas(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tu
 
 
 def _sums_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """nerfacc's function of a similar name: the weighted sum of the values of each ray, (n_rays, c)."""
+    """Return the weighted sum of each ray's values, (n_rays, c), as `nerfacc.accumulate_along_rays`."""
     weighted = weights[:, None] if values is None else weights[:, None] * values  # (m, c)
     return weighted.new_zeros(n_rays, weighted.shape[1]).index_add(0, ray_indices, weighted)

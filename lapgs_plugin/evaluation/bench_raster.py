@@ -1,7 +1,7 @@
-"""Timing of whole training iterations on the CPU: our rasterizer beside the oracle and gsplat's PyTorch code.
+"""Time whole training iterations on the CPU: our rasterizer, the oracle, and gsplat's PyTorch code.
 
 An iteration is activations, rendering, L1 + SSIM, the backward pass and Adam, at SH degree 3. The contenders take
-turns, so that a change in the machine's load meets all of them, and ratios are of medians of one run.
+turns, so that a change in the machine's load affects all of them. Ratios are of medians of one run.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer, pipeline
 
 FAST, ORACLE, GSPLAT = "cpu", "oracle", "gsplat"
-"""Names of the contenders: the fast rasterizer with our loss and Adam; the others with PyTorch's."""
+"""The contenders: the fast rasterizer with our loss and Adam, and the others with PyTorch's."""
 
 MAX_LOSS_SHARE = 0.20
-"""What the loss may add to the rest of an iteration."""
+"""Largest time of the loss, as a share of the rest of an iteration."""
 MAX_MEMORY = 1.5e9
-"""Bytes that training of the largest case may take."""
+"""Most bytes of memory for training the largest case."""
 
 FAST_ITERATIONS = 3
-"""Timed iterations of the fast contender for each turn; the one before them brings its data back into the caches."""
+"""Timed iterations of the fast contender in each turn; an untimed one before them fills the caches."""
 LEARNING_RATE = 1e-6  # so small that the scene keeps its statistics
 RELATIVE_COST = {FAST: 1.0 + FAST_ITERATIONS, ORACLE: 27.0, GSPLAT: 80.0}
-"""Roughly how long a turn takes, in iterations of the fast contender: what the progress bar counts."""
+"""Approximate length of a turn in iterations of the fast contender, for the progress bar."""
 GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
-"""Slow contenders take part in this many Gaussians' worth of turns, at least one."""
-
+"""Slow contenders take part in as many turns as add up to this many Gaussians, at least in one."""
 
 MAX_SIDE, MAX_GAUSSIANS = 8192, 10_000_000
-"""Of a case: a typing error is not to fill a machine's memory."""
+"""Limits of a case, so that a typing error does not fill a machine's memory."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class BenchCase:
 
     Attributes:
         width, height: of the image, in pixels.
-        gaussians: in the scene.
-        required: the least ratio of a contender's time to the fast one's, where the project promises one.
+        gaussians: number in the scene.
+        required: by contender, the least ratio of its time to the fast one's.
     """
 
     width: int
@@ -76,7 +76,7 @@ class BenchCase:
 
     @property
     def name(self) -> str:
-        """As `parse_cases` reads it."""
+        """The form that `parse_cases` reads."""
         return f"{self.size}/{self.gaussians}"
 
 
@@ -86,14 +86,14 @@ CASES = (
     BenchCase(800, 533, 50_000, {ORACLE: 24, GSPLAT: 70}),
     BenchCase(1600, 1066, 200_000, {ORACLE: 24, GSPLAT: 85}),
 )
-"""Sizes from a thumbnail to what papers call 1.6K."""
+"""Cases from a thumbnail to the size that papers call 1.6K."""
 
 
 def parse_cases(text: str | None) -> tuple[BenchCase, ...]:
-    """Cases from "200x150,64x48/500": sizes of `CASES`, or any size with a number of Gaussians; None for all.
+    """Parse cases such as "200x150,64x48/500": a size of `CASES`, or any size with a number of Gaussians; None for all.
 
     Raises:
-        UserInputError: an entry is not of that form, or names no known size and no number of Gaussians.
+        UserInputError: an entry has another form, or names no known size and no number of Gaussians.
     """
     if text is None:
         return CASES
@@ -120,19 +120,19 @@ def _parse_case(entry: str) -> BenchCase:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What was measured of one case; all times are medians in milliseconds.
+    """Measurements of one case; times are medians in milliseconds.
 
     Attributes:
         blended_per_pixel: Gaussians that a pixel blends, on average.
         milliseconds: of an iteration, by contender.
-        iterations: how many were timed, by contender.
-        parts: of the fast contender's iteration: prepare (activate, project, sort), blend, loss (with its gradient),
-            blend_back, project_back, adam. They come from iterations of their own, so they add up roughly.
-        loss_share: what the loss adds to the rest of the fast contender's iteration.
-        gsplat_tile_loop: how much of gsplat's iteration is its Python loop that lists the tiles of each Gaussian; None
-            where gsplat did not take part.
-        peak_memory: bytes of a process that does nothing but train with the fast contender; None where the system does
-            not tell.
+        iterations: number of timed ones, by contender.
+        parts: the fast contender's time by part: prepare (activate, project, sort), blend, loss (with its gradient),
+            blend_back, project_back, adam. Measured in separate iterations, so their sum is approximate.
+        loss_share: time of the loss, as a share of the rest of the fast contender's iteration.
+        gsplat_tile_loop: time of gsplat's Python loop over the tiles of each Gaussian; None where gsplat did not take
+            part.
+        peak_memory: bytes of a process that only trains with the fast contender; None where the system does not
+            report it.
     """
 
     case: BenchCase
@@ -146,28 +146,28 @@ class CaseResult:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Time of each other contender over the fast one's."""
+        """Each other contender's time divided by the fast one's."""
         return {name: ms / self.milliseconds[FAST] for name, ms in self.milliseconds.items() if name != FAST}
 
     @property
     def missed(self) -> list[str]:
-        """One line for each promise that was not kept."""
+        """One line for each requirement that is not met."""
         lines = [
-            f"{self.case.name}: {name} takes {self.ratios[name]:.1f} times as long, required {required:g}"
+            f"{self.case.name}: {name} takes {self.ratios[name]:.1f} times as long, expected at least {required:g}"
             for name, required in self.case.required.items()
             if name in self.ratios and self.ratios[name] < required
         ]
         if self.case.required and self.loss_share > MAX_LOSS_SHARE:
             lines.append(
-                f"{self.case.name}: the loss adds {self.loss_share:.0%}, required {MAX_LOSS_SHARE:.0%} at most"
+                f"{self.case.name}: the loss adds {self.loss_share:.0%}, expected at most {MAX_LOSS_SHARE:.0%}"
             )
         if self.case.required and self.peak_memory is not None and self.peak_memory > MAX_MEMORY:
-            lines.append(f"{self.case.name}: training takes {self.peak_memory / 1e9:.2f} GB, required 1.5 at most")
+            lines.append(f"{self.case.name}: training takes {self.peak_memory / 1e9:.2f} GB, expected at most 1.5")
         return lines
 
 
 def report(results: Sequence[CaseResult], dtype: torch.dtype) -> dict[str, Any]:
-    """Everything measured, and on what, for a JSON file."""
+    """Return all measurements, and the machine, for a JSON file."""
     return {
         "machine": machine(),
         "dtype": str(dtype).removeprefix("torch."),
@@ -176,7 +176,7 @@ def report(results: Sequence[CaseResult], dtype: torch.dtype) -> dict[str, Any]:
 
 
 def machine() -> dict[str, str | int]:
-    """The processor, its cores that this process may use, threads, and versions."""
+    """Describe the processor, the cores that this process may use, threads, and versions."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     installed = importlib.util.find_spec("gsplat") is not None
     return {
@@ -191,7 +191,7 @@ def machine() -> dict[str, str | int]:
 
 
 class _Contender:
-    """One implementation with its own copy of the parameters."""
+    """An implementation with its own copy of the parameters."""
 
     def __init__(
         self,
@@ -201,7 +201,7 @@ class _Contender:
         scene: BenchScene,
         threads: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self.rasterizer: Any = rasterizer  # gsplat's tells more than a Rasterizer has to
+        self.rasterizer: Any = rasterizer  # gsplat's has attributes that `Rasterizer` lacks
         self._loss = loss
         self._scene = scene
         self._threads = threads
@@ -215,12 +215,12 @@ class _Contender:
         return image
 
     def loss(self) -> float:
-        """The loss now; all contenders begin with the same one."""
+        """Return the current loss; all contenders begin with the same one."""
         with torch.no_grad():
             return float(self._loss(self._render(), self._scene.target))
 
     def iteration(self) -> dict[str, float]:
-        """One training iteration; milliseconds of its four parts."""
+        """Run one training iteration and return the milliseconds of its four parts."""
         with self._threads():
             moments = [time.perf_counter()]
             image = self._render()
@@ -244,10 +244,10 @@ def _fast(scene: BenchScene) -> _Contender:
 
 
 def _contenders(scene: BenchScene) -> dict[str, _Contender]:
-    """All that can run here, the fast one first."""
+    """Make all contenders that can run here, the fast one first."""
 
     def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
-        return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=1e-15)
+        return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=ADAM_EPS)
 
     found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if importlib.util.find_spec("gsplat") is not None and scene.target.dtype == torch.float32:
@@ -261,7 +261,7 @@ def _contenders(scene: BenchScene) -> dict[str, _Contender]:
 
 
 def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> list[str]:
-    """Who is timed when: the fast contender in every turn, slow ones in as many, evenly spread, as they are worth."""
+    """Order the contenders' turns: the fast one in every turn, slow ones in fewer, evenly spread."""
     plan = []
     for turn in range(turns):
         for name in contenders:
@@ -278,8 +278,8 @@ def run_case(
     """Measure one case.
 
     Args:
-        turns: of the fast contender, each with `FAST_ITERATIONS` timed iterations; slow ones get fewer at large sizes.
-        advance: called after each turn with the contender's name and the turn's cost, see `planned_cost`.
+        turns: of the fast contender, each with `FAST_ITERATIONS` timed iterations; slow ones get fewer in large cases.
+        advance: called after each turn with the contender's name and its cost, see `planned_cost`.
     """
     scene = make_scene(case.width, case.height, case.gaussians, dtype)
     contenders = _contenders(scene)
@@ -309,7 +309,7 @@ def run_case(
 
 
 def planned_cost(case: BenchCase, turns: int, dtype: torch.dtype) -> float:
-    """What `run_case` will report to `advance` in all."""
+    """Return the sum of the costs that `run_case` will report to `advance`."""
     names = [FAST, ORACLE]
     if importlib.util.find_spec("gsplat") is not None and dtype == torch.float32:
         names.append(GSPLAT)
@@ -317,7 +317,7 @@ def planned_cost(case: BenchCase, turns: int, dtype: torch.dtype) -> float:
 
 
 def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
-    """Where the fast contender's iteration goes."""
+    """Measure the parts of the fast contender's iteration, in milliseconds."""
     runs = []
     for _ in range(repeats):
         with _kernel_times() as kernels:
@@ -338,7 +338,7 @@ def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
 
 @contextmanager
 def _kernel_times() -> Iterator[dict[str, float]]:
-    """Milliseconds of each parallel kernel of the fast rasterizer that runs inside, by name."""
+    """Record the milliseconds of each parallel kernel of the fast rasterizer that runs inside, by name."""
     times: dict[str, float] = {}
     namespace = vars(pipeline)
     run = namespace["parallel"]
@@ -356,7 +356,8 @@ def _kernel_times() -> Iterator[dict[str, float]]:
 
 
 def peak_memory(case: BenchCase, dtype: torch.dtype) -> int | None:
-    """Bytes of memory of a process of its own that trains a few iterations; None where the system does not tell."""
+    """Return the peak memory, in bytes, of a new process that trains a few iterations; None where the system does not
+    report it."""
     command = [sys.executable, "-m", __spec__.name, case.name, str(dtype).removeprefix("torch.")]
     finished = subprocess.run(command, capture_output=True, text=True, check=True)
     answer = finished.stdout.strip()

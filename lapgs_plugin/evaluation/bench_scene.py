@@ -1,4 +1,4 @@
-"""The scene that rasterizers are timed on: random, of any size, as dense everywhere as a trained field."""
+"""Make the random scene that rasterizers are timed on, of any size, as dense as a trained field."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from lapgs_plugin.reference_raster import oracle
 
 @dataclass(frozen=True)
 class BenchScene:
+    """A field, a camera that sees it, and a target image."""
+
     field: GaussianField
     camera: Camera
     target: Tensor  # (3, h, w)
 
 
 def make_scene(width: int, height: int, gaussians: int, dtype: torch.dtype) -> BenchScene:
-    """A random field that fills the view of a camera at the origin, whose pixels blend about 40 Gaussians each."""
+    """Make a random field that fills the view of a camera at the origin; each pixel blends about 40 Gaussians."""
     n = gaussians
     focal = max(width, height) * math.sqrt(3) / 2  # 60 degrees across the longer side
     camera = Camera(width, height, focal, focal, width / 2, height / 2, torch.eye(4, dtype=dtype))
@@ -31,7 +33,7 @@ def make_scene(width: int, height: int, gaussians: int, dtype: torch.dtype) -> B
         return low + (high - low) * torch.rand(n, columns, generator=generator, dtype=torch.float64)
 
     depths = uniform(1, 1.0, 6.0)
-    # A tenth of a side beyond each border, so that pixels there blend as many.
+    # A tenth of a side beyond each border, so that pixels there blend as many Gaussians.
     corners = torch.tensor([width, height]) * (uniform(2, -0.1, 1.1) - 0.5) / focal
     spacing = math.sqrt(1.44 * width * height / n)  # pixels between neighbours, were they in one plane
     sizes = torch.exp(uniform(3, math.log(0.43), math.log(2.86))) * spacing  # standard deviations in pixels
@@ -48,7 +50,7 @@ def make_scene(width: int, height: int, gaussians: int, dtype: torch.dtype) -> B
 
 @torch.no_grad()
 def blended_per_pixel(scene: BenchScene, pixels: int = 256) -> float:
-    """How many Gaussians a pixel blends, on average over a random sample of pixels."""
+    """Return the number of Gaussians that a pixel blends, on average over a random sample of pixels."""
     seen = oracle.project(scene.field, scene.camera)
     order = torch.argsort(seen.depths)
     means2d, conics = seen.means2d[order], seen.conics[order]  # (v, 2), (v, 3)

@@ -1,7 +1,7 @@
-"""Cases that rasterizers are compared on: ordinary scenes, and named ones that each press on one decision.
+"""Build the cases that rasterizers are compared on: ordinary scenes, and adversarial ones that each test one decision.
 
-A `Case` is everything one rasterizer call takes. Builders are deterministic in their arguments and work in float64;
-`Case.to(torch.float32)` rounds a case once, so that implementations of both precisions see the same numbers.
+A `Case` holds all arguments of one rasterizer call. Builders are deterministic and work in float64;
+`Case.to(torch.float32)` rounds a case once, so that both precisions see the same numbers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BLACK, WHITE, COLORED = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.7, 0.4)
 
 @dataclass(frozen=True)
 class Case:
-    """One rasterizer call: field, camera, background (RGB) and the SH degree to evaluate (None: all the field has)."""
+    """The arguments of one rasterizer call; `sh_degree` None evaluates all degrees of the field."""
 
     name: str
     field: GaussianField
@@ -37,7 +37,7 @@ class Case:
         return replace(self, field=self.field.to(dtype=dtype), camera=self.camera.to(dtype=dtype))
 
     def with_leaves(self) -> Case:
-        """The case whose field holds fresh leaf tensors that require gradients."""
+        """Return the case with fresh leaf tensors that require gradients."""
         leaves = {name: value.detach().clone().requires_grad_() for name, value in self.field.parameters.items()}
         return replace(self, field=self.field.with_parameters(leaves))
 
@@ -50,14 +50,14 @@ class Case:
 
 
 def pixel_weights(case: Case, seed: int = 0) -> Tensor:
-    """(3, h, w) random weights of both signs: their dot product with an image is a loss no symmetry can hide behind."""
+    """Return (3, h, w) random weights of both signs; their product with an image is a loss without symmetry."""
     generator = torch.Generator().manual_seed(seed)
     shape = (3, case.camera.height, case.camera.width)
     return torch.randn(shape, generator=generator, dtype=torch.float64).to(case.field.means)
 
 
 def gradients(rasterizer: Rasterizer, case: Case, weights: Tensor) -> dict[str, Tensor]:
-    """Gradients of sum(weights * image): by parameter name, and as `means2d` and (where offered) `absgrad2d`."""
+    """Return the gradients of sum(weights * image), by parameter name, "means2d" and, where offered, "absgrad2d"."""
     case = case.with_leaves()
     result = case.render(rasterizer)
     (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
@@ -80,11 +80,11 @@ def make_camera(
     principal_offset: tuple[float, float] = (0.0, 0.0),
     pose_seed: int | None = None,
 ) -> Camera:
-    """A camera at the origin looking along +z, or with a random pose near it.
+    """Make a camera at the origin that looks along +z, or one with a random pose near it.
 
     Args:
         width, height: in pixels.
-        focal: in pixels, one or (fx, fy); None for a field of view of 60 degrees across the larger side.
+        focal: in pixels, one or (fx, fy); None for 60 degrees across the larger side.
         principal_offset: (x, y) in pixels from the image centre.
         pose_seed: seed of a random rotation of any angle and a translation of about a unit.
     """
@@ -100,7 +100,7 @@ def make_camera(
 
 
 def to_world(points: Tensor, camera: Camera) -> Tensor:
-    """(n, 3) camera coordinates to world coordinates."""
+    """Transform (n, 3) camera coordinates to world coordinates."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     return (points - translation) @ rotation
 
@@ -118,7 +118,7 @@ def make_field(
     signed: bool = False,
     seed: int = 0,
 ) -> GaussianField:
-    """A float64 field at the given (n, 3) means, with random rotations and random SH.
+    """Make a float64 field at the given means, with random rotations and random SH.
 
     Args:
         means: (n, 3) world coordinates.
@@ -142,7 +142,7 @@ def make_field(
 
 
 def points_in_view(n: int, camera: Camera, *, seed: int, near: float = 1.0, far: float = 6.0) -> Tensor:
-    """(n, 3) world points, uniform over the image, a tenth of its sides beyond it, and the depths."""
+    """Return (n, 3) world points, uniform in depth and over the image, which they exceed by a tenth of its sides."""
     generator = torch.Generator().manual_seed(seed)
     u, v, d = torch.rand(3, n, generator=generator, dtype=torch.float64)
     depth = near + (far - near) * d
@@ -164,7 +164,7 @@ def random_case(
     camera: Camera | None = None,
     name: str = "random",
 ) -> Case:
-    """An ordinary scene: n Gaussians in view, standard deviations of `pixels` (from, to; log-uniform) on screen."""
+    """Make an ordinary scene: n Gaussians in view, with standard deviations log-uniform between `pixels` on screen."""
     camera = make_camera(width, height, pose_seed=seed) if camera is None else camera
     generator = torch.Generator().manual_seed(seed + 1)
     means = points_in_view(n, camera, seed=seed + 2)
@@ -191,26 +191,29 @@ def _camera_space(points: Sequence[Sequence[float]]) -> Tensor:
 
 
 def no_gaussians() -> Case:
+    """An empty field."""
     return Case("no_gaussians", make_field(torch.zeros(0, 3)), make_camera(20, 17), COLORED)
 
 
 def one_gaussian() -> Case:
+    """One Gaussian of three different scales."""
     camera = make_camera(37, 23, pose_seed=3)
     means = to_world(_camera_space([[0.1, -0.05, 2.0]]), camera)
     return Case("one_gaussian", make_field(means, scales=torch.tensor([[0.3, 0.1, 0.2]]), sh_degree=3), camera, WHITE)
 
 
 def one_pixel() -> Case:
+    """An image of a single pixel."""
     return random_case(40, 1, 1, seed=5, pixels=(0.2, 3.0), name="one_pixel")
 
 
 def ragged_size() -> Case:
-    """Neither side a multiple of the tile; the last tiles are one pixel wide and high."""
+    """No side is a multiple of the tile; the last tiles are one pixel wide and high."""
     return random_case(120, 33, 49, seed=6, name="ragged_size")
 
 
 def near_plane() -> Case:
-    """Centres behind the camera, at it, at both sides of the culling depth 0.2, and huge on screen just past it."""
+    """Centres behind the camera, at it, on both sides of the culling depth 0.2, and huge on screen just past it."""
     camera = make_camera(40, 30)
     depths = [-2.0, -0.2, 0.0, 0.1, 0.2 - 1e-9, 0.2, 0.2 + 1e-9, 0.21, 0.5, 1.0]
     means = _camera_space([[0.02 * i - 0.1, 0.01 * i, z] for i, z in enumerate(depths)])
@@ -219,7 +222,7 @@ def near_plane() -> Case:
 
 
 def outside_frustum() -> Case:
-    """Centres beyond 1.3 tan(fov / 2) on every side, large enough to reach the image: the Jacobian's limit acts."""
+    """Centres beyond 1.3 tan(fov / 2) on every side, large enough to reach the image: the Jacobian is clamped."""
     camera = make_camera(40, 30)
     means = [[s * 2.2, 0.1, 2.0 + 0.1 * s] for s in (-1, 1)] + [[0.1, s * 1.6, 2.0 + 0.2 * s] for s in (-1, 1)]
     means += [[s * 2.5, s * 2.0, 2.5 + 0.1 * s] for s in (-1, 1)] + [[9.0, 0.0, 2.0], [0.0, -30.0, 1.0]]
@@ -228,7 +231,7 @@ def outside_frustum() -> Case:
 
 
 def saturated() -> Case:
-    """Opacities of 0.993 and more stacked in depth: the 0.99 cap and the stop at 1e-4 act almost everywhere."""
+    """Opacities of 0.993 and more stacked in depth: most pixels reach the 0.99 cap and the stop at 1e-4."""
     case = random_case(60, 40, 40, seed=8, sh_degree=1, pixels=(2.0, 9.0), name="saturated")
     logits = torch.linspace(5.0, 10.0, 60, dtype=torch.float64)
     return replace(case, field=case.field.with_parameters({"opacity_logits": logits}))
@@ -244,7 +247,7 @@ def crowd() -> Case:
 
 
 def opaque_crowd() -> Case:
-    """A thousand half-opaque Gaussians over the same few pixels: most are never reached."""
+    """A thousand half-opaque Gaussians over the same few pixels: blending stops before most of them."""
     camera = make_camera(18, 18)
     generator = torch.Generator().manual_seed(10)
     means = torch.randn(1000, 3, generator=generator, dtype=torch.float64) * 0.2 + torch.tensor([0.0, 0.0, 3.0])
@@ -253,7 +256,7 @@ def opaque_crowd() -> Case:
 
 
 def needles() -> Case:
-    """One axis a thousand times the two others, in random directions."""
+    """One axis a thousand times as long as the two others, in random directions."""
     camera = make_camera(48, 40)
     scales = torch.tensor([[1.0, 1e-3, 1e-3]], dtype=torch.float64)
     means = points_in_view(24, camera, seed=11, near=2.0)
@@ -261,7 +264,7 @@ def needles() -> Case:
 
 
 def pancakes() -> Case:
-    """Two axes a thousand times the third, in random directions."""
+    """Two axes a thousand times as long as the third, in random directions."""
     camera = make_camera(48, 40)
     scales = torch.tensor([[0.5, 0.5, 5e-4]], dtype=torch.float64)
     means = points_in_view(24, camera, seed=12, near=2.0)
@@ -269,24 +272,24 @@ def pancakes() -> Case:
 
 
 def specks() -> Case:
-    """A thousandth of a pixel wide: only the 0.3 px^2 make them visible."""
+    """Gaussians a thousandth of a pixel wide, visible only by the 0.3 px^2 added to the covariance."""
     return random_case(200, 40, 40, seed=13, pixels=(1e-4, 1e-3), name="specks")
 
 
 def giants() -> Case:
-    """Many times as wide as the screen."""
+    """Gaussians many times as wide as the screen."""
     case = random_case(12, 40, 35, seed=14, pixels=(50.0, 3000.0), name="giants")
     return replace(case, field=case.field.with_parameters({"opacity_logits": case.field.opacity_logits - 2.0}))
 
 
 def same_depths() -> Case:
-    """Groups of Gaussians at exactly the same point, told apart by colour and shape: only the index orders them."""
+    """Groups of Gaussians at exactly the same point with different colours and shapes: only the index orders them."""
     case = random_case(60, 32, 32, seed=15, sh_degree=1, camera=make_camera(32, 32), name="same_depths")
     return replace(case, field=case.field.with_parameters({"means": case.field.means[torch.arange(60) % 12]}))
 
 
 def same_plane() -> Case:
-    """All centres at one exactly representable depth before an unrotated camera: bitwise ties of different places."""
+    """All centres at one exactly representable depth: bitwise ties at different places."""
     case = random_case(60, 32, 32, seed=16, sh_degree=1, camera=make_camera(32, 32), name="same_plane")
     means = torch.cat([case.field.means[:, :2], torch.full((60, 1), 4.0, dtype=torch.float64)], dim=1)
     return replace(case, field=case.field.with_parameters({"means": means}))
@@ -311,7 +314,7 @@ def wide_angle() -> Case:
 
 
 def clamped_colors() -> Case:
-    """Half of the channels under 0, where an unsigned field clamps."""
+    """Half of the channels below 0, where an unsigned field clamps."""
     case = random_case(60, 40, 30, seed=20, sh_degree=2, name="clamped_colors")
     sh = case.field.sh.clone()
     sh[:, 0] -= 1.7
@@ -319,6 +322,7 @@ def clamped_colors() -> Case:
 
 
 def signed_residual() -> Case:
+    """An ordinary signed field over black."""
     return random_case(80, 40, 30, seed=21, signed=True, background=BLACK, name="signed_residual")
 
 
@@ -335,7 +339,7 @@ def large_quaternions() -> Case:
 
 
 def invisible() -> Case:
-    """Gaussians that are all too faint, behind the camera or off the screen: the background alone is left."""
+    """Gaussians that are too faint, behind the camera or off the screen: only the background is visible."""
     camera = make_camera(30, 20)
     means = _camera_space([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [50.0, 0.0, 2.0]])
     return Case("invisible", make_field(means, scales=0.05, opacities=0.003), camera, COLORED)

@@ -1,9 +1,9 @@
-"""Conformance: any rasterizer against the float64 oracle, case by case.
+"""Compare a rasterizer with the float64 oracle, case by case.
 
-Image, transmittance, radii, screen-space gradients and the gradients of all parameters have to agree wherever the image
-does not hang on a comparison that rounding can turn. Pixels and Gaussians where it does (`reference_raster.thresholds`)
-form a band: they are counted, and still have to stay within what the decisions can make of them. The gradients are
-those of a loss that leaves the band's pixels out. A case for which a rasterizer departs by design is all band.
+Image, transmittance, radii, screen-space gradients and the gradients of all parameters have to agree, except where the
+image depends on a comparison that rounding can turn (`reference_raster.thresholds`). Such pixels and Gaussians form a
+band. They are counted, must stay within the bounds of either decision, and are left out of the loss. A case where a
+rasterizer differs by design is all band.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_ma
 
 @dataclass(frozen=True)
 class Bounds:
-    """How closely a rasterizer has to follow the oracle in everything but the band.
+    """Largest errors of a rasterizer outside the band.
 
     Attributes:
-        image: largest error of a pixel, of the image or the transmittance, relative to the largest colour or 1.
-        element: largest error of a gradient, relative to its largest element.
-        row: largest error of one Gaussian's gradient relative to its norm, which counts as at least `row_floor` of the
-            largest norm.
-        row_floor: see there.
-        relative_l2: largest distance of the whole gradient relative to its norm.
-        mean2d: largest error of a projected centre in pixels, relative to the larger image side or the coordinate.
-        roundings: width of the band in epsilon of the float type.
+        image: error of a pixel of the image or the transmittance, relative to the largest colour or 1.
+        element: error of a gradient, relative to its largest element.
+        row: error of one Gaussian's gradient, relative to its norm or to `row_floor` times the largest norm.
+        row_floor: see `row`.
+        relative_l2: distance of the whole gradient, relative to its norm.
+        mean2d: error of a projected centre in pixels, relative to the larger image side or the coordinate.
+        roundings: width of the band, in epsilon of the float type.
     """
 
     image: float
@@ -66,17 +65,11 @@ EXPANDED_CONIC: dict[str, dict[str, dict[str, float]]] = {
         "log_scales": {"element": 5e-2, "row": 1e-1, "relative_l2": 3e-2},  # 2e-2 (3e-2), 3e-2 (5e-2), 8e-3 (1e-2)
     }
 }
-"""What replaces entries of `Bounds`, by case and gradient, where `Semantics.expanded_conic_gradient` holds.
+"""Replacements in `Bounds`, by case and gradient, where `Semantics.expanded_conic_gradient` holds.
 
-With C the inverse of the 2D covariance Sigma' and G the loss's gradient by C, the gradient by Sigma' is -C G C. CUDA
-code of the family multiplies that out, entry by entry, as polynomials of Sigma' over its squared determinant. With
-eigenvalues l1 > l2 of Sigma', terms of size l1/l2^2 then cancel, in each entry by itself, to what is at most 1/l2; the
-part along the longer axis, which is all that a needle's long scale sees, is 1/l1. So a relative (l1/l2)^2 epsilon of
-it is lost. Needles reach l1/l2 = 1250: 0.1, of which the roundings' random signs leave a tenth or so. Taken through
-the determinant, as autograd does, what is lost has the shape of adj(Sigma'), whose own part along the longer axis is
-only l2, and the loss is l1/l2 epsilon: from the same float32 G, log_scales are then right to 7e-5 instead of 1e-2.
-Neither the 1e-7 that the CUDA code adds to the squared determinant (2e-8 of the largest element) nor the rounding of G
-(3e-8) plays a part. Done as two float32 matrix products, as in gsplat, it loses less of the same kind: 2e-3.
+CUDA code of the 3DGS family multiplies out -C G C, the gradient by the 2D covariance, entry by entry. Terms then cancel
+to a part l2/l1 as large, where l1 > l2 are the covariance's eigenvalues, and needles lose most of the digits of their
+long scale. Derivation: docs/notes/from_code_evaluation.md.
 """
 REBUILT_TRANSMITTANCE: dict[str, dict[str, dict[str, float]]] = {
     # Worst seen on an H200, and in the emulation of tests/unit/test_conformance.py: both 1.0e-2.
@@ -84,18 +77,13 @@ REBUILT_TRANSMITTANCE: dict[str, dict[str, dict[str, float]]] = {
 }
 """The same where `Semantics.rebuilt_transmittance` holds.
 
-A float32 opacity 1 - T is right to 2^-25, and so is the T taken back from it: to 2^-25 / T of itself, which is 3e-4
-where blending ends, at T = 1e-4. The backward pass starts from that T, so all its gradients by way of this pixel are
-too long or too short by one factor. A sum over pixels loses no larger share, unless their parts cancel: what is left of
-them is then off by more of its own length. Gradients with each pixel's factor, all else in float64, have the H200's
-errors in every quantity of this case: 2.3e-4 of the largest element of `sh`, 1.3e-4 of that of `opacity_logits`, and
-1.0e-2 of the own length of one Gaussian's, which is 1/400 of the longest. Code that keeps T itself, as that of 3DGS and
-its forks does, loses nothing.
+The backward pass takes the last transmittance T from a float32 opacity 1 - T. Near the end of blending T is small, so
+all gradients through that pixel share a relative error. Derivation: docs/notes/from_code_evaluation.md.
 """
 MAX_BAND = 0.4
-"""Largest share of pixels that may be in the band: only `near_plane` reaches a third."""
+"""Largest share of pixels in the band; only `near_plane` reaches a third."""
 KINK_FACTOR = 2.0
-"""A Gaussian at a kink may have either side's gradient: none longer than this many times the longest of the case."""
+"""Longest gradient of a Gaussian at a kink, where either side is correct, relative to the longest of the case."""
 GRADIENTS = ("means2d", "means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
@@ -104,11 +92,11 @@ class Subject:
     """A rasterizer to check.
 
     Attributes:
-        name: how the report calls it.
-        rasterizer: it.
-        dtype: float type of the fields it gets.
-        device: where they are.
-        semantics: where it departs from the oracle by design.
+        name: its name in the report.
+        rasterizer: the rasterizer.
+        dtype: float type of the fields that it renders.
+        device: device of the fields.
+        semantics: where it differs from the oracle by design.
     """
 
     name: str
@@ -120,16 +108,16 @@ class Subject:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One rasterizer on one case.
+    """The result of one rasterizer on one case.
 
     Attributes:
         rasterizer, case: their names.
-        signed: the colour map.
-        errors: worst error by quantity, in the measure of `Bounds.image` or `Bounds.element`, outside the band.
-        band_pixels, band_share: pixels in the band, and what share of all they are.
+        signed: whether colour is signed.
+        errors: by quantity, the largest error outside the band, as `Bounds.image` or `Bounds.element` measures it.
+        band_pixels, band_share: number and share of the pixels in the band.
         band_error: largest error of the image in the band.
         band_gaussians: Gaussians whose radius or gradient is in the band.
-        problems: what is wrong, one line each; empty when the case passed.
+        problems: one line for each problem; empty when the case passed.
     """
 
     rasterizer: str
@@ -158,7 +146,7 @@ class _Rendered:
 
 
 def conformance_cases() -> list[Case]:
-    """Every case: the adversarial ones, and ordinary scenes of each SH degree before each background."""
+    """Build all cases: the adversarial ones, and ordinary scenes of each SH degree over each background."""
     ordinary = [
         replace(
             random_case(60, 45, 37, seed=100 + degree, sh_degree=degree, background=background),
@@ -171,14 +159,14 @@ def conformance_cases() -> list[Case]:
 
 
 def check(subject: Subject, cases: Sequence[Case]) -> Iterator[Outcome]:
-    """Each case with clamped and with signed colour, in turn; never raises what the rasterizer raises."""
+    """Check each case with clamped and with signed colour; errors of the rasterizer become problems."""
     for case in cases:
         for signed in (False, True):
             yield check_case(subject, replace(case, field=replace(case.field, signed=signed)))
 
 
 def check_case(subject: Subject, case: Case) -> Outcome:
-    """One case as it is; see `check`."""
+    """Check one case as it is, see `check`."""
     bounds = BOUNDS[subject.dtype]
     case = case.to(subject.dtype)
     exact = case.to(torch.float64)
@@ -204,17 +192,17 @@ def check_case(subject: Subject, case: Case) -> Outcome:
     )
     try:
         actual = _render(subject.rasterizer, case, weights, subject.device)
-    except Exception as error:  # whatever a rasterizer raises is a finding about it, and the next case goes on
+    except Exception as error:  # an error of the rasterizer is a result, and the next case follows
         line = (str(error).splitlines() or [""])[0]
         return replace(outcome, problems=(f"raised {type(error).__name__}: {line}",))
     problems = list(_shape_problems(actual, expected))
     if problems:
         return replace(outcome, problems=tuple(problems))
-    return _compared(outcome, actual, expected, mask, exact, subject)
+    return _compare(outcome, actual, expected, mask, exact, subject)
 
 
 def _render(rasterizer: Rasterizer, case: Case, weights: Tensor, device: str) -> _Rendered:
-    """The case rendered, with the gradients of sum(weights * image)."""
+    """Render the case, with the gradients of sum(weights * image)."""
     case = replace(case, field=case.field.to(device), camera=case.camera.to(device)).with_leaves()
     result: RenderResult = case.render(rasterizer)
     if result.image.requires_grad:
@@ -239,7 +227,7 @@ def _exact(value: Tensor) -> Tensor:
 
 
 def _shape_problems(actual: _Rendered, expected: _Rendered) -> Iterator[str]:
-    """What is missing, of another shape or not finite."""
+    """Report values that are missing, of another shape or not finite."""
     for name in ("image", "transmittance", "radii", "means2d"):
         yield from _value_problems(name, getattr(actual, name), getattr(expected, name))
     for name in GRADIENTS:
@@ -256,7 +244,7 @@ def _value_problems(name: str, actual: Tensor | None, expected: Tensor | None) -
         yield f"{name} has {int((~torch.isfinite(actual)).sum())} values that are not finite"
 
 
-def _compared(
+def _compare(
     outcome: Outcome, actual: _Rendered, expected: _Rendered, mask: ThresholdMask, case: Case, subject: Subject
 ) -> Outcome:
     bounds, problems = BOUNDS[subject.dtype], []
@@ -290,7 +278,7 @@ def _compared(
 
 
 def _bounds(subject: Subject, case: str, gradient: str) -> Bounds:
-    """How closely this gradient has to follow the oracle's."""
+    """Return the bounds of one gradient."""
     bounds, semantics = BOUNDS[subject.dtype], subject.semantics
     for holds, granted in (
         (semantics.expanded_conic_gradient, EXPANDED_CONIC),
@@ -302,7 +290,7 @@ def _bounds(subject: Subject, case: str, gradient: str) -> Bounds:
 
 
 def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance: float) -> Iterator[str]:
-    """Whatever was decided, a pixel is a mean of colours and background, weighted by what adds up to one."""
+    """Check that pixels in the band are convex combinations of colours and background, whatever was decided."""
     transmittance = actual.transmittance[mask.pixels]  # (p,)
     if bool(((transmittance < -tolerance) | (transmittance > 1 + tolerance)).any()):
         yield "transmittance in the band is not in [0, 1]"
@@ -314,11 +302,11 @@ def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance
     pixels = actual.image[:, mask.pixels]  # (3, p)
     outside = int(((pixels < low) | (pixels > high)).sum())
     if outside:
-        yield f"{outside} values in the band are beyond all colours of the scene"
+        yield f"{outside} values in the band are outside the range of the scene's colours"
 
 
 def _blended(expected: _Rendered) -> Tensor:
-    """(n,) True for Gaussians that are in some pixel outside the band, as their colour's gradient tells."""
+    """Return (n,) whether each Gaussian contributes to a pixel outside the band, judged by its opacity's gradient."""
     gradient = expected.gradients["opacity_logits"]
     assert gradient is not None
     return gradient != 0
@@ -327,16 +315,16 @@ def _blended(expected: _Rendered) -> Tensor:
 def _compare_radii(
     actual: Tensor, expected: Tensor, is_open: Tensor, culled_freely: Tensor
 ) -> tuple[float, Iterator[str] | list[str]]:
-    """Largest difference of the radii that are not open, and what is wrong with those that are.
+    """Compare radii, and return the largest difference that is not allowed with the problems.
 
     Args:
         actual, expected: (n,) whole pixels, 0 where culled.
-        is_open: (n,) where rounding decides: a pixel more or less, or culled.
-        culled_freely: (n,) where 0 is as good.
+        is_open: (n,) where rounding decides: one pixel more or less, or culled.
+        culled_freely: (n,) where 0 is correct too.
     """
     difference = (actual - expected).abs()  # (n,)
     either_culled = (actual == 0) | (expected == 0)  # (n,)
-    # Float32 cannot tell neighbouring integers above 2^24: the error is then relative.
+    # Float32 cannot represent all integers above 2^24: the error is then relative.
     allowed = (difference <= 1) | (difference <= expected * 1e-5) | either_culled
     fine = (difference == 0) | (culled_freely & (actual == 0)) | (is_open & allowed)  # (n,)
     wrong = (~fine).nonzero()[:, 0].tolist()
@@ -351,7 +339,7 @@ def _compare_radii(
 def _compare_gradients(
     name: str, actual: Tensor, expected: Tensor, kinks: Tensor, bounds: Bounds
 ) -> tuple[float, list[str]]:
-    """Worst element's error relative to the largest element, and what is wrong."""
+    """Compare gradients, and return the largest element's error, relative to the largest element, with the problems."""
     problems = []
     rows, wanted = ((v[:, None] if v.ndim == 1 else v.flatten(1)) for v in (actual, expected))  # (n, m) each
     longest = _largest(wanted.norm(dim=1))
@@ -370,7 +358,7 @@ def _compare_gradients(
             problems.append(f"gradient of {name} is off by {error:.1e} of {measure}, expected at most {bound:.0e}")
     extra = int(((wanted == 0).all(1) & (rows != 0).any(1)).sum())
     if extra:
-        problems.append(f"gradient of {name}: {extra} Gaussians have one that are in no pixel")
+        problems.append(f"gradient of {name}: {extra} Gaussians that are in no pixel have one")
     return measured["its largest element"][0], problems
 
 

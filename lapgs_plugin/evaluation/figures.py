@@ -1,24 +1,25 @@
-"""The figures of a finished run: what `lapgs eval` writes into metrics.json."""
+"""Measure a finished run: the figures that `lapgs eval` writes into metrics.json."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
-from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import METRICS, LevelRecord, Manifest, RunArchive
+from lapgs_plugin.runs.training_figures import training_figures
 from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
@@ -27,24 +28,24 @@ METRIC_KEYS = {
     *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
     *("rasterizer", "versions"),
 }
-"""What metrics.json holds; `run_figures` says what each is."""
+"""Keys of metrics.json; `run_figures` describes them."""
 
 FPS_VIEWS, FPS_ROUNDS = 16, 3
-"""Frames a second are measured over at most so many views, so many times."""
+"""Views and repetitions of each over which frames a second are measured, at most."""
 
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """How well one view is rendered.
+    """Quality of one rendered view.
 
     Attributes:
-        name: of the view's image.
-        psnr, ssim: of the composition at full resolution.
-        lpips: the same by variant, those that were measured.
-        level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at that
+        name: name of the view's image.
+        psnr, ssim: of the composition at full resolution; PSNR in dB.
+        lpips: the measured distances, by variant.
+        level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at the
             level's size.
-        upsampled_psnr: by level, PSNR in dB of I_hat^l brought to full resolution with Up, against the photo: what
-            the hierarchy would give without its finer levels.
+        upsampled_psnr: by level, PSNR in dB of I_hat^l upsampled to full resolution, against the photo: the quality
+            without the finer levels.
     """
 
     name: str
@@ -56,7 +57,7 @@ class ViewMetrics:
 
 
 def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics) -> ViewMetrics:
-    """Compare a rendered view with its photo, level by level, where it was rendered."""
+    """Compare a rendered view with its photo at every level, on the renderer's device."""
     photo = view.image.to(renderer.device)
     targets = renderer.pyramid.gaussian(photo, renderer.levels)
     level_psnr = {level: psnr(image, targets[level]) for level, image in composition.composed.items()}
@@ -76,22 +77,23 @@ def evaluate_run(
     rasterizer: str = "auto",
     lpips: LpipsRequest | None = None,
 ) -> dict[str, Any]:
-    """Render the held-out views of a complete run, or the training views when none were held out, and measure it.
+    """Measure a complete run on its held-out views, or on its training views when none were held out.
 
-    Shows a progress bar and writes the result to the run's metrics.json.
+    Show a progress bar and write the result to the run's metrics.json.
 
     Args:
         archive: the run.
-        moved_to: where its scene is now; None when it did not move.
-        device, rasterizer: what renders it, see `rendering.run.run_renderer`.
-        lpips: which distances to measure; those of VGG when not given. What has no weights is left out and said so.
+        moved_to: the scene's folder now; None when it did not move.
+        device, rasterizer: see `rendering.run.run_renderer`.
+        lpips: distances to measure, those of VGG by default. Distances without weights are left out, and
+            "lpips_missing" says so.
 
     Returns:
-        What is written, described in `run_figures`.
+        The content of metrics.json, see `run_figures`.
 
     Raises:
-        RunFolderError: the run is not complete, or its scene is not where it was.
-        UserInputError: a file of LPIPS weights is not usable.
+        RunFolderError: the run is not complete, or its scene is missing.
+        UserInputError: a file of LPIPS weights cannot be used.
     """
     require_complete(archive)
     renderer = run_renderer(archive, device, rasterizer)
@@ -118,10 +120,10 @@ def evaluate_run(
 def run_metrics(
     archive: RunArchive, moved_to: Path | None = None, *, device: str = "auto", rasterizer: str = "auto"
 ) -> dict[str, Any]:
-    """The run's metrics.json, measured now, as `evaluate_run` does, if it never was.
+    """Return the run's metrics.json, or measure it with `evaluate_run` when it does not exist.
 
     Raises:
-        RunFolderError: as `evaluate_run`, or the file was written by something else.
+        RunFolderError: see `evaluate_run`; or another program wrote the file.
     """
     require_complete(archive)
     metrics = archive.metrics()
@@ -139,7 +141,7 @@ def run_metrics(
 
 
 def require_complete(archive: RunArchive) -> None:
-    """Refuse a run whose training was interrupted: its figures would be those of an unfinished hierarchy.
+    """Refuse a run with unfinished levels.
 
     Raises:
         RunFolderError: a level is not finished.
@@ -153,24 +155,24 @@ def require_complete(archive: RunArchive) -> None:
 
 
 def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], rasterizer: str) -> dict[str, Any]:
-    """Figures of a complete run as JSON, all but what `evaluate_run` adds.
+    """Return the figures of a complete run as JSON, except those that `evaluate_run` adds.
 
-    Keys, with levels as text because JSON has no other keys:
-        psnr, ssim, lpips_<variant>: means over the views of each view's own value, at full resolution.
-        lpips_missing: why others could not be measured, by variant; fps: frames a second of the composed image, median
-            over some views; both added by `evaluate_run`.
-        split, num_views: which views, "test" or "train", and how many.
-        train_seconds and what else training took: see `training_figures`.
+    Keys, with levels as text as JSON requires:
+        psnr, ssim, lpips_<variant>: means over the views, at full resolution.
+        lpips_missing: by variant, why it could not be measured; added by `evaluate_run`.
+        fps: frames a second of the composed image, the median over some views; added by `evaluate_run`.
+        split, num_views: the measured views, "test" or "train", and their number.
+        train_seconds and other figures of training: see `training_figures`.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
             num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, memory_bytes.
-        views: name, psnr, ssim, lpips_<variant> of each, in the scene's order.
-        rasterizer, versions: what rendered them.
+        views: name, psnr, ssim and lpips_<variant> of each view, in the scene's order.
+        rasterizer, versions: the rasterizer and the versions of packages that rendered the views.
     """
     records = manifest.records
     return {
-        "psnr": _mean(view.psnr for view in views),
-        "ssim": _mean(view.ssim for view in views),
-        **{LPIPS_KEY.format(name): _mean(view.lpips[name] for view in views) for name in views[0].lpips},
+        "psnr": fmean(view.psnr for view in views),
+        "ssim": fmean(view.ssim for view in views),
+        **{LPIPS_KEY.format(name): fmean(view.lpips[name] for view in views) for name in views[0].lpips},
         "split": split,
         "num_views": len(views),
         **training_figures(records),
@@ -183,8 +185,8 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
 
 def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[str, Any]:
     return {
-        "psnr": _mean(view.level_psnr[record.level] for view in views),
-        "upsampled_psnr": _mean(view.upsampled_psnr[record.level] for view in views),
+        "psnr": fmean(view.level_psnr[record.level] for view in views),
+        "upsampled_psnr": fmean(view.upsampled_psnr[record.level] for view in views),
         "iterations": record.iterations,
         "image_size": list(record.image_size),
         "train_seconds": record.train_seconds,
@@ -199,8 +201,3 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
 def _view_figures(view: ViewMetrics) -> dict[str, Any]:
     distances = {LPIPS_KEY.format(name): value for name, value in view.lpips.items()}
     return {"name": view.name, "psnr": view.psnr, "ssim": view.ssim, **distances}
-
-
-def _mean(values: Iterable[float]) -> float:
-    listed = list(values)
-    return math.fsum(listed) / len(listed)

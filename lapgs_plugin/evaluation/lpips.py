@@ -1,9 +1,10 @@
-"""LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018).
+"""Measure LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
+2018) without torchvision.
 
-The packages lpips and torchmetrics take their networks from torchvision, which is compiled for one version of PyTorch
-and often missing. The networks are a dozen convolutions that never changed, so they stand here; their weights come from
-a file in torchvision's layout, or from torchvision's own cache if they were ever downloaded, never from the network.
-The learned layers on top come from the same file, or from whichever of the two packages is installed.
+The packages lpips and torchmetrics take their networks from torchvision, which is built for one version of PyTorch and
+often missing. The networks are small and fixed, so they are defined here. Their weights come from a file in
+torchvision's layout or from torchvision's download cache; nothing is downloaded. The learned layers come from the same
+file, or from one of the two packages.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from torch import Tensor, nn
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""What LPIPS takes from each channel of an image in [-1, 1] and divides it by."""
+"""Mean and deviation by which LPIPS normalizes each channel of an image in [-1, 1]."""
 EPSILON = 1e-8
-"""Added to squared lengths of feature vectors, as torchmetrics does; lpips adds 1e-10 to the length."""
+"""Added to the squared lengths of feature vectors, as in torchmetrics; lpips adds 1e-10 to the length."""
 LINEAR_FILES = {"torchmetrics": "functional/image/lpips_models/{}.pth", "lpips": "weights/v0.1/{}.pth"}
-"""Where packages keep the learned layers."""
+"""The learned layers' files inside packages."""
 
 
 class _Fire(nn.Module):
-    """A block of SqueezeNet: fewer channels, then two convolutions side by side; names as torchvision's."""
+    """SqueezeNet's fire module, with torchvision's names."""
 
     def __init__(self, before: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -78,15 +79,15 @@ def _squeezenet() -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class Network:
-    """A network that LPIPS can look at images with.
+    """A network whose features LPIPS compares.
 
     Attributes:
-        title: as tables call it.
-        make: its layers up to the last tap.
-        taps: layers whose output is compared.
+        title: its name in tables.
+        make: builds its layers up to the last tap.
+        taps: indices of the layers whose outputs are compared.
         channels: of these outputs.
-        cached_as: name of torchvision's weights in PyTorch's cache of downloads.
-        smallest: shorter side in pixels of the smallest image that reaches its last layer.
+        cached_as: file name of torchvision's weights in PyTorch's download cache.
+        smallest: least shorter side of an image, in pixels, for which every layer has an output.
     """
 
     title: str
@@ -97,7 +98,7 @@ class Network:
     smallest: int
 
     def layers(self) -> nn.Sequential:
-        """Its convolutions up to the last tap, with shapes but no values: on PyTorch's device "meta"."""
+        """Return the layers up to the last tap with shapes but no values, on PyTorch's device "meta"."""
         with torch.device("meta"):
             return nn.Sequential(*self.make())
 
@@ -115,32 +116,32 @@ NETWORKS = {
     ),
 }
 AS_3DGS = "vgg_3dgs"
-"""The VGG distance as the 3DGS codebases compute it, and papers print it: they hand images in [0, 1] to a network that
-expects them in [-1, 1]."""
+"""The VGG distance as 3DGS codebases compute it and papers print it: images in [0, 1] go into a network that expects
+[-1, 1]."""
 VARIANTS = (*NETWORKS, AS_3DGS)
 LPIPS_KEY = "lpips_{}"
-"""What a variant is called in metrics.json."""
+"""Key of a variant in metrics.json."""
 
 
 def network_of(variant: str) -> str:
-    """The key in `NETWORKS` of one of `VARIANTS`."""
+    """Return the key in `NETWORKS` of one of `VARIANTS`."""
     return "vgg" if variant == AS_3DGS else variant
 
 
 def title_of(variant: str) -> str:
-    """One of `VARIANTS` in words."""
+    """Return the name of one of `VARIANTS` for people."""
     return NETWORKS[network_of(variant)].title + (" as 3DGS" if variant == AS_3DGS else "")
 
 
 class Lpips(nn.Module):
-    """The distance of two images under one network.
+    """The LPIPS distance of two images under one network.
 
     Args:
         name: key in `NETWORKS`.
         weights: `features.<layer>...` of the network and `lin<k>.weight`, (1, c, 1, 1), of the learned layers.
 
     Raises:
-        UserInputError: weights are missing or have other shapes; names the first.
+        UserInputError: weights are missing or have other shapes; the message names the first.
     """
 
     def __init__(self, name: str, weights: Mapping[str, Tensor]) -> None:
@@ -165,11 +166,11 @@ class Lpips(nn.Module):
 
     @torch.no_grad()
     def forward(self, image: Tensor, target: Tensor, as_3dgs: bool = False) -> float:
-        """The distance of two images, 0 for equal ones.
+        """Return the distance of two images, 0 for equal ones.
 
         Args:
             image, target: (3, h, w) on the network's device, clamped to [0, 1] here.
-            as_3dgs: leave out the step from [0, 1] to [-1, 1], see `AS_3DGS`.
+            as_3dgs: do not map [0, 1] to [-1, 1], see `AS_3DGS`.
         """
         total = 0.0
         outputs = zip(self._outputs(image, as_3dgs), self._outputs(target, as_3dgs), self.learned, strict=True)
@@ -178,7 +179,7 @@ class Lpips(nn.Module):
         return total
 
     def _outputs(self, image: Tensor, as_3dgs: bool) -> Iterable[Tensor]:
-        """(1, c, h', w') of each tapped layer, feature vectors of unit length."""
+        """Yield the output of each tapped layer, (1, c, h', w'), with feature vectors of unit length."""
         like = self.learned[0]
         values = image.clamp(0.0, 1.0).to(like.dtype)[None]
         values = values if as_3dgs else 2.0 * values - 1.0
@@ -191,12 +192,12 @@ class Lpips(nn.Module):
 
 @dataclass(frozen=True)
 class LpipsMetrics:
-    """The distances to be measured of every view.
+    """The loaded networks, and the distances to measure of every view.
 
     Attributes:
-        networks: by key in `NETWORKS`, those whose weights were found.
-        variants: of `VARIANTS`, those that can be measured.
-        missing: of the others that were asked for, why they cannot.
+        networks: by key in `NETWORKS`, those with weights.
+        variants: those of `VARIANTS` that can be measured.
+        missing: by variant, why another requested one cannot be measured.
     """
 
     networks: Mapping[str, Lpips]
@@ -204,17 +205,17 @@ class LpipsMetrics:
     missing: Mapping[str, str]
 
     def measure(self, image: Tensor, target: Tensor) -> dict[str, float]:
-        """Each variant's distance of two images, (3, h, w)."""
+        """Return each variant's distance of two images, (3, h, w)."""
         return {v: self.networks[network_of(v)](image, target, as_3dgs=v == AS_3DGS) for v in self.variants}
 
 
 @dataclass(frozen=True)
 class LpipsRequest:
-    """What is asked for.
+    """The distances that a user asks for.
 
     Attributes:
-        variants: of `VARIANTS`; None for those of the files' networks, or of VGG, which papers print, without files.
-        files: weights that the user names; which network each is of is told by its shapes.
+        variants: of `VARIANTS`; None for those of the files' networks, or of VGG without files.
+        files: files of weights; their shapes tell the network.
     """
 
     variants: tuple[str, ...] | None = None
@@ -222,7 +223,7 @@ class LpipsRequest:
 
     @classmethod
     def parse(cls, variants: str | None, files: Iterable[Path] = ()) -> LpipsRequest:
-        """From the command line; variants are separated by commas, "none" asks for nothing.
+        """Parse the command line's value: variants separated by commas, or "none".
 
         Raises:
             UserInputError: a variant is not known.
@@ -239,16 +240,16 @@ class LpipsRequest:
 
 
 def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.device) -> LpipsMetrics:
-    """Load the networks of what is asked for, as far as there are weights.
+    """Load the networks of a request whose weights can be found.
 
     Args:
-        request: what is asked for.
-        smallest_side: of the images to come, in pixels.
-        device: of the images to come.
+        request: the distances to measure.
+        smallest_side: of the images, in pixels.
+        device: of the images.
 
     Raises:
-        UserInputError: a named file cannot be read, or is of no known network.
-        MissingExtraError: it is a .safetensors file, and their package is not installed.
+        UserInputError: a named file cannot be read, or belongs to no known network.
+        MissingExtraError: a file is .safetensors, and that package is not installed.
     """
     named = dict(_read_named(path) for path in request.files)
     networks: dict[str, Lpips] = {}
@@ -262,9 +263,9 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
             continue
         weights = named.get(name) or _cached(name)
         if weights is None:
-            missing[variant] = f"no weights: name a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
+            missing[variant] = f"no weights: give a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
         elif smallest_side < NETWORKS[name].smallest:
-            missing[variant] = f"images of {smallest_side} pixels are too small, it takes {NETWORKS[name].smallest}"
+            missing[variant] = f"images of {smallest_side} pixels are too small, expected {NETWORKS[name].smallest}"
         elif (complete := _with_learned(name, weights)) is None:
             missing[variant] = "no learned layers in the weights: pip install 'lapgs_plugin[lpips]'"
         else:
@@ -273,7 +274,7 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
 
 
 def _read_named(path: Path) -> tuple[str, Mapping[str, Tensor]]:
-    """A named file's network and weights."""
+    """Read a file and recognise the network that its weights belong to."""
     weights = _read(path)
     for name, network in NETWORKS.items():
         expected = network.layers().state_dict()
@@ -282,17 +283,17 @@ def _read_named(path: Path) -> tuple[str, Mapping[str, Tensor]]:
         ):
             return name, weights
     raise UserInputError(
-        f"--lpips-weights {path}: these are the layers of none of {', '.join(n.title for n in NETWORKS.values())}; "
+        f"--lpips-weights {path}: fits none of {', '.join(n.title for n in NETWORKS.values())}; "
         "expected torchvision's names and shapes, such as features.0.weight"
     )
 
 
 def _read(path: Path) -> Mapping[str, Tensor]:
-    """A file of tensors by name, .safetensors or .pth.
+    """Read a file of tensors by name, .safetensors or .pth.
 
     Raises:
-        UserInputError: it cannot be read.
-        MissingExtraError: reading it needs a package that is not installed.
+        UserInputError: the file cannot be read.
+        MissingExtraError: the package that reads .safetensors is not installed.
     """
     try:
         if path.suffix == ".safetensors":
@@ -306,7 +307,7 @@ def _read(path: Path) -> Mapping[str, Tensor]:
         raise MissingExtraError(
             f"LPIPS weights {path}: reading .safetensors needs a package; pip install 'lapgs_plugin[lpips]'"
         ) from error
-    except Exception as error:  # torch and safetensors raise whatever a damaged file makes of them
+    except Exception as error:  # torch and safetensors raise many types for damaged files
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise UserInputError(
             f"LPIPS weights {path} cannot be read ({reason}); expected tensors by name, .safetensors or .pth"
@@ -315,13 +316,13 @@ def _read(path: Path) -> Mapping[str, Tensor]:
 
 
 def _cached(name: str) -> Mapping[str, Tensor] | None:
-    """What torchvision has downloaded at some time, by itself or for lpips or torchmetrics."""
+    """Read the weights that torchvision downloaded earlier; None where there are none."""
     path = Path(torch.hub.get_dir()) / "checkpoints" / NETWORKS[name].cached_as
     return _read(path) if path.is_file() else None
 
 
 def _with_learned(name: str, weights: Mapping[str, Tensor]) -> Mapping[str, Tensor] | None:
-    """Weights with learned layers: their own, or else an installed package's."""
+    """Add the learned layers of an installed package to weights that lack them; None where there are none."""
     if "lin0.weight" in weights:
         return weights
     for package, pattern in LINEAR_FILES.items():

@@ -1,9 +1,10 @@
-"""Image quality as 3DGS papers report it: PSNR and SSIM of one image."""
+"""Compute PSNR and SSIM of one image, as 3DGS papers report them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -11,14 +12,14 @@ from torch import Tensor
 from lapgs_plugin.ops.photometric_loss import in_torch
 
 SMALLEST_MSE = 1e-10
-"""Mean squared errors below this, which float32 images hardly resolve, count as this: no PSNR is above 100 dB."""
+"""Smallest mean squared error that counts, near the resolution of float32 images: no PSNR is above 100 dB."""
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of one image, over all its pixels and channels, at most 100.
+    """Return the peak signal-to-noise ratio of one image in dB, over all pixels and channels, at most 100.
 
     Args:
-        image, target: (3, h, w), clamped to [0, 1] here, not rounded to 8 bits.
+        image, target: (3, h, w), clamped to [0, 1] here and not rounded to 8 bits.
     """
     difference = image.detach().clamp(0.0, 1.0) - target.clamp(0.0, 1.0)
     mse = float(difference.double().square().mean())
@@ -27,7 +28,7 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 @torch.no_grad()
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Mean structural similarity of one image as 3DGS computes it, see `in_torch.ssim`.
+    """Return the mean structural similarity of one image as 3DGS computes it, see `in_torch.ssim`.
 
     Args:
         image, target: (3, h, w) of the same type and device, clamped to [0, 1] here.
@@ -41,11 +42,11 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 def mean_quality(pairs: Iterable[tuple[Tensor, Tensor]]) -> dict[str, float]:
-    """Means over images of "psnr" in dB and "ssim"; empty without an image.
+    """Return the means of "psnr" (in dB) and "ssim" over images; empty without an image.
 
     Args:
-        pairs: image and target of each, as `psnr` and `ssim` take them.
+        pairs: image and target, as `psnr` and `ssim` take them.
     """
     measured = [{"psnr": psnr(image, target), "ssim": ssim(image, target)} for image, target in pairs]
     names = measured[0] if measured else {}
-    return {name: math.fsum(each[name] for each in measured) / len(measured) for name in names}
+    return {name: fmean(each[name] for each in measured) for name in names}

@@ -1,9 +1,9 @@
-"""Flicker along a camera path: what changes between two frames besides the camera.
+"""Measure flicker along a camera path: how much frames differ besides the motion of the camera.
 
 Each pixel of a frame is followed to the frame before by its rendered depth. Where both frames see the same surface,
-their colours are compared. Detail that is fixed to its surfaces gives zero, detail that swims does not, and a
-residual might swim: image pyramids know nothing of surfaces. What shines changes as well, in every method: the figure
-is for comparing fields of one scene along one path, and both are followed by the same depth.
+their colours are compared. Detail that is fixed to its surface gives zero; detail that moves over it does not.
+Residuals might flicker, because image pyramids know no surfaces. Reflections change in every method, so figures only
+compare fields of one scene along one path, followed by the same depth.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from lapgs_plugin.evaluation.figures import require_complete
 from lapgs_plugin.evaluation.metrics import SMALLEST_MSE
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
 from lapgs_plugin.rendering.depth import DepthImage, render_depth
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 
 SAME_DEPTH = 0.01
-"""Two depths of one surface differ by less than this share of them; more is something in front of it."""
+"""Two depths belong to one surface when they differ by less than this share."""
 
 OPAQUE = 0.9
-"""Cover of a pixel from which on its depth is that of a surface."""
+"""Least opacity of a pixel whose depth is that of a surface."""
 
 COMPOSITION, SINGLE = "composition", "single field"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a path.
+    """A rendered frame of a path.
 
     Attributes:
         camera: of the frame.
         depth: of its pixels.
-        images: (3, h, w) by name, all seen with that depth.
+        images: by name, (3, h, w).
     """
 
     camera: Camera
@@ -53,11 +54,11 @@ class Frame:
 
 @dataclass
 class Flicker:
-    """Differences between frames and their predecessors, over all pixels that both show.
+    """Accumulated differences between frames and their predecessors, over all pixels that both show.
 
     Attributes:
         absolute, squared: sums over pixels and channels.
-        values: how many these are.
+        values: number of values summed.
     """
 
     absolute: float = 0.0
@@ -65,34 +66,34 @@ class Flicker:
     values: int = 0
 
     def add(self, difference: Tensor) -> None:
-        """Differences of any shape."""
+        """Add differences, a tensor of any shape."""
         self.absolute += float(difference.abs().double().sum())
         self.squared += float(difference.double().square().sum())
         self.values += difference.numel()
 
     @property
     def mean(self) -> float:
-        """Mean absolute difference, of intensities in [0, 1]."""
+        """Mean absolute difference of intensities in [0, 1]."""
         return self.absolute / max(self.values, 1)
 
     @property
     def psnr(self) -> float:
-        """In dB, of all differences together; at most 100."""
+        """PSNR in dB of all differences together, at most 100."""
         return -10.0 * math.log10(max(self.squared / max(self.values, 1), SMALLEST_MSE))
 
 
 def measure_flicker(frames: Iterable[Frame]) -> tuple[dict[str, Flicker], float]:
-    """Compare each frame with the one before.
+    """Compare each frame with the one before it.
 
     Returns:
-        By the name of the image, and the share of all pixels that were compared.
+        The flicker by image name, and the share of all pixels that were compared.
     """
     flicker: dict[str, Flicker] = {}
     before: Frame | None = None
     compared = pixels = 0
     for frame in frames:
         if before is not None:
-            positions, seen = follow(frame, before)
+            positions, seen = reproject(frame, before)
             compared, pixels = compared + int(seen.sum()), pixels + seen.numel()
             for name, image in frame.images.items():
                 carried = _sample(before.images[name], positions)
@@ -101,12 +102,12 @@ def measure_flicker(frames: Iterable[Frame]) -> tuple[dict[str, Flicker], float]
     return flicker, compared / max(pixels, 1)
 
 
-def follow(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
-    """Where the pixels of a frame were in the one before.
+def reproject(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
+    """Find the pixels of a frame in the frame before.
 
     Returns:
-        (h, w, 2) positions in that frame, x then y, in pixels from its corner; and (h, w) bool, whether it shows the
-        same surface there.
+        (h, w, 2) positions in the frame before, x then y, in pixels from the corner; and (h, w) bool, whether that
+        frame shows the same surface there.
     """
     camera, depth = frame.camera, frame.depth.depth
     height, width = depth.shape
@@ -115,7 +116,7 @@ def follow(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
         torch.arange(height, device=device) + 0.5, torch.arange(width, device=device) + 0.5, indexing="ij"
     )
     rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=-1)
-    # One transform from camera to camera: with both poses apart, float32 would lose the small step between them.
+    # One transform from camera to camera: float32 would lose the small step between two separate poses.
     step = before.camera.world_to_camera.double() @ torch.linalg.inv(camera.world_to_camera.double())
     step = step.to(depth)
     points = (rays * depth[..., None]) @ step[:3, :3].T + step[:3, 3]  # (h, w, 3) in the camera of before
@@ -125,7 +126,7 @@ def follow(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
     u, v = points[..., 0] / ahead * old.fx + old.cx, points[..., 1] / ahead * old.fy + old.cy
     inside = (u > 0) & (u < old.width) & (v > 0) & (v < old.height) & (distance > 0)
     across = torch.stack([u / old.width, v / old.height], dim=-1)
-    there = torch.nn.functional.grid_sample(  # (1, 2, h, w), linear: nothing beyond what lies beside a place
+    there = torch.nn.functional.grid_sample(  # (1, 2, h, w)
         torch.stack([before.depth.depth, before.depth.cover])[None], 2.0 * across[None] - 1.0, align_corners=False
     )[0]
     same = (there[0] - distance).abs() < SAME_DEPTH * distance
@@ -135,10 +136,10 @@ def follow(frame: Frame, before: Frame) -> tuple[Tensor, Tensor]:
 def path_frames(
     renderer: HierarchyRenderer, single: HierarchyRenderer | None, cameras: Sequence[Camera]
 ) -> Iterable[Frame]:
-    """The frames of a hierarchy along a path: its composition, each of its bands, and a single field beside it.
+    """Render the frames of a hierarchy along a path: its composition, each of its bands, and a single field.
 
-    All are at full size. The depth is that of the single field where there is one, otherwise of the finest field that
-    is no residual.
+    All images are at full size. The depth is that of the single field if there is one, otherwise of the finest unsigned
+    field.
     """
     surface = renderer if single is None else single
     solid = min(level for level, field in surface.fields.items() if not field.signed)
@@ -168,22 +169,22 @@ def evaluate_stability(
     device: str = "auto",
     rasterizer: str = "auto",
 ) -> dict[str, Any]:
-    """Measure the flicker of a run along a path, with a progress bar, and write it to the run's stability.json.
+    """Measure the flicker of a run along a path, and write it to the run's stability.json.
 
     Args:
         archive: the run.
-        single: a single field of the same scene, None without.
-        path: how the figures call it.
-        cameras: one a frame.
-        device, rasterizer: what renders, see `rendering.run.run_renderer`.
+        single: a single field of the same scene, or None.
+        path: name of the path in the figures.
+        cameras: one for each frame.
+        device, rasterizer: see `rendering.run.run_renderer`.
 
     Returns:
-        As JSON: "path", "size", "frames", "compared" (share of all pixels), "baseline", and in "flicker", by image,
-        its "mean" absolute difference and "psnr" in dB.
+        JSON values: "path", "size", "frames", "compared" (share of all pixels), "baseline", and in "flicker", by image,
+        the "mean" absolute difference and "psnr" in dB.
 
     Raises:
         RunFolderError: the run is not complete.
-        UserInputError: what is to be compared with is not a single field, or the path has one frame.
+        UserInputError: `single` has several levels, or the path has one frame.
     """
     require_complete(archive)
     if single is not None and single.manifest.levels != 1:
@@ -212,10 +213,9 @@ def evaluate_stability(
 
 
 def _sample(image: Tensor, positions: Tensor) -> Tensor:
-    """(c, h, w) between pixels at (h', w', 2) positions, in pixels from the corner: (c, h', w').
+    """Interpolate an image (c, h, w) at (h', w', 2) positions in pixels from the corner: (c, h', w').
 
-    By cubic convolution with Keys' constant, a = -1/2, which is exact for parabolas. PyTorch's has -3/4, which is not:
-    on the smooth plane of the tests it made twenty times the error.
+    Cubic convolution with Keys' constant a = -1/2 is exact for parabolas; PyTorch's -3/4 is not.
     """
     height, width = image.shape[1:]
     corner = positions - 0.5
@@ -231,7 +231,7 @@ def _sample(image: Tensor, positions: Tensor) -> Tensor:
 
 
 def _keys_weights(t: Tensor) -> list[Tensor]:
-    """Of the pixels at -1, 0, 1 and 2 for a place at t in [0, 1) between the second and the third (Keys 1981)."""
+    """Return the weights of pixels -1, 0, 1 and 2 for a position t in [0, 1) between pixels 0 and 1 (Keys 1981)."""
     t2, t3 = t * t, t * t * t
     return [
         0.5 * (-t3 + 2 * t2 - t),

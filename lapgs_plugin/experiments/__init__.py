@@ -1,11 +1,11 @@
-"""Experiments: many runs described by one file, spread over processes, kept in one store, shown as tables.
+"""Run experiments: many runs described by one file, spread over processes, kept in one store, shown as tables.
 
-    schema.py       what an experiment file may say
-    standard.py     the standard data sets, backbones' published options, the paper's printed figures (all in data/)
+    schema.py       the content of an experiment file
+    standard.py     standard data sets, backbones' published options, the paper's figures (all in data/)
     expansion.py    a file -> runs: scenes x backbones x variants x seeds, variants taking turns
-    mistakes.py     what is wrong with an experiment, told at once; cli/bench_check.py finds it by rehearsing every run
-    commands.py     a run -> the commands that train and measure it
-    store.py        who runs what, and what came out: SQLite, safe against dying and competing workers
+    mistakes.py     collects all mistakes of an experiment; cli/bench_check.py finds them by rehearsing every run
+    commands.py     a run -> the commands that train and evaluate it
+    store.py        claims and results of runs: SQLite, safe against dying and competing workers
     worker.py       takes runs from the store until none is left; leash.py ends a run whose worker died
     launchers.py    workers on this machine, on Slurm, on Ray
     rows.py         a run's folder -> one flat row

@@ -1,24 +1,25 @@
-"""From rows of results to a table: means over scenes, spread over seeds, ratios to the baseline, the paper's figures.
+"""Aggregate rows of results to a table: means over scenes, deviations over seeds, ratios, the paper's figures.
 
-A cell is taken over the scenes that every row of the table has, so that rows can be compared while some runs are
-missing: first the mean over these scenes for each seed, then mean and sample deviation over the seeds.
+Cells use the scenes that every row of the table has, so that rows stay comparable while runs are missing: first the
+mean over these scenes for each seed, then mean and sample deviation over the seeds.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean, stdev
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import PlannedRun
 from lapgs_plugin.experiments.schema import Experiment, nearest
-from lapgs_plugin.experiments.standard import DATASETS, PaperTable, Printed
+from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 
 Row = Mapping[str, Any]
-"""A row of results, see `rows`."""
+"""Row of results, see `rows`."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,12 @@ class Column:
     """A column of a table.
 
     Attributes:
-        heading: as the paper writes it, without arrow.
+        heading: heading as in the paper, without arrow.
         better: "lower", "higher" or "".
-        sources: columns of the rows; the first that a row has is taken. One that ends with _level_ stands for all.
-        scale: what the value is multiplied with.
-        decimals: digits shown after the point.
+        sources: columns of the rows; the first that a row has is used. A source that ends with "_level_" stands for one
+            column for each level.
+        scale: factor on the value.
+        decimals: digits after the point.
     """
 
     heading: str
@@ -74,34 +76,34 @@ COLUMNS: Mapping[str, Column] = {
     "inheritance_seconds": _seconds("Inheritance", "inheritance"),
     "archive_seconds": _seconds("Archive I/O", "archive"),
 }
-"""Everything a table can show, by the name that experiment files use."""
+"""All columns of tables, by their names in experiment files."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure of one row.
+    """A figure of a row.
 
     Attributes:
-        values: the mean, or one for each level, coarsest first; empty when nothing was measured.
-        deviation: of all levels together over the seeds; None with one seed.
-        seeds: over how many.
-        paper: what the paper prints, None when it prints nothing.
+        values: the mean, or one for each level, coarsest first; empty without measurements.
+        deviation: deviation over seeds of the sum over levels; None with one seed.
+        seeds: number of seeds.
+        paper: the figure in the paper, or None.
     """
 
     values: tuple[float, ...] = ()
     deviation: float | None = None
     seeds: int = 0
-    paper: Printed | None = None
+    paper: PaperFigure | None = None
 
     @property
     def value(self) -> float | None:
-        """All levels together."""
+        """Sum over the levels."""
         return math.fsum(self.values) if self.values else None
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """A row against its baseline, measured and printed; None where there is nothing to compare."""
+    """A row relative to its baseline, measured and in the paper; None without a comparison."""
 
     measured: float | None
     paper: float | None
@@ -112,12 +114,12 @@ class TableRow:
     """A variant on a backbone.
 
     Attributes:
-        label: what it is called.
+        label: its name.
         section: heading above it, "" without one.
-        cells: by column.
-        speedup: seconds of the baseline by its own.
-        psnr_gain: its PSNR less the baseline's, dB.
-        is_baseline: whether others are compared with it.
+        cells: cells by column.
+        speedup: time of the baseline divided by its own.
+        psnr_gain: its PSNR minus the baseline's, in dB.
+        is_baseline: whether other rows are compared with it.
     """
 
     label: str
@@ -130,12 +132,12 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Group:
-    """The part of a table that is about one data set, or one scene.
+    """The part of a table for one data set or one scene.
 
     Attributes:
-        title: of it.
-        rows: in the experiment's order.
-        notes: what a reader has to know, as whole sentences.
+        title: its title.
+        rows: rows in the experiment's order.
+        notes: remarks for readers, as sentences.
     """
 
     title: str
@@ -145,16 +147,16 @@ class Group:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """What is written as Markdown and LaTeX.
+    """A table of results, to be written as Markdown and LaTeX.
 
     Attributes:
-        title: of the experiment.
-        label: its name.
-        measured: on what, with which versions and for how many iterations.
+        title: title of the experiment.
+        label: name of the experiment.
+        measured: machines, versions and numbers of iterations.
         columns: names of `COLUMNS`.
-        transposed: columns are shown as rows.
-        groups: data sets, in the experiment's order.
-        scenes: scenes, when the experiment asks for them.
+        transposed: show columns as rows.
+        groups: data sets in the experiment's order.
+        scenes: scenes, if the experiment asks for them.
     """
 
     title: str
@@ -171,10 +173,10 @@ RowKey = tuple[str, str]
 
 
 def check_table(experiment: Experiment) -> PaperTable | None:
-    """The paper's table of an experiment, after checking what the file says about tables.
+    """Check the experiment's `[table]`, and return the paper's table.
 
     Raises:
-        UserInputError: a column or a row of the paper's table is not known.
+        UserInputError: a column, or a row of the paper's table, is not known.
     """
     for column in experiment.table.columns:
         if column not in COLUMNS:
@@ -194,19 +196,18 @@ def check_table(experiment: Experiment) -> PaperTable | None:
 
 
 def baseline_of(experiment: Experiment, names: Sequence[str]) -> str:
-    """Of variants on one backbone, in the experiment's order, the one that the others are compared with: the one marked
-    so, or the first."""
+    """Return the variant that others on the same backbone are compared with: the marked one, or the first."""
     marked = {variant.name for variant in experiment.variants if variant.baseline}
     return next((name for name in names if name in marked), names[0])
 
 
 def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> ResultTable:
-    """The table of an experiment.
+    """Make the table of an experiment.
 
     Args:
-        experiment: its file.
-        planned: the runs that it is about.
-        records: the rows of those that are done, by run.
+        experiment: the experiment.
+        planned: its runs.
+        records: rows of finished runs, by run.
     """
     paper = check_table(experiment)
     by_dataset: dict[str, list[PlannedRun]] = defaultdict(list)
@@ -214,9 +215,10 @@ def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: M
     for run in planned:
         by_dataset[run.spec.dataset].append(run)
         by_scene[run.spec.dataset, run.spec.scene].append(run)
-    groups = [_Part(experiment, paper, dataset, runs, records).group() for dataset, runs in by_dataset.items()]
+    groups = [_GroupBuilder(experiment, paper, dataset, runs, records).group() for dataset, runs in by_dataset.items()]
     single = [
-        _Part(experiment, paper, dataset, runs, records).group(scene) for (dataset, scene), runs in by_scene.items()
+        _GroupBuilder(experiment, paper, dataset, runs, records).group(scene)
+        for (dataset, scene), runs in by_scene.items()
     ]
     return ResultTable(
         title=experiment.title,
@@ -230,7 +232,7 @@ def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: M
 
 
 def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
-    """Where the runs' figures come from, in words."""
+    """Describe where the runs were measured."""
     found = [(run.spec, records[run.spec.run_id]) for run in planned if run.spec.run_id in records]
     if not found:
         return "nothing yet"
@@ -244,15 +246,15 @@ def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
     return ", ".join(parts)
 
 
-class _Part:
-    """What one group of a table is made from.
+class _GroupBuilder:
+    """Builds one group of a table.
 
     Args:
-        experiment: its file.
-        paper: the paper's table.
-        dataset: that the runs are of, "" for scenes of one's own.
-        runs: those of the group.
-        records: rows of all runs that are done.
+        experiment: the experiment.
+        paper: the paper's table, or None.
+        dataset: data set of the runs, "" for other scenes.
+        runs: runs of the group.
+        records: rows of all finished runs.
     """
 
     def __init__(
@@ -298,14 +300,16 @@ class _Part:
         return known.title + some
 
     def _cells(self, key: RowKey) -> dict[str, Cell]:
-        # Seeds that have all scenes which are compared.
+        # Only seeds that have all compared scenes.
         complete = [
             [one[s] for s in self._common] for one in self._found[key].values() if {*self._common} <= one.keys()
         ]
         rows = complete if self._common else []
-        return {name: _cell(rows, COLUMNS[name], self._printed(key, name)) for name in self._experiment.table.columns}
+        return {
+            name: _cell(rows, COLUMNS[name], self._paper_figure(key, name)) for name in self._experiment.table.columns
+        }
 
-    def _printed(self, key: RowKey, column: str) -> Printed | None:
+    def _paper_figure(self, key: RowKey, column: str) -> PaperFigure | None:
         row = self._variants[key[1]].paper_row(key[0])
         if self._paper is None or not row:
             return None
@@ -328,7 +332,7 @@ class _Part:
         return self._experiment.backbones[backbone].title or backbone
 
     def _baseline(self, backbone: str) -> RowKey:
-        """The row that rows of a backbone are compared with."""
+        """Return the key of a backbone's baseline."""
         return backbone, baseline_of(self._experiment, [name for own, name in self._keys if own == backbone])
 
     def _notes(self, cells: Mapping[RowKey, Mapping[str, Cell]]) -> list[str]:
@@ -336,7 +340,7 @@ class _Part:
         if self._missing:
             notes.append(f"{self._missing} of {self._total} runs are missing.")
         if self._common and len(self._common) < len(self._scenes):
-            notes.append(f"Means over {', '.join(self._common)}, the scenes that every row has.")
+            notes.append(f"Means over {', '.join(self._common)}: the scenes that every row has.")
         printed = [cell.paper for row in cells.values() for cell in row.values() if cell.paper is not None]
         if any(not figure.exact for figure in printed):
             whole = len(DATASETS[self._dataset].scenes)
@@ -345,27 +349,24 @@ class _Part:
 
 
 TIMES = ("minutes", "train_seconds", "iteration_ms")
-"""Columns that a speed-up is taken from; the first that a table has."""
+"""Columns for the speed-up; the first one in the table is used."""
 
 
-def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: Printed | None) -> Cell:
-    """A figure from the rows of all scenes, for each seed."""
+def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: PaperFigure | None) -> Cell:
+    """Compute a figure from the rows of all scenes, for each seed."""
     figures = [[_value(row, column) for row in scenes] for scenes in seeds]
     if not figures or any(not value for scenes in figures for value in scenes):
         return Cell(paper=paper)
     if len({len(value) for scenes in figures for value in scenes}) > 1:
         figures = [[(math.fsum(value),) for value in scenes] for scenes in figures]
-    means = [tuple(_mean(level) for level in zip(*scenes, strict=True)) for scenes in figures]  # by seed, by level
+    means = [tuple(fmean(level) for level in zip(*scenes, strict=True)) for scenes in figures]  # by seed, by level
     sums = [math.fsum(levels) for levels in means]
-    deviation = None
-    if len(sums) > 1:
-        centre = _mean(sums)
-        deviation = math.sqrt(math.fsum((value - centre) ** 2 for value in sums) / (len(sums) - 1))
-    return Cell(tuple(_mean(level) for level in zip(*means, strict=True)), deviation, len(sums), paper)
+    deviation = stdev(sums) if len(sums) > 1 else None
+    return Cell(tuple(fmean(level) for level in zip(*means, strict=True)), deviation, len(sums), paper)
 
 
 def _value(row: Row, column: Column) -> tuple[float, ...]:
-    """A row's figure, or one for each level, coarsest first; empty when it has none."""
+    """Return a row's figure, or one for each level, coarsest first; empty without one."""
     for source in column.sources:
         if not source.endswith(LEVELS):
             value = row.get(source)
@@ -379,7 +380,7 @@ def _value(row: Row, column: Column) -> tuple[float, ...]:
 
 
 LEVELS = "_level_"
-"""End of a source that stands for one column a level."""
+"""End of a source that stands for one column for each level."""
 
 
 def _compare(base: Cell | None, own: Cell | None, how: Callable[[float, float], float]) -> Ratio:
@@ -388,8 +389,3 @@ def _compare(base: Cell | None, own: Cell | None, how: Callable[[float, float], 
     measured = how(base.value, own.value) if base.value and own.value else None
     printed = how(base.paper.value, own.paper.value) if base.paper and own.paper else None
     return Ratio(measured, printed)
-
-
-def _mean(values: Iterable[float]) -> float:
-    listed = list(values)
-    return math.fsum(listed) / len(listed)

@@ -1,4 +1,4 @@
-"""From a run to the commands that train and measure it, and where scenes and checkouts lie on this machine."""
+"""Build the commands that train and evaluate a run, and find scenes and checkouts on this machine."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from typing import Any, ClassVar
 from lapgs_plugin.adapters.registry import recognise_checkout
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
+from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
 from lapgs_plugin.untrusted import STRICT
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
 SCRIPT = "train.py"
 IMPORTED = "lapgs"
-"""Folder inside a bare run's own where `lapgs import-run` puts what `lapgs eval` reads."""
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that the schedules of 3DGS codebases are written for."""
+"""Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
 NEGATIONS = {"fused-adam": ["--no-fused-adam"]}
-"""How the options are switched off that are on by themselves."""
+"""Words that switch off options which are on by default."""
 RASTER_OPTIONS = ("mult", "antialiasing")
-"""Options of scripts that change what a saved field looks like, see `lapgs import-run --set`."""
+"""Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Step:
 
     Attributes:
         command: with its arguments.
-        cwd: folder that it is started in.
+        cwd: working directory.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -44,22 +43,22 @@ class Step:
     cwd: str
 
 
-class Places:
-    """Where scenes, data sets and checkouts lie.
+class Locations:
+    """Folders of scenes, data sets and checkouts.
 
     Args:
         given: folders by name, from --path.
-        base: what relative paths in the experiment file start from.
+        base: base of relative paths in the experiment file.
     """
 
     def __init__(self, given: Mapping[str, Path], base: Path) -> None:
         self._given, self._base = given, base
 
     def scene(self, scene: SceneSpec) -> Path:
-        """The folder of a scene that exists.
+        """Find the folder of a scene.
 
         Raises:
-            UserInputError: it is given nowhere, or is no folder with these images.
+            UserInputError: its folder is not given, or has no such images.
         """
         folder = self._find(scene.name)
         if folder is None and scene.dataset and (root := self._find(scene.dataset)) is not None:
@@ -67,7 +66,7 @@ class Places:
         if folder is None and scene.folder is not None:
             folder = self._base / scene.folder
         names = [scene.name, *([scene.dataset] if scene.dataset else [])]
-        folder = self._existing(f"scene {scene.name}", folder, names)
+        folder = self._require_folder(f"scene {scene.name}", folder, names)
         transforms = any(folder.glob("transforms*.json"))
         if not transforms and not _is_folder(folder / scene.images):
             raise UserInputError(
@@ -77,12 +76,12 @@ class Places:
         return folder
 
     def checkout(self, name: str) -> Path:
-        """The folder of a backbone's checkout.
+        """Find the folder of a backbone's checkout.
 
         Raises:
-            UserInputError: it is given nowhere, or has no training script.
+            UserInputError: its folder is not given, or has no training script.
         """
-        folder = self._existing(f"checkout {name}", self._find(name), [name])
+        folder = self._require_folder(f"checkout {name}", self._find(name), [name])
         if not (folder / SCRIPT).is_file():
             raise UserInputError(
                 f"checkout {name}: {folder} has no {SCRIPT}; give its folder with --path {name}=FOLDER"
@@ -90,42 +89,42 @@ class Places:
         return folder
 
     def _find(self, name: str) -> Path | None:
-        variable = os.environ.get(_variable(name))
+        variable = os.environ.get(_environment_variable(name))
         return self._given.get(name, None if variable is None else Path(variable))
 
     @staticmethod
-    def _existing(what: str, folder: Path | None, names: Iterable[str]) -> Path:
-        ways = " or ".join(f"--path {name}=FOLDER ({_variable(name)})" for name in names)
+    def _require_folder(what: str, folder: Path | None, names: Iterable[str]) -> Path:
+        ways = " or ".join(f"--path {name}=FOLDER ({_environment_variable(name)})" for name in names)
         if folder is None:
-            raise UserInputError(f"{what}: nothing says where it is; give {ways}")
+            raise UserInputError(f"{what}: its folder is not given; give {ways}")
         if not _is_folder(folder):
             raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
         return folder.absolute()
 
 
 def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises where a name is too long for the file system
+    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises when a name is too long for the file system
 
 
-def _variable(name: str) -> str:
-    """The environment variable that says where something is."""
+def _environment_variable(name: str) -> str:
+    """Return the environment variable that gives a folder."""
     return "LAPGS_" + name.upper().replace("-", "_").replace(".", "_")
 
 
 def run_steps(
     spec: RunSpec, scene: Path, checkout: Path | None, folder: Path, evaluate: Sequence[str] | None
 ) -> list[Step]:
-    """The commands of a run, one after the other.
+    """Return the commands of a run, in order.
 
     Args:
         spec: the run.
         scene: its scene's folder.
-        checkout: of its backbone; None for the built-in trainer.
-        folder: that it writes into; what is there is replaced.
-        evaluate: options of `lapgs eval`, which is then the last command; None leaves it out.
+        checkout: folder of the backbone's checkout; None for the built-in trainer.
+        folder: output folder; its content is replaced.
+        evaluate: options of `lapgs eval`, the last command; None leaves it out.
 
     Raises:
-        UserInputError: the script of a checkout knows no such resolution.
+        UserInputError: a checkout's script cannot read the scene at this resolution.
     """
     if checkout is None:
         steps = [Step(_train(spec, scene, folder), str(folder.parent))]
@@ -142,7 +141,7 @@ def run_steps(
 
 
 def measured_folder(spec: RunSpec, folder: Path) -> Path:
-    """Where a run's manifest is."""
+    """Return the folder of a run's manifest."""
     return folder / IMPORTED if spec.checkout is not None and spec.method == "bare" else folder
 
 
@@ -174,10 +173,10 @@ def _script(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[s
 
 
 def _schedule(iterations: int) -> tuple[str, ...]:
-    """The family's schedule for another number of iterations: all shrinks or grows but the intervals."""
+    """Return 3DGS's schedule for a number of iterations: everything scales except the intervals."""
     if iterations == REFERENCE_ITERATIONS:
         return ()
-    start = max(1, round(500 * min(1.0, iterations / REFERENCE_ITERATIONS)))
+    start = max(1, round(REFERENCE_DENSIFY_FROM * min(1.0, iterations / REFERENCE_ITERATIONS)))
     return (
         *("--iterations", str(iterations), "--position_lr_max_steps", str(iterations)),
         *("--densify_from_iter", str(start), "--densify_until_iter", str(iterations // 2)),
@@ -194,7 +193,7 @@ def _import(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[s
 
 
 def _raster_options(arguments: Sequence[str]) -> list[str]:
-    """Those of the script's arguments that a saved field is rendered with, the last of each kind."""
+    """Return the script's arguments that affect how a saved field is rendered, the last of each kind."""
     values: dict[str, str] = {}
     for word, following in zip(arguments, [*arguments[1:], "--"], strict=True):
         name = word.removeprefix("--")
@@ -215,10 +214,10 @@ def _as_options(options: Mapping[str, Any]) -> list[str]:
 
 
 def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
-    """What a 3DGS codebase's -r is for one of our resolutions.
+    """Return the value of a 3DGS codebase's -r for one of our resolutions.
 
     Raises:
-        UserInputError: it has none.
+        UserInputError: there is no such value.
     """
     text = spec.resolution
     rule = parse_resolution(text)
@@ -228,7 +227,7 @@ def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
         divisor = 1 / rule.fraction
         if divisor not in BACKBONE_DIVISORS:
             raise UserInputError(
-                f"resolution {text!r} for scene {spec.scene}: the script of a checkout knows 1k, 2k, 4k, widths and "
+                f"resolution {text!r} for scene {spec.scene}: the script of a checkout takes 1k, 2k, 4k, widths and "
                 f"{', '.join(str(Fraction(1, d)) for d in BACKBONE_DIVISORS)}"
             )
         return str(int(divisor))
@@ -237,7 +236,7 @@ def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
 
 
 def _first_width(images: Path) -> int:
-    """Width of a scene's first image, in pixels."""
+    """Return the width of a scene's first image, in pixels."""
     from PIL import Image
 
     for path in sorted(images.rglob("*")):

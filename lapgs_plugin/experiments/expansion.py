@@ -1,4 +1,4 @@
-"""From an experiment to its runs: scenes x backbones x variants x seeds, in the order in which they are started."""
+"""Expand an experiment to its runs: scenes x backbones x variants x seeds, in the order of their start."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class SceneSpec:
     """One scene of an experiment.
 
     Attributes:
-        name: of the scene.
-        dataset: that it belongs to, "" for one's own.
-        folder: as written in the experiment, relative to its file; None where only --path or a variable says it.
-        sample: how to make it, if it is made.
+        name: name of the scene.
+        dataset: its data set, "" without one.
+        folder: as in the experiment, relative to its file; None when only --path or a variable gives it.
+        sample: options of a scene to be made, or None.
         resolution, images: see `schema.Scenes`.
     """
 
@@ -39,12 +39,12 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One training run: everything that decides its result besides the machine and where files lie.
+    """One training run: everything that decides its result except the machine and the folders.
 
     Attributes:
-        scene, dataset, images, resolution: what it is trained on.
+        scene, dataset, images, resolution: the training images.
         backbone: its name in the experiment.
-        rasterizer, checkout: one of them, see `schema.Backbone`.
+        rasterizer, checkout: one of the two, see `schema.Backbone`.
         method: "hierarchy" or "bare".
         iterations, seed: of the whole run.
         options: of `lapgs train` or `lapgs run`.
@@ -68,9 +68,9 @@ class RunSpec:
 
     @cached_property
     def run_id(self) -> str:
-        """Readable, and another one for every difference. Variants that are trained alike share their runs."""
+        """Name of the run, different for different settings. Variants with equal settings share their runs."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
-        last_first = list(self.options.items())[::-1]  # the variant's own stand last, and say most
+        last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
         words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
         return re.sub(r"[^A-Za-z0-9.-]+", "_", words) + f"-{digest}"
@@ -78,7 +78,7 @@ class RunSpec:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run and the variant that asks for it."""
+    """A run, and a variant that asks for it."""
 
     spec: RunSpec
     variant: str
@@ -86,12 +86,12 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class Selection:
-    """What of an experiment is run; None leaves the file's.
+    """The part of an experiment to run; None leaves the file's.
 
     Attributes:
         scenes, backbones, variants: names of those to run.
-        seeds: instead of the file's.
-        iterations: instead of the file's; a variant's own change in proportion.
+        seeds: replace the file's.
+        iterations: replace the file's; those of variants change in proportion.
     """
 
     scenes: Collection[str] | None = None
@@ -102,22 +102,22 @@ class Selection:
 
 
 def scenes_of(experiment: Experiment, selection: Selection) -> list[SceneSpec]:
-    """The selected scenes in the file's order.
+    """Return the selected scenes in the file's order.
 
     Raises:
-        UserInputError: a selected one is not in the file.
+        UserInputError: a selected scene is not in the file.
     """
     found = [scene for entry in experiment.scenes for scene in _scenes(entry)]
     return _selected(found, [scene.name for scene in found], selection.scenes, "--scene")
 
 
 def plan_runs(experiment: Experiment, selection: Selection) -> list[PlannedRun]:
-    """All runs in their order: for every seed and scene all variants in turn, each time beginning with another one.
+    """Plan all runs: for every seed and scene all variants in turn, each time starting with another one.
 
-    A machine that slows down or warms up in the course of an experiment so slows down all variants alike.
+    The rotation spreads a slow-down of the machine over all variants.
 
     Raises:
-        UserInputError: something selected is not in the file.
+        UserInputError: a selected name is not in the file.
     """
     backbones = _selected(
         list(experiment.backbones.items()), list(experiment.backbones), selection.backbones, "--backbone"
@@ -157,10 +157,10 @@ def _spec(
     preset = PRESETS[backbone.preset].arguments(scene.name) if backbone.preset else []
     options = {**backbone.options, **variant.options}
     if variant.method != "bare":
-        # Said even where the file does not: what a result is of must not change with a default.
+        # Stored even when the file does not set it: a changed default must make a new run.
         options = {"hierarchy": DEFAULT_HIERARCHY.value, **options}
     elif backbone.checkout is not None:
-        options = {}  # what sets up a hierarchy means nothing to a script that runs by itself
+        options = {}  # a script that runs by itself has no hierarchy
     return RunSpec(
         scene=scene.name,
         dataset=scene.dataset,

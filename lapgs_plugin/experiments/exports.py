@@ -1,4 +1,4 @@
-"""Results as files: tidy CSV and Parquet, one run a line, and the tables."""
+"""Write and read results as files: tidy CSV and Parquet with one run a line, and tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Row = Mapping[str, Any]
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """One line a row; a column that a row lacks is empty.
+    """Write one line for each row; missing values are empty.
 
     Raises:
         RunFolderError: it cannot be written.
@@ -31,7 +31,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """The same with types, a missing column is null.
+    """Write rows with types; missing values are null.
 
     Raises:
         MissingExtraError: pyarrow is not installed.
@@ -56,7 +56,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A table.
+    """Write a text file.
 
     Raises:
         RunFolderError: it cannot be written.
@@ -65,16 +65,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
-    """All columns that any row has, in the order in which they first appear."""
+    """Return the columns of all rows, in the order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 def read_csv(path: Path) -> list[dict[str, Any]]:
-    """The rows of a results.csv, numbers as numbers; what is empty is left out.
+    """Read the rows of results.csv, with numbers as numbers and without empty values.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no such table.
+        OSError: the file cannot be read.
+        ValueError: the file is not such a table.
     """
     with path.open(newline="", encoding="utf-8") as stream:
         reader = csv.DictReader(stream)

@@ -1,7 +1,6 @@
-"""Where workers run: in threads of this process, as jobs of Slurm (through submitit), or as tasks of Ray.
+"""Start workers: threads of this process, jobs of Slurm (through submitit), or tasks of Ray.
 
-A launcher starts workers and says whether any is left. What they do to which run is between them and the store, so a
-worker that dies anywhere is made up for by another one, or by the next `lapgs bench`.
+Workers share runs through the store alone. When a worker dies, another one or the next `lapgs bench` takes its run.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from lapgs_plugin.experiments.worker import Slot, work
 
 @dataclass(frozen=True)
 class WorkOrder:
-    """What workers are started for.
+    """The work to start workers for.
 
     Attributes:
         store: the store of results, on a disk that all workers see.
         run_ids: the runs to do.
-        workers: how many at once; None leaves it to the launcher.
-        gpus: local only: names for CUDA_VISIBLE_DEVICES; None finds them.
-        logs: folder for what workers themselves print.
+        workers: number of workers; None leaves it to the launcher.
+        gpus: for the local launcher, values of CUDA_VISIBLE_DEVICES; None uses all GPUs.
+        logs: folder for the workers' own output.
         options: of the engine behind the launcher.
     """
 
@@ -45,12 +44,12 @@ class WorkOrder:
 
 
 class Launcher(ABC):
-    """Workers of one engine, started when it is made."""
+    """The workers of one engine; creating it starts them."""
 
     @staticmethod
     @abstractmethod
     def check(options: Mapping[str, Any]) -> None:
-        """Refuse options of the engine that it does not have, or an engine that is not there.
+        """Refuse unknown options, or an engine that is not installed.
 
         Raises:
             UserInputError, MissingExtraError: see `check_order`.
@@ -58,18 +57,18 @@ class Launcher(ABC):
 
     @abstractmethod
     def __init__(self, order: WorkOrder) -> None:
-        """Start the workers that are ordered."""
+        """Start the workers."""
 
     @abstractmethod
     def running(self) -> bool:
-        """Whether a worker is running or waits to be started."""
+        """Whether a worker runs or waits for its start."""
 
     @abstractmethod
     def stop(self) -> None:
-        """End all workers and wait for them; runs they had are given back, or found abandoned later."""
+        """End all workers and wait for them; their runs are returned, or count as abandoned later."""
 
-    def troubles(self) -> list[str]:
-        """What went wrong with workers themselves, one line each."""
+    def failures(self) -> list[str]:
+        """Return failures of the workers themselves, one line each."""
         return []
 
 
@@ -78,10 +77,10 @@ def launch(name: str, order: WorkOrder) -> Launcher:
 
     Args:
         name: "local", "slurm" or "ray".
-        order: for what.
+        order: the work.
 
     Raises:
-        UserInputError: the name or one of the options is not known.
+        UserInputError: the name or an option is not known.
         MissingExtraError: the engine is not installed.
     """
     check_order(name, order)
@@ -89,23 +88,23 @@ def launch(name: str, order: WorkOrder) -> Launcher:
 
 
 def check_order(name: str, order: WorkOrder) -> None:
-    """Refuse what `launch` would, before anything is written.
+    """Refuse an order that `launch` would refuse, before anything is written.
 
     Raises:
-        UserInputError: the name or one of the options is not known.
+        UserInputError: the name or an option is not known.
         MissingExtraError: the engine is not installed.
     """
     if name not in _KINDS:
         raise UserInputError(f"--launcher {name}: expected {', '.join(_KINDS)}")
     if order.gpus is not None and name != "local":
-        raise UserInputError(f"--gpus {','.join(order.gpus)}: {name} deals out GPUs itself; leave it out")
+        raise UserInputError(f"--gpus {','.join(order.gpus)}: {name} assigns GPUs itself; leave it out")
     if order.gpus is not None and not all(gpu.strip() for gpu in order.gpus):
         raise UserInputError(f"--gpus {','.join(order.gpus)!r}: expected names separated by commas, such as 0,1")
     _KINDS[name].check(order.options)
 
 
 class LocalLauncher(Launcher):
-    """Threads of this process: one a GPU, or one alone without GPUs. Cores are shared out evenly."""
+    """Threads of this process, one for each GPU or a single one without GPUs; cores are shared out evenly."""
 
     @staticmethod
     def check(options: Mapping[str, Any]) -> None:
@@ -129,20 +128,20 @@ class LocalLauncher(Launcher):
         for thread in self._threads:
             thread.join()
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         return self._errors
 
     def _work(self, order: WorkOrder, slot: Slot) -> None:
         try:
             work(order.store, order.run_ids, slot, self._stop)
-        except Exception as error:  # said by whoever follows; a thread's own traceback would cut into the display
+        except Exception as error:  # reported by the caller; a thread's traceback would break the progress display
             self._errors.append(f"worker on {slot.gpu or 'the processor'}: {type(error).__name__}: {error}")
 
 
 class SlurmLauncher(Launcher):
-    """Jobs of Slurm, one a worker, through submitit. Options are submitit's, such as slurm_partition=gpu.
+    """Jobs of Slurm, one for each worker, through submitit. Options are submitit's, such as slurm_partition=gpu.
 
-    The option cluster=local runs the same jobs on this machine, for trying it out.
+    The option cluster=local runs the jobs on this machine, as a trial.
     """
 
     @staticmethod
@@ -174,15 +173,15 @@ class SlurmLauncher(Launcher):
         for job in self._jobs:
             job.cancel(check=False)
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         failed = [job for job in self._jobs if job.done() and job.exception() is not None]
         return [f"job {job.job_id}: {str(job.exception()).strip().splitlines()[-1]}" for job in failed]
 
 
 class RayLauncher(Launcher):
-    """Tasks of Ray, one a worker, on the cluster this machine belongs to or a new local one.
+    """Tasks of Ray, one for each worker, on this machine's cluster or a new local one.
 
-    Options: address, num_gpus and num_cpus of a worker. Ray starts a task whose process died again.
+    Options: address; num_gpus and num_cpus of a worker. Ray restarts a task whose process died.
     """
 
     @staticmethod
@@ -198,7 +197,7 @@ class RayLauncher(Launcher):
                 number = math.nan
             if not least <= number < math.inf:
                 raise UserInputError(
-                    f"--launcher-option {name}={options[name]}: expected a number of a worker, at least {least:g}"
+                    f"--launcher-option {name}={options[name]}: expected a number for each worker, at least {least:g}"
                 )
 
     def __init__(self, order: WorkOrder) -> None:
@@ -225,7 +224,7 @@ class RayLauncher(Launcher):
         if self._started:
             self._ray.shutdown()
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         done, _ = self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=0)
         lines = []
         for task in done:
@@ -240,7 +239,7 @@ _KINDS: dict[str, type[Launcher]] = {"local": LocalLauncher, "slurm": SlurmLaunc
 
 
 def _slots(order: WorkOrder) -> list[Slot]:
-    """A part of this machine for each worker."""
+    """Divide this machine among the workers."""
     gpus = visible_gpus() if order.gpus is None else list(order.gpus)
     count = order.workers or max(1, len(gpus))
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -249,7 +248,7 @@ def _slots(order: WorkOrder) -> list[Slot]:
 
 
 def visible_gpus() -> list[str]:
-    """What to put into CUDA_VISIBLE_DEVICES to get each of this machine's GPUs."""
+    """Return a value of CUDA_VISIBLE_DEVICES for each of this machine's GPUs."""
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:
         return [name for name in chosen.split(",") if name.strip()]

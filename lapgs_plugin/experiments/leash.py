@@ -1,8 +1,8 @@
-"""A command that does not outlive whoever asked for it: `python -m lapgs_plugin.experiments.leash CORES COMMAND...`
+"""Run a command that ends with the process that started it: `python -m lapgs_plugin.experiments.leash CORES COMMAND...`
 
-Its standard input is a pipe that the worker holds open. When the worker ends, however it ends, the pipe closes and the
-command and all that it started are killed: a run that goes on without a worker would write over the files of the next
-attempt and use a GPU that others time their runs on. CORES are processor numbers separated by commas, or - for all.
+The worker holds this process's standard input open. When the worker ends in any way, the pipe closes, and the command
+and all its children are killed. Otherwise they would overwrite the next attempt's files and use a GPU on which other
+runs are timed. CORES are processor numbers separated by commas, or - for all.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def main() -> int:
 
 
 def _kill_when_released(child: subprocess.Popen[bytes]) -> None:
-    while os.read(sys.stdin.fileno(), 1):  # unbuffered: a buffer's lock would be in the way when this process ends
+    while os.read(sys.stdin.fileno(), 1):  # unbuffered, because a buffer's lock would block the end of this process
         pass
     if sys.platform == "win32":
         child.kill()

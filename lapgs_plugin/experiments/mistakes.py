@@ -1,4 +1,4 @@
-"""Collects everything that is wrong with an experiment, so that it is said at once and before anything is written."""
+"""Collect all mistakes of an experiment, to report them together before anything is written."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.experiments.expansion import PlannedRun, Selection
-from lapgs_plugin.experiments.schema import Experiment, one_line
+from lapgs_plugin.experiments.schema import Experiment, ExperimentError
 
 
 class Mistakes:
-    """The mistakes of one experiment file, each one line: file, key path, value, what was expected.
+    """The mistakes of one experiment file, each one line: file, key, value, expectation.
 
     Args:
         file: the experiment file.
@@ -25,37 +25,37 @@ class Mistakes:
         self._lines: dict[str, None] = {}
 
     def add(self, key: str, message: str) -> None:
-        """Note a mistake; the same one only once, however many runs make it."""
-        self._lines[one_line(f"{self._file}: {key}: {message}")] = None
+        """Add a mistake; a repeated one is kept once."""
+        self._lines[f"{self._file}: {key}: {message}"] = None
 
     @contextmanager
     def at(self, key: str) -> Iterator[None]:
-        """Note the error that ends the block, if one does."""
+        """Add the error that ends the block, if any."""
         try:
             yield
         except LapgsError as error:
             self.add(key, str(error))
 
     def refuse(self) -> None:
-        """Say all of them.
+        """Raise all mistakes as one error.
 
         Raises:
-            UserInputError: there is any.
+            ExperimentError: there are mistakes.
         """
         if self._lines:
-            raise UserInputError("\n".join(self._lines))
+            raise ExperimentError(self._lines)
 
 
 def scene_key(experiment: Experiment, name: str) -> str:
-    """Where the file names a scene."""
+    """Return the key of a scene in the file."""
     number = next(i for i, entry in enumerate(experiment.scenes) if name in entry.names)
     return f"scenes.{number} ({name})"
 
 
 def keys_of(experiment: Experiment, selection: Selection, run: PlannedRun) -> dict[str, str]:
-    """Where the file, or the command line, says what a run is: by the name of an option, the key path and its value.
+    """Return the keys in the file, or on the command line, that define a run: by option, the key and its value.
 
-    "run" is the key of the whole run, "scene" of its scene.
+    "run" is the key of the whole run, "scene" that of its scene.
     """
     spec = run.spec
     scene = next(i for i, entry in enumerate(experiment.scenes) if spec.scene in entry.names)

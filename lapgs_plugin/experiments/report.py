@@ -1,14 +1,14 @@
-"""report.html of an experiment: its tables, what training took and how views look, as one page that needs no network.
+"""Write report.html of an experiment: tables, time and views, as one page that needs no network.
 
-It is made of the files that `lapgs bench` leaves: results.csv, tables.md and run folders, some of which may be gone.
+Reads the files that `lapgs bench` writes: results.csv, tables.md and run folders. Missing run folders are left out.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from markdown_it import MarkdownIt
@@ -18,7 +18,7 @@ from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import Bar, BarChart, Chart, Move, draw_bars, draw_moves
+from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import (
     MeasuredRun,
@@ -37,16 +37,16 @@ from lapgs_plugin.untrusted import read_text, shortened
 
 TEMPLATE = "experiment.html.jinja"
 COLORS = 8
-"""Styles of lines and arrows; later variants share them."""
+"""Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
     "weighted_gaussians": "Gaussians, mean of levels by iterations",
     "mean_gaussians": "Gaussians at once, mean of iterations",
     "gaussians": "Gaussians to render",
 }
-"""Columns that say how many Gaussians there were: the first that all rows have is charted."""
+"""Columns with numbers of Gaussians; the first that all rows have is drawn."""
 
 NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
-"""Columns that every row has: text and numbers."""
+"""Columns with text and with numbers that every row has."""
 
 Row = Mapping[str, Any]
 
@@ -56,13 +56,13 @@ class Part:
     """One scene on one backbone.
 
     Attributes:
-        title: of both.
-        charts: what training recorded, see `report.training_charts`.
-        names: of variants, by the style of their lines.
+        title: names of both.
+        charts: charts of training, see `report.training_charts`.
+        names: variants by the style of their lines.
         strips: views of a variant beside the baseline.
         view_columns, view_rows: see `report.view_table`.
-        compared: whose views these are, in words.
-        notes: what could not be shown, and why.
+        compared: the variants that the views compare, in words.
+        notes: parts that could not be shown, with the reason.
     """
 
     title: str
@@ -77,11 +77,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Results:
-    """What an experiment left.
+    """The results of an experiment.
 
     Attributes:
-        folder: of the experiment.
-        rows: of results.csv, in its order.
+        folder: the experiment's folder.
+        rows: rows of results.csv, in order.
     """
 
     folder: Path
@@ -89,10 +89,10 @@ class Results:
 
     @classmethod
     def read(cls, folder: Path) -> Results:
-        """The results in a folder of `lapgs bench`.
+        """Read the results in a folder of `lapgs bench`.
 
         Raises:
-            RunFolderError: there are none, or they cannot be read.
+            RunFolderError: they are missing, or cannot be read.
         """
         path = folder / CSV
         try:
@@ -115,25 +115,25 @@ class Results:
 
     @property
     def variants(self) -> list[str]:
-        """In the experiment's order."""
+        """Variants in the experiment's order."""
         return list(dict.fromkeys(row["variant"] for row in self.rows))
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Scene and backbone of all rows."""
+        """Pairs of scene and backbone."""
         return list(dict.fromkeys((row["scene"], row["backbone"]) for row in self.rows))
 
     def of(self, scene: str, backbone: str, variant: str) -> list[Row]:
-        """All seeds of a variant."""
+        """Return the rows of a variant, one for each seed."""
         wanted = (scene, backbone, variant)
         return [row for row in self.rows if (row["scene"], row["backbone"], row["variant"]) == wanted]
 
     def baseline(self, backbone: str) -> str:
-        """What the others are compared with on a backbone."""
+        """Return the variant that others on a backbone are compared with."""
         return str(next(row["baseline"] for row in self.rows if row["backbone"] == backbone))
 
     def style(self, variant: str) -> str:
-        """Of its lines and arrows."""
+        """Return the style of a variant's lines and arrows."""
         return f"variant-{self.variants.index(variant) % COLORS}"
 
     def title(self, scene: str, backbone: str) -> str:
@@ -145,11 +145,11 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
     """Write FOLDER/report.html.
 
     Args:
-        folder: of an experiment that was run by `lapgs bench`.
-        device, rasterizer: what renders the pictures, see `rendering.run.run_renderer`.
+        folder: folder of `lapgs bench`.
+        device, rasterizer: see `rendering.run.run_renderer`.
 
     Returns:
-        The file.
+        The path of the page.
 
     Raises:
         RunFolderError: there are no results, or the file cannot be written.
@@ -162,7 +162,7 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         tables=tables,
         variants={name: results.style(name) for name in results.variants},
         num_runs=len({row["run"] for row in results.rows}),
-        moves=_moves(results),
+        arrows=_time_arrows(results),
         breakdown=_breakdown(results),
         overhead=_overhead(results),
         parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
@@ -172,7 +172,7 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
 
 
 def _tables(path: Path) -> tuple[str, str]:
-    """The experiment's title, and its tables as HTML."""
+    """Return the experiment's title, and its tables as HTML."""
     if not path.is_file():
         return "", ""
     advice = "write it again with `lapgs bench` and --tables-only"
@@ -184,7 +184,7 @@ def _tables(path: Path) -> tuple[str, str]:
 
 
 def _machines(results: Results) -> list[str]:
-    """Where it was measured and with what."""
+    """Describe machines and versions."""
     found = {
         ", ".join(str(row[name]) for name in ("gpu", "processor") if row.get(name))
         + f": lapgs_plugin {row.get('lapgs_version', '?')}, PyTorch {row.get('torch', '?')}"
@@ -196,10 +196,10 @@ def _machines(results: Results) -> list[str]:
 # All scenes and backbones together.
 
 
-def _moves(results: Results) -> Chart | None:
-    """Time against Gaussians: arrows from every baseline to every other variant, means over the seeds."""
+def _time_arrows(results: Results) -> Chart | None:
+    """Draw time against Gaussians: arrows from every baseline to every other variant, means over the seeds."""
     column = next(name for name in COUNTS if all(name in row for row in results.rows))
-    moves = []
+    arrows = []
     for scene, backbone in results.pairs:
         base = results.baseline(backbone)
         start = _point(results.of(scene, backbone, base), column)
@@ -207,45 +207,45 @@ def _moves(results: Results) -> Chart | None:
             end = _point(results.of(scene, backbone, variant), column)
             if variant != base and start is not None and end is not None:
                 label = f"{results.title(scene, backbone)}: {base} to {variant}"
-                moves.append(Move(results.style(variant), label, start, end))
-    if not moves:
+                arrows.append(Arrow(results.style(variant), label, start, end))
+    if not arrows:
         return None
-    return draw_moves(
-        "Optimization (s) against Gaussians", COUNTS[column], moves, format_x=count_text, format_y=count_text
+    return draw_arrows(
+        "Optimization (s) against Gaussians", COUNTS[column], arrows, format_x=count_text, format_y=count_text
     )
 
 
 def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
     if not rows:
         return None
-    return _mean(row[column] for row in rows), _mean(row["train_seconds"] for row in rows)
+    return fmean(row[column] for row in rows), fmean(row["train_seconds"] for row in rows)
 
 
 def _breakdown(results: Results) -> BarChart | None:
-    """Milliseconds an iteration by part, means over scenes and seeds."""
+    """Draw milliseconds an iteration by part, means over scenes and seeds."""
     names = {f"{part}_ms": part for part in PARTS}
     return _bars(results, "An iteration", names, lambda value: f"{value:.3g} ms")
 
 
 def _overhead(results: Results) -> BarChart | None:
-    """Seconds beside the optimization, means over scenes and seeds."""
+    """Draw seconds of overhead, means over scenes and seeds."""
     columns = dict.fromkeys(name for row in results.rows for name in row)
     names = {
         column: column.removeprefix("overhead_").removesuffix("_seconds")
         for column in columns
         if column.startswith("overhead_") and column != "overhead_seconds"
     }
-    return _bars(results, "Beside the optimization", names, seconds_text)
+    return _bars(results, "Overhead", names, seconds_text)
 
 
 def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable[[float], str]) -> BarChart | None:
-    """A bar for each variant on each backbone that has any of these columns."""
+    """Draw a bar for each variant on each backbone that has any of these columns."""
     bars = []
     for backbone in dict.fromkeys(row["backbone"] for row in results.rows):
         for variant in results.variants:
             rows = [row for row in results.rows if (row["backbone"], row["variant"]) == (backbone, variant)]
             parts = [
-                (name, _mean(row.get(column, 0.0) for row in rows))
+                (name, fmean(row.get(column, 0.0) for row in rows))
                 for column, name in names.items()
                 if any(column in row for row in rows)
             ]
@@ -254,16 +254,11 @@ def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable
     return draw_bars(title, bars, format_value=text) if bars else None
 
 
-def _mean(values: Iterator[float]) -> float:
-    listed = list(values)
-    return math.fsum(listed) / len(listed)
-
-
 # One scene on one backbone.
 
 
 def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> Part:
-    """The first seed of every variant."""
+    """Show the first seed of every variant."""
     runs: dict[str, MeasuredRun] = {}
     notes = []
     for variant in results.variants:
@@ -297,10 +292,10 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:
-    """A run's folder, inside that of the experiment wherever that is now.
+    """Open a run's folder inside the experiment's folder.
 
     Raises:
-        RunFolderError: it is gone or damaged.
+        RunFolderError: it is missing or damaged.
     """
     path = folder / RUNS / str(row["run"])
     archive = RunArchive.open(path / IMPORTED if (path / IMPORTED).is_dir() else path)

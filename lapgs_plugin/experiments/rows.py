@@ -1,15 +1,15 @@
-"""From a finished run's folder to its row of results: flat, one value a column, units in the column's name.
+"""Make the row of results of a finished run: flat, one value a column, units in the column's name.
 
-    run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    what it is of
-    psnr, ssim, lpips_*, fps            and every other single figure of metrics.json
-    measured_by                         "lapgs eval" or "training": who measured the images
+    run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    settings
+    psnr, ssim, lpips_*, fps            and every other number of metrics.json
+    measured_by                         "lapgs eval" or "training": origin of the image metrics
     train_seconds, overhead_seconds, overhead_<what>_seconds, wall_seconds
-    gaussians, gaussians_level_<l>      in the archived fields; peak_gaussians, mean_gaussians while training
+    gaussians, gaussians_level_<l>      of the archived fields; peak_gaussians, mean_gaussians during training
     peak_memory_bytes, peak_memory_without_images_bytes    on a GPU
-    <part>_ms, iteration_ms             milliseconds an iteration, where --breakdown measured them
+    <part>_ms, iteration_ms             milliseconds an iteration, with --breakdown
     lapgs_version, torch, gpu, processor, host, python, started, attempt, folder
 
-A row lacks what was not measured.
+A row has no columns for values that were not measured.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runs.archive import LevelRecord, RunArchive, read_bare_record
+from lapgs_plugin.runs.training_figures import training_figures
 
-NOTED = ("psnr", "ssim")
-"""What training itself notes of its images."""
+LOGGED_METRICS = ("psnr", "ssim")
+"""Image metrics that training records itself."""
 SINGLE = ("peak_gaussians", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes")
-"""Figures of training that are columns as they are, where they were measured."""
+"""Figures of training that become columns unchanged, if they were measured."""
 EVALUATED, RECORDED = "lapgs eval", "training"
 
 
 def result_row(job: Job) -> dict[str, Any]:
-    """The figures of a finished run; `worker` adds where and when it ran.
+    """Return the figures of a finished run; `worker` adds time and machine.
 
     Raises:
-        RunFolderError: the run's folder lacks what its commands should have written.
+        RunFolderError: the run's folder lacks files that its commands should have written.
     """
     folder = measured_folder(job.spec, Path(job.folder))
     row = {**_identity(job.spec, job.run_id), "measured_by": EVALUATED if job.evaluate else RECORDED}
@@ -48,7 +48,7 @@ def result_row(job: Job) -> dict[str, Any]:
     archive = RunArchive.open(folder)
     manifest = archive.manifest
     if not manifest.complete:
-        raise RunFolderError(f"{folder} is not complete, though its command ended well; look at {job.log}")
+        raise RunFolderError(f"{folder} is not complete, although its command succeeded; look at {job.log}")
     return {**row, **_figures_of_records(manifest.records), **_image_figures(archive, job.evaluate)}
 
 
@@ -65,20 +65,20 @@ def _identity(spec: RunSpec, run_id: str) -> dict[str, Any]:
 
 
 def _image_figures(archive: RunArchive, evaluate: bool) -> dict[str, Any]:
-    """How good its images are."""
+    """Return the image metrics of `lapgs eval`, or the last ones that training recorded."""
     if not evaluate:
-        noted = [entry for entry in archive.history() if entry.get("psnr") is not None]
-        return {name: noted[-1][name] for name in NOTED if name in noted[-1]} if noted else {}
+        logged = [entry for entry in archive.history() if entry.get("psnr") is not None]
+        return {name: logged[-1][name] for name in LOGGED_METRICS if name in logged[-1]} if logged else {}
     metrics = archive.metrics()
     if metrics is None:
-        raise RunFolderError(f"{archive.path()} has no metrics.json, though `lapgs eval` ended well; run it again")
+        raise RunFolderError(f"{archive.path()} has no metrics.json, although `lapgs eval` succeeded; run it again")
     return {
         name: value for name, value in metrics.items() if isinstance(value, (int, float, str)) and name != "rasterizer"
     }
 
 
 def _figures_of_records(records: Sequence[LevelRecord]) -> dict[str, Any]:
-    """What the manifest says about training."""
+    """Return the figures of training."""
     figures = training_figures(records)
     overhead, parts, counts = (figures[name] for name in ("overhead_seconds", "breakdown_seconds", "num_gaussians"))
     row: dict[str, Any] = {
@@ -97,7 +97,7 @@ def _figures_of_records(records: Sequence[LevelRecord]) -> dict[str, Any]:
 
 
 def _bare_figures(folder: Path) -> dict[str, Any]:
-    """What was noted while a script ran by itself."""
+    """Return the recorded figures of a script that ran by itself."""
     values = read_bare_record(folder / BARE_RECORD)
     count = values["num_gaussians"]
     row = {
@@ -106,7 +106,7 @@ def _bare_figures(folder: Path) -> dict[str, Any]:
         "gaussians_level_0": count,
         **{name: values[name] for name in ("peak_gaussians", "mean_gaussians")},
     }
-    row |= {name: values[name] for name in NOTED if name in values}
+    row |= {name: values[name] for name in LOGGED_METRICS if name in values}
     if memory := values["memory_bytes"]:
         row["peak_memory_bytes"] = memory["peak"]
         row["peak_memory_without_images_bytes"] = memory["peak"] - memory["images"]

@@ -1,4 +1,4 @@
-"""An experiment from its file to its finished results: prepared, launched, followed, reported."""
+"""Prepare the runs of an experiment, and follow them until they have ended."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.commands import Places, run_steps
+from lapgs_plugin.experiments.commands import Locations, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec, Selection
 from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
 from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.store import DONE, FAILED, PATIENCE, Job, Outcome, ResultStore
+from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
 MISSING = Path("SCENE")
-"""Stands for a scene that is missing in commands that are only checked."""
-LOOK_EVERY = 0.5
-"""Seconds between two looks at the store."""
+"""Placeholder for a missing scene in commands that are only checked."""
+POLL_SECONDS = 0.5
+"""Seconds between two checks of the store."""
 
 
 @dataclass(frozen=True)
 class Folder:
-    """Where everything of an experiment is kept."""
+    """The folder of an experiment."""
 
     path: Path
 
@@ -40,33 +40,33 @@ class Folder:
 def prepare(
     planned: Sequence[PlannedRun],
     scenes: Sequence[SceneSpec],
-    places: Places,
+    places: Locations,
     folder: Folder,
     evaluate: Sequence[str] | None,
     experiment: Experiment,
     selection: Selection,
     mistakes: Mistakes,
 ) -> tuple[list[Job], dict[str, tuple[SceneSpec, Path]]]:
-    """Make the jobs of all runs that are different, in their order.
+    """Make the jobs of all distinct runs, in order.
 
     Args:
         planned: the runs.
-        scenes: that they are trained on.
-        places: where scenes and checkouts lie.
-        folder: of the experiment.
+        scenes: their scenes.
+        places: folders of scenes and checkouts.
+        folder: the experiment's folder.
         evaluate: options of `lapgs eval`; None leaves it out.
-        experiment, selection: that the runs come from.
-        mistakes: gets scenes and checkouts that are missing, and what a checkout's script cannot be told.
+        experiment, selection: the source of the runs.
+        mistakes: receives missing scenes and checkouts, and resolutions that a checkout's script cannot read.
 
     Returns:
-        The jobs, without those whose checkout, or whose scene for a checkout, is missing; and by name the scenes that
-        are there, each with its folder.
+        The jobs, except those whose checkout, or whose scene for a checkout, is missing; and the scenes that exist, by
+        name, with their folders.
     """
     where: dict[str, tuple[SceneSpec, Path]] = {}
     for scene in scenes:
         with mistakes.at(scene_key(experiment, scene.name)):
             _check_sample(scene)
-            where[scene.name] = (scene, _sample(scene, folder) if scene.sample else places.scene(scene))
+            where[scene.name] = (scene, _sample_folder(scene, folder) if scene.sample else places.scene(scene))
     checkouts: dict[str, Path] = {}
     for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
         with mistakes.at(f"backbones.{key}.checkout"):
@@ -87,10 +87,10 @@ def prepare(
 
 
 def _check_sample(scene: SceneSpec) -> None:
-    """Refuse what no sample scene can be made of.
+    """Refuse options that no sample scene can have.
 
     Raises:
-        UserInputError: its size, views or points.
+        UserInputError: the size, the views or the points are out of range.
     """
     if scene.sample is None:
         return
@@ -101,27 +101,27 @@ def _check_sample(scene: SceneSpec) -> None:
 
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
-    """Make the sample scenes that are not there yet; one process at a time.
+    """Make the sample scenes that do not exist yet, in one process at a time.
 
     Raises:
-        RunFolderError: another process holds the folder and does not come to an end.
+        RunFolderError: another process locks the folder for too long.
     """
-    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample(scene, folder).is_dir()]
+    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample_folder(scene, folder).is_dir()]
     if not missing:
         return
-    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs what reads scenes
+    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs packages that read scenes
 
     place = folder.path.absolute() / SCENES
     with one_line_errors(place):
         place.mkdir(parents=True, exist_ok=True)
-    lock = _waited_for(place)
+    lock = _wait_for_lock(place)
     try:
         for scene, sample in missing:
-            if _sample(scene, folder).is_dir():  # another process made it meanwhile
+            if _sample_folder(scene, folder).is_dir():  # another process made it meanwhile
                 continue
             width, height = parse_size(sample.size)
             make_sample_scene(
-                _sample(scene, folder),
+                _sample_folder(scene, folder),
                 width=width,
                 height=height,
                 views=sample.views,
@@ -132,38 +132,38 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
         lock.release()
 
 
-def _waited_for(place: Path) -> FolderLock:
-    """The lock of a folder that another process may have for a while."""
-    end = time.monotonic() + PATIENCE
+def _wait_for_lock(place: Path) -> FolderLock:
+    """Wait for the lock of a folder."""
+    end = time.monotonic() + LOCK_TIMEOUT
     while True:
         try:
             return FolderLock.acquire(place)
         except RunFolderError:
             if time.monotonic() > end:
                 raise
-        time.sleep(LOOK_EVERY)
+        time.sleep(POLL_SECONDS)
 
 
-def _sample(scene: SceneSpec, folder: Folder) -> Path:
+def _sample_folder(scene: SceneSpec, folder: Folder) -> Path:
     return folder.path.absolute() / SCENES / scene.name
 
 
 def execute(
-    store: ResultStore, run_ids: Sequence[str], start: Callable[[], Launcher], say: Callable[[Outcome], None]
+    store: ResultStore, run_ids: Sequence[str], start: Callable[[], Launcher], on_end: Callable[[Outcome], None]
 ) -> list[Outcome]:
-    """Have all runs done, by workers of one's own and by whoever else works on the same store.
+    """Wait until all runs have ended, done by own workers or by others on the same store.
 
     Args:
-        store: that has them.
+        store: the store of the runs.
         run_ids: the runs.
-        start: starts workers; again when a worker of somebody else's died and left a run.
-        say: told of every run that ends meanwhile.
+        start: starts workers; called again when another process's worker died and left a run.
+        on_end: called for every run that ends.
 
     Returns:
-        All runs as they are in the end, each done or failed.
+        All runs, each done or failed.
 
     Raises:
-        UserInputError: workers end without doing anything.
+        UserInputError: workers end without finishing a run.
     """
     known = {outcome.run_id for outcome in store.outcomes(run_ids) if _ended(outcome)}
 
@@ -172,7 +172,7 @@ def execute(
         for outcome in outcomes:
             if _ended(outcome) and outcome.run_id not in known:
                 known.add(outcome.run_id)
-                say(outcome)
+                on_end(outcome)
         return outcomes
 
     while not all(_ended(outcome) for outcome in look()):
@@ -181,16 +181,16 @@ def execute(
             launcher = start()
             try:
                 while launcher.running():
-                    time.sleep(LOOK_EVERY)
+                    time.sleep(POLL_SECONDS)
                     look()
                 look()
-                if len(known) == before and (troubles := launcher.troubles()):
+                if len(known) == before and (failures := launcher.failures()):
                     raise UserInputError(
-                        f"workers end without finishing a run: {troubles[0]}; the runs wait in the store"
+                        f"workers end without finishing a run: {failures[0]}; the runs wait in the store"
                     )
             finally:
                 launcher.stop()
-        time.sleep(LOOK_EVERY)
+        time.sleep(POLL_SECONDS)
     return store.outcomes(run_ids)
 
 

@@ -1,54 +1,56 @@
-"""What an experiment file may say, and reading one."""
+"""Read and check experiment files."""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, Hierarchy
+from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 
 T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 Options = dict[str, bool | int | float | str]
-"""Options of `lapgs train` or `lapgs run` by name, without dashes in front and with underscores inside."""
-RESIDUAL_OPTIONS = {
-    **{"supervision": "reconstructed", "inherit": None, "joint": 0.0, "residual_color_rate": None},
-    **{"residual_resets": False, "residual_threshold": 1.0, "base_sh_degree": None},
-}
-"""Those that only residuals have, and what of them says no more than leaving them out; None where nothing does."""
+"""Options of `lapgs train` or `lapgs run` by name, without leading dashes and with underscores."""
 
 
-class _Part(BaseModel):
-    """Every table of the file: unknown keys are errors, and 3 is no text."""
+class ExperimentError(UserInputError):
+    """Mistakes in an experiment file, one line each."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        Exception.__init__(self, "\n".join(map(one_line, lines)))
+
+
+class _StrictModel(BaseModel):
+    """Base of all tables of the file: unknown keys are errors, and numbers are not converted to text."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class SampleScene(_Part):
-    """A scene made by `lapgs sample` before the first run; its options."""
+class SampleScene(_StrictModel):
+    """Options of `lapgs sample` for a scene that is made before the first run."""
 
     size: str = "480x320"
     views: int = Field(40, ge=2)
     points: int = Field(4000, ge=1)
 
 
-class Scenes(_Part):
-    """One `[[scenes]]`: a standard data set, a folder of one's own, or the sample scene.
+class Scenes(_StrictModel):
+    """One `[[scenes]]` table: a standard data set, a folder, or the sample scene.
 
     Attributes:
-        dataset: name of a standard data set; `only` picks some of its scenes.
-        name: of a scene of one's own; its folder is `path`, relative to the experiment file, or given with --path.
-        sample: makes a sample scene of that `name` instead of reading one.
-        resolution: as `lapgs train --resolution`.
-        images: name of the image folder; "downscaled" is the folder that the data set keeps smaller copies in.
+        dataset: name of a standard data set; `only` selects some of its scenes.
+        name: name of another scene; its folder is `path`, relative to the experiment file, or given with --path.
+        sample: make a sample scene of that `name`.
+        resolution: see `lapgs train --resolution`.
+        images: name of the image folder; "downscaled" is the data set's folder of smaller copies.
     """
 
     dataset: str | None = None
@@ -70,29 +72,29 @@ class Scenes(_Part):
                 known = DATASETS[self.dataset].scenes if self.dataset else ()
                 raise ValueError(f"only {scene!r}: expected scenes of the data set ({', '.join(known)})")
         if self.images == "downscaled" and self.dataset is None:
-            raise ValueError('images = "downscaled" is known of data sets alone; name the folder')
+            raise ValueError('images = "downscaled" is only for data sets; name the folder')
         if self.sample is not None and (self.dataset is not None or self.path is not None):
-            raise ValueError("a sample scene has a name alone, no dataset and no path")
+            raise ValueError("a sample scene has only a name, no dataset and no path")
         return self
 
     @property
     def names(self) -> list[str]:
-        """Its scenes, in their order."""
+        """Names of its scenes, in order."""
         if self.dataset is None:
             return [self.name or ""]
         return self.only or list(DATASETS[self.dataset].scenes)
 
 
-class Backbone(_Part):
-    """One `[backbones.NAME]`: the built-in trainer on a rasterizer, or a checkout.
+class Backbone(_StrictModel):
+    """One `[backbones.NAME]` table: the built-in trainer with a rasterizer, or a checkout.
 
     Attributes:
-        title: in tables; NAME when it is not given.
-        rasterizer: of `lapgs train`: gsplat, cpu, auto, ...
-        checkout: name under which --path or an environment variable gives the checkout's folder.
+        title: its name in tables; NAME by default.
+        rasterizer: rasterizer of `lapgs train`: gsplat, cpu, auto, ...
+        checkout: name of the checkout, whose folder is given by --path or an environment variable.
         preset: published options for the scenes of standard data sets, a name in data/presets.toml.
-        arguments: of the checkout's script, for every run; what is named here wins over the preset.
-        options: of `lapgs train` for every run, or of `lapgs run` for every hierarchy.
+        arguments: arguments of the checkout's script for every run; they override the preset.
+        options: options of `lapgs train` for every run, or of `lapgs run` for every hierarchy.
     """
 
     title: str = ""
@@ -114,23 +116,23 @@ class Backbone(_Part):
 
     @property
     def command(self) -> str:
-        """The `lapgs` command that trains it as a hierarchy."""
+        """The `lapgs` command that trains a hierarchy on it."""
         return "train" if self.checkout is None else "run"
 
 
-class Variant(_Part):
-    """One `[[variants]]`: a setting that every scene is trained with.
+class Variant(_StrictModel):
+    """One `[[variants]]` table: a setting that every scene is trained with.
 
     Attributes:
-        name: in tables.
-        method: "hierarchy", or "bare": the checkout's script by itself, or one level of the built-in trainer.
-        backbones: those that it is trained on; empty means all.
-        iterations, resolution: instead of the experiment's and the scene's.
-        options: of `lapgs train` or `lapgs run`, over those of the backbone.
-        arguments: of the checkout's script, after those of the backbone.
-        section: heading in tables above this row.
+        name: its name in tables.
+        method: "hierarchy"; or "bare": the checkout's script by itself, or one level of the built-in trainer.
+        backbones: backbones that it is trained on; empty means all.
+        iterations, resolution: override those of the experiment and of the scene.
+        options: options of `lapgs train` or `lapgs run`; they override those of the backbone.
+        arguments: arguments of the checkout's script, after those of the backbone.
+        section: heading above this row in tables.
         paper: row of the paper's table, or one for each backbone.
-        baseline: what other variants on the same backbone are compared with.
+        baseline: whether other variants on the same backbone are compared with it.
     """
 
     name: str
@@ -145,18 +147,18 @@ class Variant(_Part):
     baseline: bool = False
 
     def paper_row(self, backbone: str) -> str:
-        """Name of the row that the paper prints for it, "" when it prints none."""
+        """Return the name of its row in the paper's table, "" without one."""
         return self.paper if isinstance(self.paper, str) else self.paper.get(backbone, "")
 
 
-class Table(_Part):
-    """`[table]`: how results are shown.
+class Table(_StrictModel):
+    """The `[table]` table: how results are shown.
 
     Attributes:
         paper: the paper's table, a file in data/paper.
-        columns: of `aggregate.COLUMNS`.
-        transposed: one column a variant.
-        by_scene: also a table for each scene.
+        columns: names in `aggregate.COLUMNS`.
+        transposed: show each variant as a column.
+        by_scene: add a table for each scene.
     """
 
     paper: str | None = None
@@ -165,12 +167,12 @@ class Table(_Part):
     by_scene: bool = False
 
 
-class Experiment(_Part):
-    """A whole file."""
+class Experiment(_StrictModel):
+    """A whole experiment file."""
 
     name: str = Field(pattern=NAME)
     title: str
-    iterations: int = Field(30_000, ge=1)
+    iterations: int = Field(REFERENCE_ITERATIONS, ge=1)
     seeds: list[int] = Field([0], min_length=1)
     scenes: list[Scenes] = Field(min_length=1)
     backbones: dict[str, Backbone] = Field(min_length=1)
@@ -184,12 +186,12 @@ class Experiment(_Part):
         return self
 
     def _repetitions(self) -> Iterator[str]:
-        if (twice := _twice([variant.name for variant in self.variants])) is not None:
+        if (twice := _first_duplicate([variant.name for variant in self.variants])) is not None:
             yield f"variants: two variants are called {twice!r:.80}; expected different names"
-        if (twice := _twice([name for entry in self.scenes for name in entry.names])) is not None:
-            yield f"scenes: scene {twice!r} is there twice; a variant may have a resolution of its own instead"
-        if (seed := _twice(self.seeds)) is not None:
-            yield f"seeds: {seed} is there twice, which would count its runs twice; expected different seeds"
+        if (twice := _first_duplicate([name for entry in self.scenes for name in entry.names])) is not None:
+            yield f"scenes: scene {twice!r} is listed twice; a variant may have its own resolution instead"
+        if (seed := _first_duplicate(self.seeds)) is not None:
+            yield f"seeds: {seed} is listed twice, which would count its runs twice; expected different seeds"
 
     def _unknown_backbones(self) -> Iterator[str]:
         for number, variant in enumerate(self.variants):
@@ -201,7 +203,7 @@ class Experiment(_Part):
                 )
 
     def _without_effect(self) -> Iterator[str]:
-        """What would change nothing."""
+        """Find settings that change nothing."""
         for number, variant in enumerate(self.variants):
             names = [name for name in variant.backbones or self.backbones if name in self.backbones]
             checkouts = [self.backbones[name].checkout is not None for name in names]
@@ -209,9 +211,9 @@ class Experiment(_Part):
             if variant.method == "bare" and "levels" in variant.options:
                 yield f"{where} is bare, which is one level; leave levels out"
             if variant.method == "bare" and variant.options and all(checkouts):
-                yield f"{where} is bare: options of `lapgs run` mean nothing; set the script's arguments"
+                yield f"{where} is bare: options of `lapgs run` have no effect; set the script's arguments"
             if variant.arguments and not any(checkouts):
-                yield f"{where} has arguments, but no script of a checkout to give them to"
+                yield f"{where} has arguments, but no checkout whose script takes them"
 
 
 PARTS: Mapping[str, type[BaseModel]] = {
@@ -223,9 +225,9 @@ PARTS: Mapping[str, type[BaseModel]] = {
 }
 """The model behind each key that holds tables."""
 LONGEST_LINE = 1000
-"""Characters of one mistake."""
+"""Most characters of one mistake's line."""
 ALTERNATIVES = ("bool", "int", "float", "str", "dict[str,str]")
-"""What pydantic calls the types of a value that may be one of several."""
+"""Pydantic's names for the alternative types of a value."""
 
 
 def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experiment:
@@ -236,10 +238,11 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
         option_names: by command, "train" and "run", the options that an experiment may set.
 
     Raises:
-        UserInputError: it is not readable, not TOML, or says something that no experiment may say: a line for each
-            mistake, which names the key, and for an unknown one the nearest that is known.
+        UserInputError: it cannot be read, is not TOML, or has mistakes: one line for each, which names the key, and for
+            an unknown key the nearest known one.
     """
-    values = read_toml(path, advice="give an experiment file such as smoke.toml")
+    # The commands refuse numbers that are not finite, and name the option.
+    values = read_toml(path, advice="give an experiment file such as smoke.toml", finite=False)
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:
@@ -247,32 +250,32 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     else:
         problems = _option_problems(experiment, option_names)
     if problems:
-        raise UserInputError("\n".join(one_line(f"{path}: {problem}") for problem in problems))
+        raise ExperimentError(f"{path}: {problem}" for problem in problems)
     return experiment
 
 
-def _twice(names: Sequence[T]) -> T | None:
-    """The first that is there more than once."""
+def _first_duplicate(names: Sequence[T]) -> T | None:
+    """Return the first item that occurs twice."""
     return next((name for name in names if names.count(name) > 1), None)
 
 
 def nearest(name: str, known: Set[str]) -> str:
-    """What to say of an unknown name: the nearest known one, or all of them."""
+    """Suggest the nearest known name, or list all of them."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(sorted(known))}"
 
 
 def one_line(text: str) -> str:
-    """The text on one line that is not endless, with what a terminal would obey spelled out."""
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    """Return the text as one line of limited length, with control characters escaped."""
+    line = printable(text)
     return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
 
 
 def _problems(error: ValidationError) -> list[str]:
-    """Pydantic's complaints, a line each; unknown keys first, and no missing key beside one that is misspelt."""
+    """Turn pydantic's errors into lines; a misspelt key is reported once, not also as a missing one."""
     found: dict[tuple[str, ...], list[Any]] = {}
     for problem in error.errors(include_url=False):
-        # Of a value that may be one of several types there is a complaint for each type, under the type's name.
+        # A value with alternative types has an error for each type, under the type's name.
         place = tuple(str(part) for part in problem["loc"] if part not in ALTERNATIVES)
         found.setdefault(place, []).append(problem)
     unknown = {place: _unknown_key(place) for place, each in found.items() if each[0]["type"] == "extra_forbidden"}
@@ -292,7 +295,7 @@ def _unknown_key(place: tuple[str, ...]) -> str:
 
 
 def _wrong_value(where: str, problems: list[Any]) -> list[str]:
-    """What is said of one value, or of what tables say together: there several mistakes may be in one complaint."""
+    """Report one wrong value, or the errors of a table, which may be several in one message."""
     received = problems[0]["input"]
     of_tables = problems[0]["type"] == "value_error" and isinstance(received, (dict, BaseModel))
     shown = "" if of_tables else f" = {received!r:.80}"
@@ -301,44 +304,21 @@ def _wrong_value(where: str, problems: list[Any]) -> list[str]:
 
 
 def _option_problems(experiment: Experiment, option_names: Mapping[str, Set[str]]) -> list[str]:
-    """What is wrong with options: every one has to be of the command that it will be given to."""
-    found: dict[str, str] = {}  # by place: what several commands do not have is said once
-    residual: dict[str, None] = {}
+    """Find options that the command of their runs does not have."""
+    found: dict[str, str] = {}  # by key, so that a mistake that concerns several commands is reported once
 
-    def check(where: str, options: Mapping[str, Any], command: str) -> bool:
-        unknown = [name for name in options if name not in option_names[command]]
-        for name in unknown:
-            place = f"{where}.options.{name}"
+    def check(where: str, options: Mapping[str, Any], command: str) -> None:
+        for name in options.keys() - option_names[command]:
+            key = f"{where}.options.{name}"
             found.setdefault(
-                place,
-                f"{place} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
+                key,
+                f"{key} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
                 f"experiment sets itself; {nearest(name, option_names[command])}",
             )
-        return not unknown
 
     for key, backbone in experiment.backbones.items():
-        known = check(f"backbones.{key}", backbone.options, backbone.command)
+        check(f"backbones.{key}", backbone.options, backbone.command)
         for number, variant in enumerate(experiment.variants):
-            if variant.backbones and key not in variant.backbones:
-                continue
-            if (
+            if key in (variant.backbones or [key]):
                 check(f"variants.{number}", variant.options, backbone.command)
-                and known
-                and (variant.method != "bare" or backbone.checkout is None)
-            ):
-                options = {**backbone.options, **variant.options}
-                where = f"variants.{number}: variant {variant.name!r} on backbone {key!r}"
-                residual.update(dict.fromkeys(_residual_problems(where, options)))
-    return list(found.values()) or list(residual)
-
-
-def _residual_problems(where: str, options: Mapping[str, Any]) -> list[str]:
-    """What the command would refuse of options about residuals."""
-    if options.get("hierarchy", DEFAULT_HIERARCHY.value) != Hierarchy.NESTED.value:
-        return []
-    return [
-        f"{where} sets {name} = {options[name]!r:.80}, which is about residuals, and nested levels have none; leave it "
-        f'out, or add hierarchy = "{Hierarchy.LAPLACIAN.value}" to train residuals'
-        for name, idle in RESIDUAL_OPTIONS.items()
-        if options.get(name, idle) != idle
-    ]
+    return [found[key] for key in sorted(found)]

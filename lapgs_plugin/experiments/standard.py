@@ -1,6 +1,6 @@
-"""What is known beforehand: standard data sets, options that backbones publish for them, figures that the paper prints.
+"""Load standard data sets, backbones' published options for them, and the figures of the paper.
 
-All of it is data, in data/datasets.toml, data/presets.toml and data/paper/*.csv.
+All of them are files in data/: datasets.toml, presets.toml and paper/*.csv.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lapgs_plugin.untrusted import read_toml
 
 DATA = Path(__file__).parent / "data"
 KEYS = ("dataset", "scene", "row")
-"""Columns of a paper table that say what its figures are of."""
+"""Columns of a paper table that identify a row."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Dataset:
     """A data set that papers report on.
 
     Attributes:
-        title: as papers write it.
-        scenes: its scenes in their usual order, each with the name of the folder of its smaller copies.
+        title: its name in papers.
+        scenes: its scenes in their usual order, each with the name of its folder of smaller images.
     """
 
     title: str
@@ -38,9 +38,9 @@ class Preset:
     """Options that a backbone publishes.
 
     Attributes:
-        source: where.
-        common: for every scene.
-        scenes: what is added, by scene.
+        source: where they are published.
+        common: options for every scene.
+        scenes: further options by scene.
     """
 
     source: str
@@ -48,17 +48,17 @@ class Preset:
     scenes: Mapping[str, tuple[str, ...]]
 
     def arguments(self, scene: str) -> list[str]:
-        """Of the backbone's script, for a scene; one that it says nothing about gets what is common."""
+        """Return the script's arguments for a scene; unknown scenes have the common ones."""
         return [*self.common, *self.scenes.get(scene, ())]
 
 
 @dataclass(frozen=True)
-class Printed:
-    """A figure, or one for each level, as the paper prints it.
+class PaperFigure:
+    """A figure of the paper, or one for each level.
 
     Attributes:
-        values: one, or one a level.
-        exact: whether it is of the very scenes that were asked for; else it is of the whole data set.
+        values: one, or one for each level, coarsest first.
+        exact: whether it is of exactly the requested scenes; otherwise it is of the whole data set.
     """
 
     values: tuple[float, ...]
@@ -66,7 +66,7 @@ class Printed:
 
     @property
     def value(self) -> float:
-        """All levels together."""
+        """Sum over the levels."""
         return math.fsum(self.values)
 
 
@@ -74,10 +74,10 @@ class PaperTable:
     """One table of the paper.
 
     Args:
-        name: of its file.
+        name: its file in data/paper.
 
     Raises:
-        UserInputError: there is none of that name.
+        UserInputError: there is no table of that name.
     """
 
     def __init__(self, name: str) -> None:
@@ -94,27 +94,27 @@ class PaperTable:
 
     @property
     def rows(self) -> set[str]:
-        """Names of its rows."""
+        """Names of the rows."""
         return {row for _, _, row in self._figures}
 
-    def figure(self, dataset: str, scenes: Collection[str], row: str, column: str) -> Printed | None:
-        """What is printed for some scenes of a data set, their mean where it prints them one by one.
+    def figure(self, dataset: str, scenes: Collection[str], row: str, column: str) -> PaperFigure | None:
+        """Return the figure for some scenes of a data set: their mean when they are printed one by one.
 
         Returns:
-            None where it prints nothing, neither for them nor for the whole data set.
+            None when neither they nor the whole data set are printed.
         """
         single = [self._figures.get((dataset, scene, row), {}).get(column) for scene in scenes]
         if len(single) == 1 and single[0] is not None:
-            return Printed(single[0], True)
+            return PaperFigure(single[0], True)
         whole = self._figures.get((dataset, "", row), {}).get(column)
         complete = dataset in DATASETS and set(scenes) == set(DATASETS[dataset].scenes)
         if whole is not None and complete:
-            return Printed(whole, True)
+            return PaperFigure(whole, True)
         values = [value for value in single if value is not None]
         if values and len(values) == len(scenes):
             levels = zip(*values, strict=True)
-            return Printed(tuple(math.fsum(level) / len(values) for level in levels), True)
-        return None if whole is None else Printed(whole, False)
+            return PaperFigure(tuple(math.fsum(level) / len(values) for level in levels), True)
+        return None if whole is None else PaperFigure(whole, False)
 
 
 def _figures(text: str) -> tuple[float, ...]:
@@ -145,6 +145,6 @@ def _presets() -> dict[str, Preset]:
 
 
 DATASETS = _datasets()
-"""By the name that experiments use."""
+"""Data sets by their names in experiments."""
 PRESETS = _presets()
-"""By backbone and name, such as "backbone.big"."""
+"""Presets by backbone and name, such as "backbone.big"."""

@@ -1,11 +1,11 @@
-"""Who runs what, and what came out: one SQLite file that several workers share, on one machine or on many.
+"""Store claims and results of runs in one SQLite file that workers share, on one machine or on many.
 
-A run is pending, running, done or failed. A worker claims one, renews its claim while the run lasts, and either
-records the run's row or its failure. A claim that is not renewed for `LEASE` seconds, or whose process is gone from
-this machine, is anybody's. What a worker records is taken only while the claim is still its own, so a worker that was
-suspended and comes back records nothing, and a run that is done is never run again.
+A run is pending, running, done or failed. A worker claims a run, renews its claim while the run lasts, and records the
+row of results or the failure. A claim is abandoned when it is not renewed for `LEASE` seconds, or when its process on
+this machine is gone; another worker may then take the run. A worker can only record while it holds the claim, so one
+that was suspended records nothing, and a finished run is not repeated.
 
-The journal is SQLite's default, not WAL, which does not work across machines on a network file system.
+The journal is SQLite's default, because WAL does not work across machines on a network file system.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from lapgs_plugin.untrusted import STRICT, parse_json
 
 FORMAT_VERSION = 1
 LEASE = 120.0
-"""Seconds that a claim holds without being renewed. Clocks of machines that share a store may differ by less."""
-MOST_CLAIMS = 3
-"""A run whose workers died this often is failed: it is probably what kills them."""
-PATIENCE = 60.0
-"""Seconds to wait for another process's transaction, which takes milliseconds."""
+"""Seconds that a claim lasts without renewal. Clocks of machines that share a store must differ by less."""
+MAX_CLAIMS = 3
+"""Claims after which a run fails, because it probably kills its workers."""
+LOCK_TIMEOUT = 60.0
+"""Seconds to wait for another process."""
 
 PENDING, RUNNING, DONE, FAILED = "pending", "running", "done", "failed"
 
@@ -59,15 +59,15 @@ CREATE TABLE runs (
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs to know of a run.
+    """The information that a worker needs for a run.
 
     Attributes:
-        run_id: of the run.
-        spec: what is trained.
-        folder: that it writes into.
-        log: file for what its commands print.
+        run_id: name of the run.
+        spec: settings of the run.
+        folder: output folder.
+        log: file for the output of its commands.
         steps: its commands.
-        evaluate: whether the last of them is `lapgs eval`.
+        evaluate: whether the last command is `lapgs eval`.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -80,7 +80,7 @@ class Job:
     evaluate: bool
 
     def attempt(self, number: int) -> Job:
-        """The same in a folder of its own: a worker that lost its claim may still be writing into the last one's."""
+        """Return the job in a separate folder: a worker that lost its claim may still write to the previous one."""
         if number == 1:
             return self
         folder, log = f"{self.folder}-attempt{number}", f"{self.log.removesuffix('.log')}-attempt{number}.log"
@@ -105,8 +105,8 @@ class Claim:
 
     Attributes:
         job: the run, in a folder of this attempt.
-        owner: who has it; no two claims have the same.
-        number: how often the run was claimed so far, this time included.
+        owner: unique name of the claim's holder.
+        number: number of claims of the run so far, with this one.
     """
 
     job: Job
@@ -119,10 +119,10 @@ class Outcome:
     """A run in the store.
 
     Attributes:
-        run_id: of the run.
+        run_id: name of the run.
         state: "pending", "running", "done" or "failed".
-        record: the row of a run that is done, else None.
-        error: why it failed, "" unless it did.
+        record: the row of a finished run, else None.
+        error: reason of a failure, else "".
     """
 
     run_id: str
@@ -132,15 +132,15 @@ class Outcome:
 
 
 class ResultStore:
-    """An experiment's results. Every method is one transaction; objects may be used by several threads.
+    """An experiment's results. Each method is one transaction; threads may share an object.
 
     All methods raise RunFolderError when the file cannot be read or written.
 
     Args:
-        path: the file; `create` makes one.
+        path: the file; `create` makes a new one.
 
     Raises:
-        RunFolderError: there is none, it is no store, or another version wrote it.
+        RunFolderError: the file is missing, is no store, or was written by another version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -157,11 +157,11 @@ class ResultStore:
 
     @classmethod
     def create(cls, path: Path) -> ResultStore:
-        """Open the store at `path`, after making it if there is none."""
+        """Open the store at `path`; make it if it does not exist."""
         if not path.is_file():
             with one_line_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                # Two processes may be here at once: each makes a whole file, and the second keeps the first's.
+                # Two processes may do this at once: each makes a whole file, and the second keeps the first's.
                 fresh = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
                 connection = sqlite3.connect(fresh)
                 try:
@@ -179,7 +179,7 @@ class ResultStore:
         return cls(path)
 
     def plan(self, jobs: Sequence[Job]) -> None:
-        """Put runs into the store in this order. Those done stay done; those failed get another chance."""
+        """Add runs in this order. Finished runs stay; failed runs become pending again."""
         with self._transaction() as connection:
             for position, job in enumerate(jobs):
                 values = (job.run_id, position, json.dumps(asdict(job.spec)), job.to_json(), PENDING)
@@ -194,7 +194,7 @@ class ResultStore:
                 )
 
     def claim(self, run_ids: Collection[str]) -> Claim | None:
-        """Take the first of these runs that nobody has; None when there is none to take."""
+        """Claim the first free run of these; None when none is free."""
         now, wanted = time.time(), set(run_ids)
         with self._transaction() as connection:
             found = connection.execute(
@@ -205,7 +205,7 @@ class ResultStore:
             for run_id, job, state, holder, lease_until, claims in found:
                 if run_id not in wanted or (state == RUNNING and not _abandoned(holder, lease_until, now)):
                     continue
-                if claims >= MOST_CLAIMS:
+                if claims >= MAX_CLAIMS:
                     connection.execute(
                         "UPDATE runs SET state = ?, owner = NULL, error = ? WHERE run_id = ?",
                         (FAILED, f"the worker that ran it died {claims} times", run_id),
@@ -220,7 +220,7 @@ class ResultStore:
         return None
 
     def has_free(self, run_ids: Collection[str]) -> bool:
-        """Whether `claim` would find one of these runs."""
+        """Tell whether `claim` would find one of these runs."""
         now, wanted = time.time(), set(run_ids)
         with self._transaction() as connection:
             found = connection.execute("SELECT run_id, state, owner, lease_until FROM runs").fetchall()
@@ -230,23 +230,23 @@ class ResultStore:
         )
 
     def renew(self, claim: Claim) -> bool:
-        """Hold a claim for another `LEASE`; False when it is lost, and the run must be stopped."""
+        """Extend a claim by `LEASE`; False when it is lost, and the run must be stopped."""
         return self._update(claim, "lease_until = ?", (time.time() + LEASE,))
 
     def release(self, claim: Claim) -> None:
-        """Give a run back that was stopped on request: it is pending, and this was no attempt."""
+        """Make a stopped run pending again, without counting this attempt."""
         self._update(claim, "state = ?, owner = NULL, claims = claims - 1", (PENDING,))
 
     def record(self, claim: Claim, row: Mapping[str, Any]) -> bool:
-        """Keep the row of a finished run; False when the claim was lost, and nothing is kept."""
+        """Record the row of a finished run; False when the claim is lost, and nothing is recorded."""
         return self._update(claim, "state = ?, owner = NULL, record = ?, error = NULL", (DONE, json.dumps(dict(row))))
 
     def fail(self, claim: Claim, error: str) -> bool:
-        """Keep why a run failed; False when the claim was lost."""
+        """Record the reason of a failure; False when the claim is lost."""
         return self._update(claim, "state = ?, owner = NULL, error = ?", (FAILED, error))
 
     def outcomes(self, run_ids: Collection[str] | None = None) -> list[Outcome]:
-        """The runs in their order, all or those."""
+        """Return all runs, or these, in order."""
         wanted = None if run_ids is None else set(run_ids)
         with self._transaction() as connection:
             found = connection.execute("SELECT run_id, state, record, error FROM runs ORDER BY position").fetchall()
@@ -257,7 +257,7 @@ class ResultStore:
         ]
 
     def _row(self, run_id: str, text: str) -> dict[str, Any]:
-        """What is recorded of a run."""
+        """Parse the recorded row of a run."""
         name, advice = f"the record of {run_id} in {self._path}", "run the experiment again in another folder"
         row: dict[str, Any] = parse_json(text, name, dict[str, Any], error=RunFolderError, advice=advice)
         return row
@@ -272,8 +272,8 @@ class ResultStore:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        """One transaction that no other process interrupts."""
-        connection = sqlite3.connect(self._path, timeout=PATIENCE, isolation_level=None)
+        """Open a transaction that locks out other processes."""
+        connection = sqlite3.connect(self._path, timeout=LOCK_TIMEOUT, isolation_level=None)
         try:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
@@ -290,7 +290,7 @@ class ResultStore:
 
 
 def _put_if_absent(source: Path, target: Path) -> None:
-    """Give a whole file its name, unless another process was first."""
+    """Rename a file, unless the target exists."""
     try:
         os.link(source, target)
     except FileExistsError:
@@ -304,13 +304,13 @@ def _new_owner() -> str:
 
 
 def _abandoned(owner: str, lease_until: float, now: float) -> bool:
-    """Whether a claim is nobody's any more."""
+    """Tell whether a claim has expired, or its process on this machine has ended."""
     host, pid, _ = owner.rsplit("|", 2)
     return now > lease_until or (host == socket.gethostname() and not _alive(int(pid)))
 
 
 def _alive(pid: int) -> bool:
-    if sys.platform == "win32":  # asking there would end the process; the lease decides
+    if sys.platform == "win32":  # os.kill would end the process there; the lease decides
         return True
     try:
         os.kill(pid, 0)

@@ -1,4 +1,4 @@
-"""A table of results as Markdown and as LaTeX: each measured figure with the paper's beside it, in its layout."""
+"""Write a table of results as Markdown and LaTeX, with the paper's figures beside the measured ones."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ GROUPS_BESIDE = 3
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
 SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
-NOTHING = "-"
+NO_VALUE = "-"
 PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 2K and 4K"
 
 
 def markdown(table: ResultTable) -> str:
-    """The table for people and for a repository's pages."""
+    """Write the table as Markdown."""
     lines = [f"# {table.title}", "", _legend(table), ""]
     for group in (*table.groups, *table.scenes):
         lines += [f"## {group.title}", ""]
@@ -28,7 +28,7 @@ def markdown(table: ResultTable) -> str:
 
 
 def latex(table: ResultTable) -> str:
-    r"""The table for a paper: needs booktabs, and prints the paper's figures through \paper{...}."""
+    r"""Write the table as LaTeX; it needs booktabs and prints the paper's figures through \paper{...}."""
     parts = [
         "% Needs \\usepackage{booktabs,multirow}. Measured figures; the paper's in small print.",
         r"\providecommand{\paper}[1]{{\scriptsize\,[#1]}}",
@@ -79,13 +79,13 @@ def _ratios(row: TableRow) -> list[str]:
 
 
 def _ratio(ratio: Ratio, pattern: str) -> str:
-    measured = NOTHING if ratio.measured is None else pattern.format(ratio.measured)
+    measured = NO_VALUE if ratio.measured is None else pattern.format(ratio.measured)
     return measured if ratio.paper is None else f"{measured} [{pattern.format(ratio.paper)}]"
 
 
 def _text(cell: Cell, column: Column) -> str:
-    """0.71/0.87 ±0.01 [0.70/0.88]"""
-    measured = _number(cell.values, column) or NOTHING
+    """Format a cell: 0.71/0.87 ±0.01 [0.70/0.88]."""
+    measured = _number(cell.values, column) or NO_VALUE
     if cell.deviation is not None:
         measured += f" ±{cell.deviation:.{column.decimals}f}"
     return measured if cell.paper is None else f"{measured} [{_number(cell.paper.values, column)}]"
@@ -113,7 +113,7 @@ def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label:
 
 
 def _latex_blocks(groups: Sequence[Group], columns: Sequence[str]) -> Iterator[str]:
-    """Groups side by side, in blocks below each other."""
+    """Write groups side by side, in blocks below each other."""
     width = len(columns) + 2
     beside = min(GROUPS_BESIDE, len(groups))
     yield rf"\begin{{tabular}}{{l{('c' * width) * beside}}}"
@@ -169,7 +169,7 @@ def _latex_text(cell: Cell, column: Column) -> str:
 
 
 def _latex_marked(text: str) -> str:
-    r"""1.0 ±0.1 [2.0] -> 1.0 $\pm$0.1\paper{2.0}"""
+    r"""Convert 1.0 ±0.1 [2.0] to 1.0 $\pm$0.1\paper{2.0}."""
     measured, bracket, paper = text.partition(" [")
     tex = _escaped(measured).replace("±", r"$\pm$")
     return tex + (rf"\paper{{{_escaped(paper.removesuffix(']'))}}}" if bracket else "")

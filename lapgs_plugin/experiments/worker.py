@@ -1,4 +1,4 @@
-"""A worker: takes runs from the store until none is left, each in processes of its own."""
+"""Take runs from the store until none is left, and run each in separate processes."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 
 RENEW_EVERY = LEASE / 8
 LAST_LINES = 12
-"""Lines of a failed run's log that are reported."""
+"""Lines of a failed run's log in the report."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """The part of a machine that a worker uses.
+    """The part of a machine for a worker.
 
     Attributes:
-        gpu: for CUDA_VISIBLE_DEVICES; None leaves it as it is.
-        cores: processor numbers; empty means all.
+        gpu: value of CUDA_VISIBLE_DEVICES; None leaves it unchanged.
+        cores: numbers of processors; empty means all.
     """
 
     gpu: str | None = None
@@ -42,22 +42,22 @@ class Slot:
 
 
 class RunStopped(Exception):
-    """The run was killed: on request, or because its claim was lost."""
+    """The run was killed on request, or because its claim was lost."""
 
 
 def work(
     store_path: Path, run_ids: Collection[str], slot: Slot | None = None, stop: threading.Event | None = None
 ) -> int:
-    """Run what can be claimed of these runs.
+    """Claim and run these runs until none is free.
 
     Args:
-        store_path: of the results.
-        run_ids: those that may be taken.
-        slot: what to run them on.
-        stop: when set, the current run is killed and given back.
+        store_path: the store of results.
+        run_ids: the runs that may be claimed.
+        slot: the part of the machine to use.
+        stop: when set, the current run is killed and released.
 
     Returns:
-        How many were finished, well or not.
+        Number of runs that ended, done or failed.
     """
     store = ResultStore(store_path)
     slot, stop = slot or Slot(), stop or threading.Event()
@@ -77,14 +77,14 @@ def work(
 
 
 class RunFailedError(LapgsError):
-    """A command of a run ended badly; the message has the end of its log, in lines of their own."""
+    """A command of a run failed; the message has the end of its log, line by line."""
 
     def __init__(self, message: str) -> None:
         Exception.__init__(self, "\n".join(printable(line) for line in message.split("\n")))
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
-    """Train and measure one run.
+    """Train and evaluate one run.
 
     Raises:
         RunStopped: it was killed.
@@ -94,7 +94,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
     job = claim.job
     folder = Path(job.folder)
-    if folder.exists():  # what an earlier command left
+    if folder.exists():  # left by an earlier command
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     log = Path(job.log)
@@ -121,7 +121,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
 
 def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> int:
-    """One command, on a leash; its exit code.
+    """Run one command and return its exit code; it is killed when this process ends.
 
     Raises:
         RunStopped: it was killed.
@@ -131,7 +131,7 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
     environment = dict(os.environ)
     if slot.gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = slot.gpu
-    # The same package as here, also where it is found by the current folder alone.
+    # Use the package of this process, even if it was found through the current folder.
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     environment["PYTHONUNBUFFERED"] = "1"
     cores = ",".join(map(str, slot.cores)) or "-"
@@ -142,7 +142,7 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
         stdin=subprocess.PIPE,
         stdout=log,
         stderr=subprocess.STDOUT,
-        start_new_session=True,  # Ctrl-C in the terminal is for the worker, which then lets go of the leash
+        start_new_session=True,  # Ctrl-C reaches only the worker, which then closes the pipe
     )
     assert process.stdin is not None
     try:
@@ -164,14 +164,14 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
 
 
 def last_lines(log: Path) -> str:
-    """The end of a log, progress bars left out."""
+    """Return the end of a log without progress bars."""
     text = log.read_text(encoding="utf-8", errors="replace")
     lines = [line.rsplit("\r", 1)[-1].rstrip() for line in re.split(r"\n", text)]
     return "\n".join([line for line in lines if line][-LAST_LINES:])
 
 
 def gpu_name(index: str | None) -> str:
-    """Name of the GPU that a slot uses, "" without one."""
+    """Return the name of a slot's GPU, "" without one."""
     if shutil.which("nvidia-smi") is None:
         return ""
     chosen = index or os.environ.get("CUDA_VISIBLE_DEVICES") or "0"

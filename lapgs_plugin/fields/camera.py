@@ -1,4 +1,4 @@
-"""Pinhole cameras: what a rasterizer needs to know of a view."""
+"""Describe pinhole cameras."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Camera:
 
     @property
     def tan_half_fov(self) -> tuple[float, float]:
-        """Half the width and height of the image plane at depth 1."""
+        """Half the width and half the height of the image plane at depth 1."""
         return self.width / (2.0 * self.fx), self.height / (2.0 * self.fy)
 
     @property
@@ -47,12 +47,12 @@ class Camera:
         return self.world_to_camera.new_tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera with exactly the same field of view at another image size: how a pyramid level is rendered."""
+        """Return the camera with exactly the same field of view at another image size."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The camera with its pose on another device or in another precision."""
+        """Return the camera with its pose on another device or in another precision."""
         return replace(self, world_to_camera=self.world_to_camera.to(device=device, dtype=dtype))

@@ -1,4 +1,4 @@
-"""A set of Gaussians with the parameterisation every 3DGS backbone optimizes; its PLY file in and out."""
+"""Hold a set of Gaussians with the parameters that 3DGS optimizes; read and write it as PLY."""
 
 from __future__ import annotations
 
@@ -20,15 +20,19 @@ from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import atomic_write
 
 SIGNED_COMMENT = "lapgs_signed 1"
-"""PLY comment that marks a residual field. Viewers that do not know it show the field as an ordinary one."""
+"""PLY comment that marks a residual field. Other viewers ignore it and show an ordinary field."""
 
 SH_REST_COUNTS = (0, 9, 24, 45)
-"""How many f_rest_* properties a PLY of SH degree 0 to 3 has: three channels of (degree + 1)^2 - 1."""
+"""Number of f_rest_* properties of a PLY of SH degree 0 to 3: (degree + 1)^2 - 1 for each of three channels."""
+
+
+SPLAT_NAMES = {"means": "means", "quats": "quaternions", "scales": "log_scales", "opacities": "opacity_logits"}
+"""Attributes of a field, except SH, by the names of gsplat's trainers and strategies."""
 
 
 @dataclass(frozen=True)
 class GaussianField:
-    """n Gaussians, as raw (unconstrained) parameters.
+    """Hold n Gaussians as raw (unconstrained) parameters.
 
     Attributes:
         means: (n, 3) centres in world coordinates.
@@ -37,6 +41,9 @@ class GaussianField:
         opacity_logits: (n,) logit of the opacity.
         sh: (n, k, 3) spherical-harmonic coefficients, k = (degree + 1)^2 with degree 0 to 3, RGB last.
         signed: True for a residual field, whose colour is the raw SH value; False for max(SH + 0.5, 0).
+
+    Raises:
+        FieldError: a tensor has another shape.
     """
 
     means: Tensor  # (n, 3)
@@ -64,11 +71,11 @@ class GaussianField:
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """The tensors by attribute name, in declaration order."""
+        """Tensors by attribute name, in declaration order."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "signed"}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> GaussianField:
-        """The field with some or all tensors replaced."""
+        """Return the field with some or all tensors replaced."""
         return GaussianField(**{**self.parameters, **parameters}, signed=self.signed)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> GaussianField:
@@ -78,15 +85,13 @@ class GaussianField:
         return self.with_parameters({k: v.detach() for k, v in self.parameters.items()})
 
     def require_finite(self) -> None:
-        """Check every number of the field.
+        """Check that every number is finite.
 
         Raises:
-            FieldError: one is NaN or inf; names the property as a PLY calls it, how many and the first Gaussian.
+            FieldError: one is NaN or inf; names the PLY property, how many and the first Gaussian.
         """
         for attribute, tensor in self.parameters.items():
-            if bool(
-                torch.isfinite(tensor.detach().sum())
-            ):  # a tenth of the time of looking at each, and nearly always so
+            if bool(torch.isfinite(tensor.detach().sum())):  # far cheaper than looking at each number
                 continue
             bad = ~torch.isfinite(_as_columns(tensor))  # (n, columns)
             if bool(bad.any()):
@@ -99,13 +104,13 @@ class GaussianField:
                 )
 
     def save_ply(self, path: Path | str, comments: Sequence[str] = ()) -> None:
-        """Write the field as a standard 3DGS PLY, little endian, float32, that other viewers read.
+        """Write the field as a standard 3DGS PLY, little endian and float32.
 
-        float32 parameters come back from `load_ply` with the same bits. The file appears whole or not at all.
+        `load_ply` returns float32 parameters with the same bits. The file is written completely or not at all.
 
         Args:
             path: of the file.
-            comments: for the header, one line each; non-ASCII characters are written as question marks.
+            comments: lines of the header; non-ASCII characters are written as question marks.
 
         Raises:
             OSError: the folder cannot be written, or the disk is full.
@@ -132,14 +137,14 @@ class GaussianField:
 
     @classmethod
     def load_ply(cls, path: Path | str) -> GaussianField:
-        """Read a 3DGS PLY as any trainer wrote it, in float32 on the CPU.
+        """Read a 3DGS PLY of any trainer in float32 on the CPU.
 
-        SH degree 0 to 3, with or without normals, with further properties (ignored), in float or double, ascii or
-        binary of either byte order. A file is a residual field when its header says so (`SIGNED_COMMENT`).
+        It may have SH degree 0 to 3, normals and further properties (both ignored), float or double values, in ASCII or
+        binary of either byte order. `SIGNED_COMMENT` in its header marks a residual field.
 
         Raises:
-            FieldError: the file is missing, cut short (says after which Gaussian), not a PLY, lacks properties of a
-                Gaussian field (says which), or holds NaN or inf (says where).
+            FieldError: the file is missing, truncated, not a PLY, lacks properties of a Gaussian field, or holds NaN or
+                inf; says where or which.
         """
         path = Path(path)
         with _naming_file(path):
@@ -160,11 +165,43 @@ class GaussianField:
         return field
 
 
-def property_names(sh_degree: int) -> dict[str, tuple[str, ...]]:
-    """PLY properties of each attribute of a field, in the order of the attribute's flattened columns.
+def field_from_splats(splats: Mapping[str, Tensor], signed: bool = False) -> GaussianField:
+    """Make a field that shares the tensors of a gsplat trainer, and their gradients.
 
-    A PLY numbers SH coefficients above degree 0 channel by channel (all of red, then green, then blue), the field
-    holds them coefficient by coefficient with RGB last.
+    Args:
+        splats: "means" (n, 3), "quats" (n, 4), "scales" (n, 3) logarithms, "opacities" (n,) or (n, 1) logits, and SH
+            as "sh" (n, k, 3), or as "sh0" (n, 1, 3) and "shN" (n, k - 1, 3). Other entries are ignored.
+        signed: whether it is a residual.
+
+    Raises:
+        FieldError: an entry is missing, or of another shape.
+    """
+    colors = ("sh",) if "sh" in splats else ("sh0", "shN")
+    if missing := [name for name in (*SPLAT_NAMES, *colors) if name not in splats]:
+        raise FieldError(
+            f"splats without {', '.join(missing)} (they have {', '.join(splats)}); expected gsplat's names"
+        )
+    values = {ours: splats[theirs] for theirs, ours in SPLAT_NAMES.items()}
+    if values["opacity_logits"].ndim == 2:
+        values["opacity_logits"] = values["opacity_logits"][:, 0]
+    sh = splats["sh"] if colors == ("sh",) else torch.cat([splats["sh0"], splats["shN"]], 1)
+    return GaussianField(**values, sh=sh, signed=signed)
+
+
+def splats_from_field(field: GaussianField) -> dict[str, Tensor]:
+    """Return a field's tensors by gsplat's names: "means", "quats", "scales", "opacities", "sh0", "shN".
+
+    Only SH are copied. `field.signed` is not part of the result.
+    """
+    values = {theirs: field.parameters[ours] for theirs, ours in SPLAT_NAMES.items()}
+    return {**values, "sh0": field.sh[:, :1].contiguous(), "shN": field.sh[:, 1:].contiguous()}
+
+
+def property_names(sh_degree: int) -> dict[str, tuple[str, ...]]:
+    """Return the PLY properties of each attribute of a field, in the order of its flattened columns.
+
+    A PLY numbers SH coefficients above degree 0 channel by channel (red, then green, then blue). A field holds them
+    coefficient by coefficient, RGB last.
     """
     rest = (sh_degree + 1) ** 2 - 1
     return {
@@ -180,10 +217,10 @@ def property_names(sh_degree: int) -> dict[str, tuple[str, ...]]:
 
 
 def count_gaussians(path: Path | str) -> int:
-    """How many Gaussians a PLY file holds, from its header and its size, without reading them when it is binary.
+    """Return the number of Gaussians in a PLY file from its header and size, without reading binary values.
 
     Raises:
-        FieldError: as `GaussianField.load_ply`, except that values are not looked at.
+        FieldError: as `GaussianField.load_ply`, except that values are not checked.
     """
     path = Path(path)
     with _naming_file(path):
@@ -194,7 +231,7 @@ def count_gaussians(path: Path | str) -> int:
 
 @contextmanager
 def _naming_file(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while reading `path` into one line that names it."""
+    """Turn errors while reading `path` into a FieldError that names it."""
     try:
         yield
     except FieldError as error:
@@ -214,7 +251,7 @@ def _read_vertices(path: Path) -> tuple[PlyData, PlyElement]:
 
 
 def _sh_degree(vertices: PlyElement) -> int:
-    """SH degree of the properties, after checking that a whole set is there."""
+    """Return the SH degree, after checking that all properties of a field are there."""
     scalars = scalar_names(vertices)
     rest = sum(name.startswith("f_rest_") for name in scalars)
     degree = SH_REST_COUNTS.index(rest) if rest in SH_REST_COUNTS else 3
@@ -231,14 +268,14 @@ def _sh_degree(vertices: PlyElement) -> int:
 
 
 def _as_columns(tensor: Tensor) -> Tensor:
-    """A parameter as the PLY's columns, (n, columns); reshape(n, -1) would refuse a field without Gaussians."""
+    """Return a parameter as PLY columns, (n, columns); reshape(n, -1) would refuse a field without Gaussians."""
     return tensor.detach().reshape(len(tensor), math.prod(tensor.shape[1:]))
 
 
 def _stack_columns(vertices: PlyElement, names: tuple[str, ...]) -> Tensor:
-    """Properties as one tensor, (n, len(names)) float32."""
+    """Return properties as one tensor, (n, len(names)) float32."""
     if (rows := _as_rows(vertices)) is not None:
-        # Row by row; property by property would go through the whole file for each.
+        # All columns in one pass; property by property would read the whole array for each.
         columns = [vertices.data.dtype.names.index(name) for name in names]
         return torch.from_numpy(np.take(rows, columns, axis=1))
     stacked: NDArray[Any] = np.empty((vertices.count, len(names)), dtype=np.float32)
@@ -249,7 +286,7 @@ def _stack_columns(vertices: PlyElement, names: tuple[str, ...]) -> Tensor:
 
 
 def _as_rows(vertices: PlyElement) -> NDArray[np.float32] | None:
-    """The vertices as (n, properties), where all are floats as they lie in this machine's memory; None otherwise."""
+    """Return a view of the vertices as (n, properties) if all are native float32; None otherwise."""
     layout = vertices.data.dtype
     if any(layout[name] != np.dtype(np.float32) for name in layout.names):
         return None

@@ -1,4 +1,4 @@
-"""Read PLY files of unknown origin: plyfile reads them, after their header was compared with their size."""
+"""Read PLY files of unknown origin with plyfile, after comparing their header with their size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty
 from lapgs_plugin.untrusted import shortened
 
 HEADER_BYTES = 2**18
-"""Longest header that is read. That of a Gaussian field has two thousand, comments are what makes it longer."""
+"""Longest header that is read; the header of a Gaussian field is far shorter unless it has many comments."""
 
 _END = re.compile(rb"(?:^|[\r\n])end_header(\r\n|\r|\n)")
 _ELEMENT = re.compile(rb"(?m)^(element[ \t]+)(\S+)([ \t]+)(\S+)[ \t]*$")
@@ -23,7 +23,7 @@ def read_ply(path: Path | str) -> PlyData:
     """Read a PLY file.
 
     Raises:
-        ValueError: it is not one, is cut short, or is damaged otherwise; says how in one line.
+        ValueError: it is not a PLY file, truncated or otherwise damaged; says how in one line.
         OSError: it cannot be read.
     """
     _check_header(Path(path))
@@ -34,20 +34,20 @@ def read_ply(path: Path | str) -> PlyData:
     except PlyElementParseError as error:
         at = "" if error.row is None else f" after {error.row} of {error.element.count} ({error.element.name})"
         raise ValueError(f"it is cut short or damaged{at} ({error.message})") from error
-    except Exception as error:  # plyfile and numpy raise ValueError, OverflowError, MemoryError, ... by damage
+    except Exception as error:  # damage raises ValueError, OverflowError, MemoryError, ... in plyfile and numpy
         raise ValueError(f"it is not a PLY file ({_line(error)})") from error
 
 
 def scalar_names(element: PlyElement) -> set[str]:
-    """The properties of an element that hold one number each."""
+    """Return the properties of an element that hold one number each."""
     return {prop.name for prop in element.properties if not isinstance(prop, PlyListProperty)}
 
 
 def _check_header(path: Path) -> None:
-    """Refuse a header that promises more than the file holds: plyfile would take memory for it before it reads.
+    """Check that the file is as large as its header says: plyfile allocates memory for that before it reads.
 
     Raises:
-        ValueError: it does, or is no header.
+        ValueError: it is smaller, or has no valid header.
         OSError: the file cannot be read.
     """
     with path.open("rb") as stream:
@@ -63,7 +63,7 @@ def _check_header(path: Path) -> None:
         if not re.fullmatch(rb"[0-9]{1,15}", count):
             raise ValueError(f"its header counts {shortened(count.decode('latin-1'))}, expected a number from 0")
     try:
-        # Without any contents plyfile reads the header alone.
+        # With all counts 0 plyfile reads the header alone.
         empty = PlyData.read(io.BytesIO(_ELEMENT.sub(rb"\1\2\g<3>0", header)))
     except Exception as error:  # as in `read_ply`
         raise ValueError(f"it is not a PLY file ({_line(error)})") from error
@@ -75,7 +75,7 @@ def _check_header(path: Path) -> None:
     for element, row, count in zip(empty.elements, rows, map(int, counts), strict=True):
         if count and not element.properties:
             raise ValueError(f"its header counts {count} of {element.name} without any property")
-        # The last line of a text may lack its line break.
+        # The last line of an ASCII file may lack its line break.
         if row * count > held + is_text:
             fitting = held // row
             raise ValueError(
@@ -86,7 +86,7 @@ def _check_header(path: Path) -> None:
 
 
 def _row_bytes(element: PlyElement, is_text: bool) -> int:
-    """The fewest bytes that one of an element takes in a file."""
+    """Return the least number of bytes of one row of an element."""
     if is_text:
         return 2 * len(element.properties)  # a digit, and a space or a line break
     return sum(
@@ -96,6 +96,6 @@ def _row_bytes(element: PlyElement, is_text: bool) -> int:
 
 
 def _line(error: Exception) -> str:
-    """What an error says, as one line."""
+    """Return an error's message as one line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 300 else f"{text[:297]}..."

@@ -1,4 +1,4 @@
-"""The one interface of every rasterizer: the CPU reference, gsplat and each wrapped CUDA extension satisfy it."""
+"""Define the interface of all rasterizers: the CPU rasterizers, gsplat and the wrapped CUDA extensions."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What rendering one view returns.
+    """The result of rendering one view.
 
     Attributes:
         image: (3, height, width) colour, background blended in, not clamped.
-        transmittance: (height, width) what is left of the background's weight in each pixel, in [0, 1]; None where it
-            is not for free, since neither training nor rendering looks at it: `render_transmittance` gets it.
+        transmittance: (height, width) the background's weight in each pixel, in [0, 1]; None if the rasterizer does
+            not compute it anyway (`render_transmittance` does).
         radii: (n,) int32, three-sigma radius in pixels of each Gaussian's footprint; 0 where it was culled.
-        means2d: (n, 2) projected centres in pixels, x then y. When the field's parameters require gradients,
-            `means2d.grad` holds after `backward()` the gradient of the loss with respect to the screen position, in
-            loss per pixel: what densification thresholds. Zeros where culled.
-        absgrad2d: (n, 2) buffer that after `backward()` holds the sum over pixels of the absolute value of that
-            gradient (AbsGS); None where the rasterizer does not offer it.
+        means2d: (n, 2) projected centres in pixels, x then y; zeros where culled. If the field's parameters require
+            gradients, `means2d.grad` holds after `backward()` the gradient of the loss by screen position, in loss per
+            pixel, which densification thresholds.
+        absgrad2d: (n, 2) buffer that holds after `backward()` the sum over pixels of the absolute value of that
+            gradient (AbsGS); None if the rasterizer does not offer it.
     """
 
     image: Tensor
@@ -38,19 +38,18 @@ class RenderResult:
 
 @dataclass(frozen=True)
 class Semantics:
-    """Where a rasterizer departs by design from what `reference_raster.oracle` states, and correctly so.
+    """Legitimate differences of a rasterizer from `reference_raster.oracle`, by design.
 
     Attributes:
-        three_sigma_cut: False where a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one
-            that is blended in no pixel may then have radius 0.
-        expanded_conic_gradient: True where the backward pass takes the gradient of the inverse 2D covariance to that of
-            the covariance by matrix products, as such or multiplied out. In float32 that loses the gradients of
-            Gaussians that are very long on screen; see `evaluation.conformance.EXPANDED_CONIC`.
-        rebuilt_transmittance: True where the forward pass keeps a pixel's opacity, and the backward pass takes the
-            transmittance from that. In float32 little of a small one is left; see
-            `evaluation.conformance.REBUILT_TRANSMITTANCE`.
-        departures: reasons by the name of the conformance case for which another image or gradient is right.
-        note: the departures in words, for reports.
+        three_sigma_cut: False if a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one that
+            is blended in no pixel may then have radius 0.
+        expanded_conic_gradient: True if the backward pass turns the gradient by the inverse 2D covariance into that by
+            the covariance with matrix products. In float32 that loses the gradients of Gaussians that are very long on
+            screen; see `evaluation.conformance.EXPANDED_CONIC`.
+        rebuilt_transmittance: True if the backward pass computes the transmittance from a pixel's stored opacity. In
+            float32 that is inaccurate where little is left; see `evaluation.conformance.REBUILT_TRANSMITTANCE`.
+        departures: reasons by name of the conformance cases in which the image or a gradient differs.
+        note: the differences in words, for reports.
     """
 
     three_sigma_cut: bool = True
@@ -61,17 +60,17 @@ class Semantics:
 
 
 class Rasterizer(Protocol):
-    """Renders a field from a camera."""
+    """Render a field from a camera."""
 
     @property
     def name(self) -> str:
-        """How logs, manifests and tables call it."""
+        """Its name in logs, manifests and tables."""
         ...
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """Render `field`, differentiably with respect to its parameters.
+        """Render `field`, differentiably by its parameters.
 
         Args:
             field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
@@ -84,26 +83,26 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class ImageRasterizer(Protocol):
-    """A rasterizer that can leave out what training alone looks at, and render several views in one go.
+    """A rasterizer that can render images alone, without radii and centres, and several views together.
 
-    On a GPU all its work goes to PyTorch's current stream, so that fields can be rendered beside each other.
+    On a GPU all its work goes to PyTorch's current stream, so that fields can be rendered concurrently.
     """
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Images (b, 3, height, width) of b cameras of one size, as `Rasterizer` renders them one by one."""
+        """Render b cameras of one size, (b, 3, height, width), to the images that `Rasterizer` gives one by one."""
         ...
 
 
 class FieldStack(Protocol):
-    """Fields that are finished and ready on a device, to be rendered together; see `StackingRasterizer`."""
+    """Finished fields on a device, to be rendered together; see `StackingRasterizer`."""
 
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
-        """Images of the first fields, each as `Rasterizer` renders it from its own camera.
+        """Render the first fields, each from its own camera.
 
         Args:
-            cameras: for the first field, the second, ..., at most as many as there are fields. All have the same pose;
-                sizes and intrinsics are their own.
-            background: (3,) behind fields that are not signed; None is black. Signed ones always lie over zero.
+            cameras: of the first field, the second, ..., at most one per field. All have the same pose; sizes and
+                intrinsics may differ.
+            background: (3,) behind fields that are not signed; None is black. Signed ones are rendered over zero.
 
         Returns:
             (3, height, width) of each camera, in PyTorch's current stream.
@@ -113,7 +112,7 @@ class FieldStack(Protocol):
 
 @runtime_checkable
 class StackingRasterizer(Protocol):
-    """A rasterizer that may render several fields together, with hardly more launches than one alone."""
+    """A rasterizer that may render several fields together, with hardly more launches than one field takes."""
 
     @property
     def can_stack(self) -> bool:
@@ -121,13 +120,13 @@ class StackingRasterizer(Protocol):
         ...
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
-        """A copy of the fields, which may be anywhere, on its own device; only where `can_stack`."""
+        """Copy fields from any device to a stack on its own; only if `can_stack`."""
         ...
 
 
 @runtime_checkable
 class BatchRasterizer(Protocol):
-    """A rasterizer that may train on several views of one size with as many launches as on one."""
+    """A rasterizer that may train on several views of one size with as many launches as one view takes."""
 
     @property
     def can_batch(self) -> bool:
@@ -143,31 +142,31 @@ class BatchRasterizer(Protocol):
         sh_degree: int | None = None,
         describes: bool = True,
     ) -> RenderResult:
-        """What a call gives for each of b cameras of one size, differentiably, with a leading dimension b each.
+        """Render b cameras of one size differentiably; every tensor of the result has a leading dimension b.
 
         Args:
             field, background, sh_degree: as a `Rasterizer` takes them.
-            cameras: two or more; only where `can_batch`.
-            describes: fill in radii and centres; False leaves them empty and costs less.
+            cameras: two or more; only if `can_batch`.
+            describes: fill in radii and centres; False leaves them empty and is faster.
         """
         ...
 
 
 @runtime_checkable
 class PlainRasterizer(Protocol):
-    """A rasterizer that is faster where nobody looks at radii and centres."""
+    """A rasterizer that is faster without radii and centres."""
 
     def render_image(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> Tensor:
-        """`RenderResult.image` of the same call, (3, height, width), with its gradients."""
+        """Return `RenderResult.image` of the same call, (3, height, width), with its gradients."""
         ...
 
 
 def render_image(
     rasterizer: Rasterizer, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int | None = None
 ) -> Tensor:
-    """The image (3, height, width) alone by any rasterizer, differentiable, the fastest way that it has."""
+    """Render the image (3, height, width) alone with any rasterizer, differentiably, in its fastest way."""
     if isinstance(rasterizer, PlainRasterizer):
         return rasterizer.render_image(field, camera, background=background, sh_degree=sh_degree)
     return rasterizer(field, camera, background=background, sh_degree=sh_degree).image
@@ -177,7 +176,7 @@ def render_image(
 def render_images(
     rasterizer: Rasterizer, field: GaussianField, cameras: Sequence[Camera], background: Tensor
 ) -> Tensor:
-    """Images (b, 3, height, width) of b cameras of one size by any rasterizer, the fastest way that it has."""
+    """Render b cameras of one size, (b, 3, height, width), with any rasterizer in its fastest way."""
     if isinstance(rasterizer, ImageRasterizer):
         return rasterizer.render_images(field, cameras, background=background)
     images = [rasterizer(field, camera, background=background).image for camera in cameras]
@@ -186,9 +185,6 @@ def render_images(
 
 @torch.no_grad()
 def render_transmittance(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> Tensor:
-    """What any rasterizer leaves of the background's weight in each pixel: (height, width), in [0, 1].
-
-    It renders black Gaussians before white.
-    """
+    """Compute `RenderResult.transmittance` with any rasterizer: render black Gaussians over white."""
     black = replace(field.with_parameters({"sh": torch.zeros_like(field.sh[:, :1])}), signed=True)
     return rasterizer(black, camera, background=torch.ones(3).to(field.means), sh_degree=0).image[0]

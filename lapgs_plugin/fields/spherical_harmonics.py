@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, in the order and with the signs of 3D Gaussian Splatting.
+"""Evaluate real spherical harmonics up to degree 3 in the order and with the signs of 3D Gaussian Splatting.
 
 The functions are ordered Y_0^0, Y_1^-1, Y_1^0, Y_1^1, Y_2^-2, ..., Y_3^3 and orthonormal on the unit sphere. They carry
 the Condon-Shortley phase, (-1)^m: every function of odd order m is negated against the convention without it.
@@ -26,7 +26,7 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """The (degree + 1)^2 basis functions in the given directions.
+    """Evaluate the (degree + 1)^2 basis functions in the given directions.
 
     Args:
         directions: (n, 3) unit vectors.
@@ -62,7 +62,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_to_color(sh: Tensor, directions: Tensor, degree: int, *, signed: bool) -> Tensor:
-    """Colour of each Gaussian seen along a direction.
+    """Return the colour of each Gaussian seen along a direction.
 
     Args:
         sh: (n, k, 3) coefficients, k at least (degree + 1)^2; higher ones are not read.

@@ -1,4 +1,4 @@
-"""Cameras at the sizes of pyramid levels."""
+"""Make cameras of pyramid levels."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from lapgs_plugin.hierarchy.plan import level_size
 
 
 def level_camera(camera: Camera, level: int) -> Camera:
-    """The camera of a pyramid level, from the camera of the full-resolution view."""
+    """Return the camera of a pyramid level, from the camera of the full-resolution view."""
     return camera.resized(*level_size((camera.width, camera.height), level))
 
 
 def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> Tensor:
-    """The intrinsics of a pyramid level's camera, for loops that keep cameras as matrices.
+    """Return the intrinsics of a pyramid level's camera, for loops that keep cameras as matrices.
 
-    Odd sizes are rounded up, and the field of view stays: focal lengths are not simply halved.
+    Odd sizes are rounded up and the field of view is kept, so focal lengths are not exactly halved.
 
     Args:
         intrinsics: (..., 3, 3) matrices K of the full-resolution camera.

@@ -1,4 +1,4 @@
-"""How a field begins: from a point cloud, or from the field of the level before."""
+"""Initialize a field from a point cloud, or from the next coarser level's field."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.settings import parse_inheritance
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
-"""The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every side."""
+"""The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every direction."""
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SQUARED_DISTANCE = 1e-7
-"""Floor of the mean squared distance to the neighbours, in squared world units: points may coincide."""
+"""Least mean squared distance to the neighbours, in squared world units: points may coincide."""
 
 
 class Inherited(NamedTuple):
-    """A new field and the Gaussians of the old one that it came from.
+    """A new field, and which Gaussians of the old field it came from.
 
     Attributes:
         field: the field to train.
@@ -36,11 +36,11 @@ class Inherited(NamedTuple):
 
 
 def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> GaussianField:
-    """A fresh base field as 3DGS starts it: round Gaussians as large as their spacing, a tenth opaque.
+    """Initialize a base field as 3DGS does: isotropic Gaussians as large as their spacing, with opacity 0.1.
 
     Args:
         points: (n, 3) positions in world units, n at least 1.
-        colors: (n, 3) RGB in [0, 1], the same from every side.
+        colors: (n, 3) RGB in [0, 1], the same from every direction.
         sh_degree: 0 to 3; coefficients above degree 0 are zero.
 
     Returns:
@@ -51,7 +51,7 @@ def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> Gaussia
     """
     sh = torch.zeros(len(points), (sh_degree + 1) ** 2, 3, device=points.device)
     sh[:, 0] = (colors.to(sh) - 0.5) / SH_C0
-    return _fresh_field(points, sh, signed=False)
+    return _initial_field(points, sh, signed=False)
 
 
 def inherit(
@@ -61,31 +61,34 @@ def inherit(
     generator: torch.Generator | None = None,
     sh_degree: int | None = None,
 ) -> Inherited:
-    """The residual field that continues from the field of the next coarser level (paper, "Initialization and
-    inheritance" and the supplement's ablation).
+    """Initialize a residual field from the next coarser level's field (paper, "Initialization and inheritance" and the
+    supplement's ablation).
 
-    "geometry", ours, keeps positions, shapes and opacities and starts with zero colour: the residual renders exactly
-    zero, by Gaussians that already follow the scene's surfaces. "xyz", the paper's default, keeps the positions and
-    starts everything else afresh: scale from the nearest neighbours among the kept Gaussians, opacity 0.1, no rotation,
-    and zero colour. "full" keeps every parameter, colours included, as the paper ("retains all parameters") and its
-    authors' release do; `kept` tells which rows of the optimizer state go with it. As a residual's colour is the raw SH
-    value, what inherits fully from a base starts as the base's image minus 0.5 wherever that is opaque, and has to
-    unlearn it.
+    "geometry", ours, keeps positions, shapes and opacities and sets colours to zero: the residual first renders exactly
+    zero, with Gaussians that already follow the scene's surfaces.
+
+    "xyz", the paper's default, keeps positions alone. Scales come from the nearest neighbours among the kept Gaussians;
+    opacity is 0.1, rotation the identity and colour zero.
+
+    "full" keeps every parameter, as the paper ("retains all parameters") and its authors' release do; `kept` tells
+    which rows of the optimizer's state belong to it. A residual's colour is the raw SH value, so a residual that
+    inherits fully from a base starts as the base's image minus 0.5 where that is opaque, which it has to unlearn.
 
     Args:
         field: of the coarser level; not modified.
         mode: "geometry", "xyz" or "full".
-        ratio: rho in (0, 1], the share of Gaussians to keep, drawn without replacement; at least one is kept.
-        generator: CPU generator of the draw; None takes PyTorch's global one. Not used when all are kept.
+        ratio: rho in (0, 1], the share of Gaussians to keep, sampled without replacement; at least one is kept.
+        generator: CPU generator for the sampling; None takes PyTorch's global one. Not used when all are kept.
         sh_degree: of the new field; None keeps the old one's. "full" can only keep it.
 
     Raises:
-        UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians.
+        UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians, or "full" with another
+            `sh_degree`.
     """
-    parse_inheritance(mode if ratio == 1.0 else f"{mode}:{ratio}")  # raises what is to be said of them
+    parse_inheritance(mode if ratio == 1.0 else f"{mode}:{ratio}")  # raises for an unknown mode or ratio
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
-    kept = _draw(len(field), ratio, generator).to(field.means.device)
+    kept = _sample_rows(len(field), ratio, generator).to(field.means.device)
     degree = field.sh_degree if sh_degree is None else sh_degree
     rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
     if mode == "full":
@@ -98,19 +101,19 @@ def inherit(
     sh = torch.zeros(len(kept), (degree + 1) ** 2, 3, dtype=field.means.dtype, device=field.means.device)
     if mode == "geometry":
         return Inherited(GaussianField(**{**rows, "sh": sh}, signed=True), kept)
-    return Inherited(_fresh_field(rows["means"], sh, signed=True), kept)
+    return Inherited(_initial_field(rows["means"], sh, signed=True), kept)
 
 
-def _draw(n: int, ratio: float, generator: torch.Generator | None) -> Tensor:
-    """Ascending indices of a random share of n, at least one, (m,)."""
+def _sample_rows(n: int, ratio: float, generator: torch.Generator | None) -> Tensor:
+    """Return ascending indices of a random share of n, at least one, (m,)."""
     count = max(1, round(n * ratio))
     if count == n:
         return torch.arange(n)
     return torch.randperm(n, generator=generator)[:count].sort().values
 
 
-def _fresh_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
-    """Everything but position and colour as 3DGS initialises a point cloud."""
+def _initial_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
+    """Initialize everything but position and colour as 3DGS does from a point cloud."""
     if len(means) == 0 or not bool(torch.isfinite(means).all()):
         raise UserInputError(
             f"{len(means)} points, not all finite; expected at least one point with finite coordinates"
@@ -130,9 +133,9 @@ def _fresh_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
 
 
 def mean_squared_distance(points: Tensor) -> Tensor:
-    """Mean of the squared distances from each point to its three nearest neighbours.
+    """Return the mean squared distance from each point to its three nearest neighbours.
 
-    With fewer than four points the mean is over the neighbours there are, and 0 for a single point.
+    With fewer than four points the mean is over all other points, and 0 for a single point.
 
     Args:
         points: (n, 3), n at least 1.
@@ -144,6 +147,6 @@ def mean_squared_distance(points: Tensor) -> Tensor:
     if count == 0:
         return torch.zeros_like(points[:, 0])
     positions = points.detach().to("cpu", torch.float64).numpy()
-    # The nearest of count + 1 is the point itself, or one at the same place: distance 0 either way.
+    # The nearest of count + 1 is the point itself or one at the same position: its distance is 0 either way.
     distances, _ = cKDTree(positions).query(positions, k=count + 1, workers=-1)
     return torch.from_numpy(np.mean(distances[:, 1:] ** 2, axis=1)).to(points)

@@ -1,4 +1,4 @@
-"""What is trained when: the stages of a hierarchy. Pure Python, no torch."""
+"""Plan the stages of a hierarchy: which level is trained when, at what size, for how long. Imports no torch."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from fractions import Fraction
 
 from lapgs_plugin.errors import UserInputError
 
+REFERENCE_ITERATIONS = 30_000
+"""Iterations of a run that 3DGS's published schedule is made for; shorter runs shrink its constants in proportion."""
+REFERENCE_DENSIFY_FROM = 500
+"""First densification in that schedule."""
+
 MIN_LEVEL_SIDE = 16
-"""Smallest side, in pixels, of a level that is trained: SSIM's window is 11 wide, and a tile 16."""
+"""Smallest side of a trained level in pixels: SSIM's window is 11 pixels wide, a tile 16."""
 
 MOST_LEVELS = 24
-"""Images of a hierarchy with more would have over a hundred million pixels a side."""
+"""Most levels of a hierarchy; with more, images would have over a hundred million pixels a side."""
 
 DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
     1: (Fraction(1),),
@@ -21,41 +26,34 @@ DEFAULT_SPLITS: dict[int, tuple[Fraction, ...]] = {
     3: (Fraction(1, 3), Fraction(1, 6), Fraction(1, 2)),
     4: (Fraction(1, 3), Fraction(1, 6), Fraction(1, 6), Fraction(1, 3)),
 }
-"""Share of the iterations of each stage, coarsest first.
+"""Share of each stage in the iterations, coarsest first, by number of levels.
 
-Three and four levels are split as in the paper, two as nested levels are.
+For two levels the paper's ablation finds halves better than the 1/3, 2/3 of its main tables; three and four levels are
+split as in the paper.
 """
-
-RESIDUAL_SPLIT = (Fraction(1, 3), Fraction(2, 3))
-"""The same for a base and one residual: the paper's main tables."""
 
 NESTED_DENSIFY_SHARE = 2 / 3
 NESTED_DENSIFY_LEAST = 4000
-"""A stage that continues the coarser level's field densifies for this share of the iterations in which it otherwise
-would, but for at least as many as the second says, or for all where there are fewer. It has its surfaces, and what it
-adds late in a long run costs more time than it is worth; in a short one it is what is missing (fox, 3,000 iterations:
-0.4 dB)."""
+"""A stage that continues the coarser level's field densifies for this share of the usual iterations, but for at least
+this number, or for all of them if there are fewer. Its surfaces exist already: in a long run late densification costs
+more time than it gains, in a short run it is needed."""
 
 
 class Hierarchy(str, Enum):
-    """What the field of a level is for, if not of the coarsest."""
+    """What the field of each level but the coarsest represents."""
 
     NESTED = "nested"
-    """The whole image: the coarser level's field, trained on at the finer size."""
+    """The whole image: the coarser level's field, trained further at the finer size."""
     LAPLACIAN = "laplacian"
-    """A signed residual, added to what the coarser fields make: the paper's."""
+    """A signed residual, added to the upsampled image of the coarser fields: the paper's."""
 
 
-DEFAULT_HIERARCHY = Hierarchy.NESTED
-"""Of `lapgs train`, `lapgs run` and experiments. On bonsai residuals lose 0.4 to 0.6 dB and nested levels, about as
-fast, next to nothing; these need no patched rasterizer, and a frame takes what one field's does (docs/gsplat.md).
-
-It is no default of what is read: runs that do not say what their levels are were trained before there was a choice, as
-`Hierarchy.LAPLACIAN`."""
+DEFAULT_HIERARCHY = Hierarchy.LAPLACIAN
+"""Default of every command: the paper's method."""
 
 
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
-    """Size (width, height) of a pyramid level: halved `level` times, odd sizes rounded up.
+    """Return the size (width, height) of a pyramid level: halved `level` times, odd sizes rounded up.
 
     >>> level_size((1063, 533), 1)
     (532, 267)
@@ -68,13 +66,13 @@ def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the schedule: which level is trained, at what size, for how long.
+    """One stage: which level is trained, at what size, for how long.
 
     Attributes:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
         image_size: (width, height) in pixels of this level for an image of the plan's size.
         iterations: optimizer steps of this stage, at least 1.
-        signed: True for a residual (raw SH value, zero background), False for the base and where levels are nested.
+        signed: True for a residual (raw SH value, zero background), False for the base and for nested levels.
     """
 
     level: int
@@ -85,16 +83,16 @@ class Stage:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """The stages in training order, coarsest first; contiguous and validated.
+    """The stages of a run in training order, coarsest first.
 
     Attributes:
-        stages: one a level.
-        hierarchy: what the fields after the first are for. Where nothing else is said they are residuals, which is what
-            a loop of one's own composes (examples/); our commands always say.
+        stages: one per level.
+        hierarchy: what the fields after the first represent. The default is residuals, which custom training loops
+            compose (examples/); our commands always pass it.
 
     Raises:
-        UserInputError: the stages do not run from the coarsest level down to 0, one is too small to train, or one is
-            signed that should not be or the reverse.
+        UserInputError: the levels do not run from the coarsest down to 0, a stage has no iterations or is too small to
+            train, or `signed` does not fit the hierarchy.
     """
 
     stages: tuple[Stage, ...]
@@ -129,7 +127,7 @@ class StagePlan:
         return iter(self.stages)
 
     def __getitem__(self, level: int) -> Stage:
-        """The stage that trains `level`."""
+        """Return the stage that trains `level`."""
         return self.stages[self.levels - 1 - level]
 
     @classmethod
@@ -141,19 +139,23 @@ class StagePlan:
         split: Sequence[Fraction] | None = None,
         hierarchy: Hierarchy = Hierarchy.LAPLACIAN,
     ) -> StagePlan:
-        """A plan for `levels` levels whose stages share `iterations` as `split` says.
+        """Make a plan of `levels` levels whose stages share `iterations` by `split`.
 
         Args:
-            image_size: (width, height) of level 0; with views of several sizes, the smallest.
-            iterations: total optimizer steps, at least one a level.
+            image_size: (width, height) of level 0; the smallest if views differ in size.
+            iterations: total optimizer steps, at least one per level.
             levels: number of levels L, at least 1.
-            split: share of each stage, coarsest first, summing to 1; None takes `DEFAULT_SPLITS`, and for more than
-                four levels thirds at both ends with the middle shared evenly.
-            hierarchy: what the fields after the first are for.
+            split: share of each stage, coarsest first, summing to 1. None takes `DEFAULT_SPLITS`; with more than four
+                levels, the first and last stage get a third each and the others share the rest evenly.
+            hierarchy: what the fields after the first represent.
+
+        Raises:
+            UserInputError: fewer iterations than levels, shares that are not one positive number per level or do not
+                sum to 1, or a level too small to train.
         """
         if levels < 1:
             raise UserInputError(f"--levels {levels}: expected at least 1")
-        # First, as what follows takes time and memory for every level.
+        # Checked first: the rest takes time and memory for every level.
         _require_side(levels - 1, levels, level_size(image_size, min(levels - 1, max(image_size).bit_length())))
         if iterations < levels:
             raise UserInputError(f"--iterations {iterations}: expected at least one for each of the {levels} levels")
@@ -170,10 +172,10 @@ class StagePlan:
             )
         ends = [round(iterations * sum(split[: i + 1], Fraction(0))) for i in range(levels)]
         counts = [end - start for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-        adds = hierarchy is Hierarchy.LAPLACIAN
+        residuals = hierarchy is Hierarchy.LAPLACIAN
         return cls(
             tuple(
-                Stage(level, level_size(image_size, level), count, signed=adds and level != levels - 1)
+                Stage(level, level_size(image_size, level), count, signed=residuals and level != levels - 1)
                 for level, count in zip(range(levels - 1, -1, -1), counts, strict=True)
             ),
             hierarchy,
@@ -195,7 +197,7 @@ def continues_field(stage: Stage, levels: int) -> bool:
 
 
 def nested_densify_until(until: int) -> int:
-    """The last iteration in which a field that goes on densifies, where its stage otherwise would until `until`.
+    """Return the last iteration of densification of a continued field, whose stage would otherwise densify to `until`.
 
     >>> nested_densify_until(7500), nested_densify_until(5000), nested_densify_until(750)
     (5000, 4000, 750)

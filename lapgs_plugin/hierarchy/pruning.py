@@ -1,7 +1,7 @@
-"""Gaussians that hardly anything is seen of.
+"""Find Gaussians with negligible visibility in the training views.
 
-When densification ends many Gaussians lie behind others, cover less than a pixel, or were grown where nothing was
-missing. All of them are projected, sorted and stepped in every iteration that is left, and in every frame after.
+When densification ends, many Gaussians are hidden, cover less than a pixel, or add nothing. Each still costs time in
+every later iteration and every frame.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from lapgs_plugin.hierarchy.inheritance import SH_C0
 
 
 def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:
-    """(n,) how much of a view each Gaussian makes up at most, in pixels: its weights alpha T, summed over the view.
+    """Return each Gaussian's visibility (n,) in pixels: the sum of its blending weights alpha T in its best view.
 
-    A weight is the derivative of a pixel by the Gaussian's colour, so one backward pass a view gives all sums. The
-    largest over the views, and not their sum, because what a single view shows belongs to the scene as well.
+    A weight is the derivative of a pixel by the Gaussian's colour, so one backward pass per view gives all sums. They
+    are not added over views, because a surface seen in a single view belongs to the scene as well.
 
     Args:
-        images: (3, h, w) of the views that count, rendered one after the other, without SH beyond `coefficients`.
+        images: (3, h, w) of the views, rendered one after the other, without SH above `coefficients`.
         coefficients: (n, 1, 3) of the constant harmonic, with gradients; such that no colour is clamped, as zeros are.
     """
     most = torch.zeros_like(coefficients[:, 0, 0], requires_grad=False)
@@ -32,14 +32,14 @@ def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:
 
 
 def least_blended(pixels: Tensor, share: float) -> Tensor:
-    """(n,) bool, the most Gaussians that together make up at most a share of the sum of `pixels`.
+    """Return a mask (n,) of the least visible Gaussians that together have at most a share of total visibility.
 
     Args:
-        pixels: (n,) of each, not negative.
-        share: from 0, for those alone that are blended nowhere, to below 1.
+        pixels: (n,) visibility of each, not negative.
+        share: from 0, which selects only Gaussians that are never blended, to below 1.
     """
     ordered, order = pixels.double().sort()
     total = ordered.sum()
     least = torch.zeros_like(pixels, dtype=torch.bool)
-    least[order] = (ordered.cumsum(0) <= share * total) & (total > 0)  # where nothing is seen nothing can be said
+    least[order] = (ordered.cumsum(0) <= share * total) & (total > 0)  # without any visibility there is no order
     return least

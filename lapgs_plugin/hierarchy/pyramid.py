@@ -1,21 +1,19 @@
-"""Image pyramids: Down and Up as one paired object, Gaussian and Laplacian pyramids, reconstruction.
+"""Build image pyramids: Down and Up as a pair, Gaussian and Laplacian pyramids, reconstruction.
 
-Down is the 5-tap binomial blur of Burt and Adelson (1983) followed by halving, odd sides rounded up; Up resizes to the
+Down is the 5-tap binomial blur of Burt and Adelson (1983) followed by halving, odd sides rounded up. Up resizes to the
 exact finer size and applies the same blur. Both act on rows and columns separately, preserve constants, and clamp
-nothing. Two pixel grids say where a coarse pixel lies among the fine ones, for a side of n fine and m = ceil(n / 2)
-coarse pixels:
+nothing.
 
-    camera   coarse i is at fine (i + 0.5) n / m - 0.5, so that a camera with the same field of view at the coarse size
-             sees the pixel where it is. For even n it is the middle of a pair of fine pixels.
-    even     coarse i is at fine 2 i: every second pixel is kept, as OpenCV's pyrDown does. Against the cameras the
-             image is shifted by half a fine pixel a level.
+A pixel grid defines where a coarse pixel lies among the fine ones. For a side of n fine and m = ceil(n / 2) coarse
+pixels:
 
-The even grid blurs a little less: on the 50 photos of the fox scene its first residual holds 18 % less energy at full
-size and 8 % less at a quarter. Trained (a quarter of the size, 1500 iterations, two levels, two seeds), the camera grid
-is 0.15 and 0.34 dB better on held-out views all the same, and it is the default.
+    camera   coarse i is at fine (i + 0.5) n / m - 0.5, where a camera with the same field of view at the coarse size
+             sees it. For even n it is the middle of a pair of fine pixels. This is the default.
+    even     coarse i is at fine 2 i: every second pixel is kept, as in OpenCV's pyrDown. It blurs a little less, and
+             the image is shifted against the cameras by half a fine pixel per level.
 
-The paper authors' release pairs Down of the even grid with Up of the camera grid, half a fine pixel apart. Their runs
-are rendered on that grid, "mixed"; it is no choice for training.
+The paper authors' release pairs Down of the even grid with Up of the camera grid, half a fine pixel apart. Its runs are
+rendered on that grid, "mixed", which is not offered for training.
 """
 
 from __future__ import annotations
@@ -31,18 +29,18 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import GRIDS
 
 MIXED_GRID = "mixed"
-"""Down of "even" and Up of "camera": the grid of runs that the paper authors' release trained."""
+"""Down of "even" with Up of "camera": the grid of runs of the paper authors' release."""
 BLUR_RADIUS = 2
 
 
 class Pyramid:
-    """Down and Up on one pixel grid, and the pyramids they make.
+    """Downsample and upsample images on one pixel grid, and build pyramids.
 
     Images are (..., h, w) of any float type on any device, usually (3, h, w); results have the type and device of their
     argument. Half-precision images are filtered in float32 and rounded once. Everything is linear and differentiable.
 
     Args:
-        grid: "camera" or "even", or "mixed" for runs of the paper authors' release, see the module.
+        grid: "camera" or "even", or "mixed" for runs of the paper authors' release; see the module.
 
     Raises:
         UserInputError: another name.
@@ -54,7 +52,7 @@ class Pyramid:
         self.grid = grid
 
     def down(self, image: Tensor) -> Tensor:
-        """Down: (..., h, w) to (..., ceil(h / 2), ceil(w / 2))."""
+        """Downsample (..., h, w) to (..., ceil(h / 2), ceil(w / 2))."""
         values = _working_precision(image)
         for dim in (-2, -1):  # rows first: halving them is cheap and halves the work on the columns
             fine = values.shape[dim]
@@ -62,7 +60,7 @@ class Pyramid:
         return values.to(image.dtype)
 
     def up(self, image: Tensor, size: tuple[int, int]) -> Tensor:
-        """Up: (..., ceil(h / 2), ceil(w / 2)) to (..., h, w).
+        """Upsample (..., ceil(h / 2), ceil(w / 2)) to (..., h, w).
 
         Args:
             image: the coarser image.
@@ -79,7 +77,7 @@ class Pyramid:
         return values.to(image.dtype)
 
     def up_taps(self, fine: int) -> tuple[Tensor, Tensor]:
-        """Up along one side as sums: fine sample i is that of weights[i, k] * coarse[first[i] + k] over k.
+        """Return Up along one side as weighted sums: fine[i] = sum over k of weights[i, k] * coarse[first[i] + k].
 
         Args:
             fine: samples of the finer side.
@@ -104,7 +102,7 @@ class Pyramid:
         return first, weights.scatter_add_(1, torch.where(used, parts - first[:, None], 0), shares)
 
     def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
-        """Gaussian pyramid: I^0 = `image`, I^(l+1) = Down(I^l), finest first.
+        """Build the Gaussian pyramid I^0 = `image`, I^(l+1) = Down(I^l), finest first.
 
         Raises:
             UserInputError: fewer than one level.
@@ -117,7 +115,7 @@ class Pyramid:
         return images
 
     def laplacian(self, image: Tensor, levels: int) -> list[Tensor]:
-        """Laplacian pyramid: R^l = I^l - Up(I^(l+1)) for l < levels - 1, then I^(levels-1); finest first.
+        """Build the Laplacian pyramid R^l = I^l - Up(I^(l+1)) for l < levels - 1, then I^(levels-1); finest first.
 
         Raises:
             UserInputError: fewer than one level.
@@ -127,27 +125,27 @@ class Pyramid:
         return [*residuals, images[-1]]
 
     def reconstruct(self, pyramid: Sequence[Tensor]) -> Tensor:
-        """The image of a Laplacian pyramid, finest level first: I^l = Up(I^(l+1)) + R^l, down to level 0."""
+        """Return the image of a Laplacian pyramid, finest level first: I^l = Up(I^(l+1)) + R^l, down to level 0."""
         image = pyramid[-1]
         for residual in reversed(pyramid[:-1]):
             image = self.up(image, _size(residual)) + residual
         return image
 
     def _coarse_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
-        """Where the coarse samples lie among the fine ones: the first, the distance between two, how many."""
+        """Return where coarse samples lie among the fine ones: first position, spacing, count."""
         if self.grid != "camera":
             return 0.0, 2.0, coarse
         return 0.5 * fine / coarse - 0.5, fine / coarse, coarse
 
     def _fine_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
-        """Where the fine samples lie among the coarse ones."""
+        """Return where fine samples lie among the coarse ones, likewise."""
         if self.grid == "even":
             return 0.0, 0.5, fine
         return 0.5 * coarse / fine - 0.5, coarse / fine, fine
 
 
 def require_half(image: Tensor, size: tuple[int, int]) -> None:
-    """Check that an image can be raised to (h, w) = `size`.
+    """Check that an image can be upsampled to (h, w) = `size`.
 
     Raises:
         UserInputError: it is not half of that, rounded up.
@@ -161,14 +159,14 @@ def require_half(image: Tensor, size: tuple[int, int]) -> None:
 
 
 def transposed_taps(first: Tensor, weights: Tensor, samples: int) -> tuple[Tensor, Tensor]:
-    """Taps of the transposed sums: what gradients take back.
+    """Return the taps of the transposed sums, which gradients take.
 
     Args:
-        first (n,), weights (n, k): sums over `samples` samples, as `Pyramid.up_taps` gives them.
-        samples: how many.
+        first (n,), weights (n, k): sums over coarse samples, as `Pyramid.up_taps` returns them.
+        samples: number of coarse samples.
 
     Returns:
-        first (samples,) and weights (samples, j) of sums over n samples, in the same form.
+        first (samples,) and weights (samples, j) of sums over n fine samples, in the same form.
     """
     n, taps = weights.shape
     summed = first[:, None] + torch.arange(taps)  # (n, k)
@@ -198,7 +196,7 @@ def _blur(image: Tensor, dim: int) -> Tensor:
     before, after = _mirrored(n, image.device)
     padded = torch.cat([image.index_select(dim, before), image, image.index_select(dim, after)], dim)
     taps = [padded.narrow(dim, offset, n) for offset in range(2 * BLUR_RADIUS + 1)]
-    # Sums of shifted views: several times faster than a convolution with one channel on a CPU.
+    # Sums of shifted views: faster on a CPU than a convolution of one channel.
     total = taps[0] + taps[4]
     return total.add_(taps[1], alpha=4).add_(taps[3], alpha=4).add_(taps[2], alpha=6).mul_(1 / 16)
 
@@ -206,20 +204,20 @@ def _blur(image: Tensor, dim: int) -> Tensor:
 @lru_cache(maxsize=256)
 @torch.inference_mode(False)  # kept for others, who may need gradients
 def _mirrored(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Which samples stand for those just before and after the n of a side; sides of 1 and 2 mirror repeatedly."""
+    """Return the samples that pad a side of n before and after; sides of 1 and 2 are mirrored repeatedly."""
     before, after = _reflected(torch.tensor([[-2, -1], [n, n + 1]]), n).to(device)
     return before, after
 
 
 def _reflected(positions: Tensor, n: int) -> Tensor:
-    """Which of the n samples of a side stand for those at integer positions, mirrored at its ends."""
+    """Map integer positions to the n samples of a side, mirrored at its ends."""
     period = max(2 * (n - 1), 1)
     around = positions % period
     return torch.minimum(around, period - around).clamp_max(n - 1)
 
 
 def _sample(image: Tensor, dim: int, centres: tuple[float, float, int]) -> Tensor:
-    """Linear interpolation along one dimension at evenly spaced positions, constant beyond the ends."""
+    """Interpolate one dimension linearly at evenly spaced positions; constant beyond the ends."""
     lower, upper, fraction = _neighbours(image.shape[dim], centres, image.dtype, image.device)
     if fraction is None:
         return _take(image, dim, lower)
@@ -229,7 +227,7 @@ def _sample(image: Tensor, dim: int, centres: tuple[float, float, int]) -> Tenso
 
 
 def _take(image: Tensor, dim: int, index: Tensor) -> Tensor:
-    """Samples of one dimension. On a CPU index_select copies whole rows fast, and is the slowest way for columns."""
+    """Select samples of one dimension. On a CPU index_select is fast for rows and slow for columns."""
     return image[..., index] if dim == -1 else image.index_select(dim, index)
 
 
@@ -238,7 +236,7 @@ def _take(image: Tensor, dim: int, index: Tensor) -> Tensor:
 def _neighbours(
     n: int, centres: tuple[float, float, int], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Samples on both sides of each position and the weight of the upper one, None when all are on samples."""
+    """Return the samples on both sides of each position, and the upper one's weight; None if all are on samples."""
     first, distance, count = centres
     positions = (first + distance * torch.arange(count, dtype=torch.float64)).clamp(0, n - 1)
     lower = positions.floor().long()

@@ -1,135 +1,161 @@
-"""Declare what a user can choose about a hierarchy, for `lapgs train` and `lapgs run` alike. Imports no torch."""
+"""Declare the options of a hierarchy, which `lapgs train` and `lapgs run` share. Imports no torch."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, RESIDUAL_SPLIT, Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import option
 
 GRIDS = ("camera", "even")
-"""Pixel grids of a pyramid, see `pyramid`."""
+"""Pixel grids of a pyramid; see `pyramid`."""
 INHERIT_MODES = ("geometry", "xyz", "full")
 DEFAULT_INHERITANCE = "geometry"
 PLACES = ("gpu", "memory", "disk")
-"""Where images of a stage can wait, see `runs.image_store`."""
+"""Where images of a stage can be kept; see `runs.image_store`."""
 PRECISIONS = ("float32", "float16", "uint8")
 AUTO = "auto"
-"""Left to the device and to the images' size."""
+"""Chosen by the device and the images' size."""
 
 COARSE_THRESHOLD = {Hierarchy.NESTED: 2.0, Hierarchy.LAPLACIAN: 1.0}
-"""Factor on densification thresholds for each time that images are halved. Coarse images have less detail than
-gradients, and nested levels carry every Gaussian of a coarse level to the end."""
+"""Default factor on densification thresholds for each halving of the images. Coarse levels would otherwise grow more
+Gaussians than their detail needs, and nested levels keep every one of them to the end."""
 JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
-"""Share of a residual stage, its last, in which the finished fields are trained along: a frozen coarse level cannot
-correct errors that the finer level is unable to represent."""
+"""Default share of a residual stage, at its end, in which the finished coarser fields are trained as well: a frozen
+coarse level cannot correct errors that the finer level is unable to represent."""
 RESIDUAL_COLOR_RATE = 4.0
-"""Factor on the SH learning rates of residual stages, which start from zero colour and have fewer iterations."""
+"""Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
 
 PANEL = "Hierarchy"
 STORAGE = "Memory and speed"
 
 ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate", "residual_threshold", "residual_resets")
-"""Fields that nested levels have no use for."""
+"""Settings that mean nothing for nested levels."""
+
+
+PROTOCOLS = ("default", "paper")
+PAPER: Mapping[str, object] = {
+    "hierarchy": Hierarchy.LAPLACIAN.value,
+    "supervision": RECONSTRUCTED,
+    "inherit": "xyz",
+    "joint": 0.0,
+    "residual_color_rate": 1.0,
+    "residual_threshold": 1.0,
+    "residual_resets": True,
+    "coarse_threshold": 1.0,
+    "prune": 0.0,
+}
+"""Settings of the paper's main tables, except the split of two levels. Other settings classes add their own."""
+PAPER_SPLIT = "1/3,2/3"
 
 
 @dataclass(frozen=True)
 class HierarchySettings:
-    """Choose the levels of a run and how they are trained.
-
-    None stands for the hierarchy's own default.
+    """Choose the levels of a run and how they are trained. None stands for the hierarchy's default.
 
     Raises:
-        UserInputError: a value is none of what it can be, or is about residuals where levels are nested.
+        UserInputError: a value is unknown or out of range, or about residuals although levels are nested.
     """
 
     hierarchy: str = option(
         DEFAULT_HIERARCHY.value,
-        "What finer levels are. laplacian: the paper's signed residuals, added to the upsampled coarser image. "
-        "nested: the coarser level's field, trained further at the finer size; it makes the whole image alone and ends "
-        "as one plain PLY.",
+        "Kind of hierarchy. laplacian: each level trains a signed residual, which is added to the upsampled coarser "
+        "image, as in the paper. nested: each level continues training the coarser level's field at the finer size; "
+        "the result is one ordinary field.",
         panel=PANEL,
     )
-    levels: int = option(2, "Number of levels; 1 trains a plain single field, the baseline.", panel=PANEL)
+    protocol: str = option(
+        "default",
+        "default: the settings of this program. paper: exactly those of the paper's main tables; options that "
+        "contradict them are refused.",
+        panel=PANEL,
+    )
+    levels: int = option(
+        2,
+        "Number of resolutions, each half of the next finer one; 1 trains a single field at full size, the baseline.",
+        panel=PANEL,
+    )
     split: str | None = option(
         None,
-        "Share of the iterations of each stage, coarsest first, such as 1/3,2/3. Default: 1/2,1/2 nested, 1/3,2/3 with "
-        "residuals.",
+        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2.",
         panel=PANEL,
     )
     supervision: str = option(
         RECONSTRUCTED,
-        "Loss of residual stages: reconstructed compares the composed image with the photo; online_residual and "
-        "gt_laplacian compare the residual alone (ablations of the paper).",
+        "Loss of residual levels. reconstructed: compare the composed image with the photo. online_residual, "
+        "gt_laplacian: compare the residual alone (ablations of the paper).",
         panel=PANEL,
     )
     inherit: str | None = option(
         None,
-        "What a residual field starts from: geometry (the default; everything but colour), xyz (positions, as in the "
-        "paper) or full "
-        "(all parameters and the optimizer's state). A ratio in (0, 1] keeps that share of the Gaussians: 0.5 or "
-        "xyz:0.5.",
+        "What a residual field copies from the coarser level: geometry (everything but colour), xyz (positions, as in "
+        "the paper) or full (all parameters and the optimizer's state). A ratio in (0, 1] keeps that share of the "
+        f"Gaussians: 0.5 or xyz:0.5. Default: {DEFAULT_INHERITANCE}.",
         panel=PANEL,
     )
     joint: float | None = option(
         None,
-        "Share of each residual stage, its last, in which the finished coarser fields are optimized too; 0 freezes "
-        f"them as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
+        "Share of each residual level's iterations, at the end, in which the coarser fields are optimized as well; 0 "
+        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
         panel=PANEL,
     )
     residual_color_rate: float | None = option(
         None,
-        f"Factor on the SH learning rates of residual stages. Default: {RESIDUAL_COLOR_RATE:g}; the paper's is 1.",
+        f"Factor on the SH learning rates of residual levels. Default: {RESIDUAL_COLOR_RATE:g}; the paper's is 1.",
         panel=PANEL,
     )
     coarse_threshold: float | None = option(
         None,
-        "Factor on the gradient thresholds of densification for each time that images are halved: above 1 gives coarse "
-        f"levels fewer Gaussians. Default: {COARSE_THRESHOLD[Hierarchy.NESTED]:g} nested, "
-        f"{COARSE_THRESHOLD[Hierarchy.LAPLACIAN]:g} with residuals.",
+        "Factor on the gradient thresholds of densification for each halving of the images; above 1 coarse levels get "
+        f"fewer Gaussians. Default: {COARSE_THRESHOLD[Hierarchy.NESTED]:g} nested, "
+        f"{COARSE_THRESHOLD[Hierarchy.LAPLACIAN]:g} laplacian.",
         panel=PANEL,
     )
     residual_threshold: float = option(
-        1.0, "Factor on the gradient thresholds of densification in residual stages.", panel=PANEL
+        1.0, "Factor on the gradient thresholds of densification in residual levels.", panel=PANEL
     )
     residual_resets: bool = option(
-        False, "Reset opacities in residual stages, too, as in the paper; otherwise only in the base's.", panel=PANEL
+        False, "Reset opacities in residual levels as well as in the base, as in the paper.", panel=PANEL
     )
     grid: str = option(
         "camera",
-        "Pixel grid of the pyramid: camera (aligned with the cameras) or even (every second pixel, as OpenCV).",
+        "Pixel grid of the image pyramid: camera (aligned with the cameras) or even (every second pixel, as OpenCV).",
         panel=PANEL,
     )
     prune: float = option(
         0.0,
-        "When a stage's densification ends, remove the least visible Gaussians, together this share of total "
-        "visibility; 0 removes none. 0.005 removes about a fifth of them.",
+        "When a level's densification ends, remove the least visible Gaussians, together this share of total "
+        "visibility in the training views, such as 0.005; 0 removes none.",
         panel=PANEL,
     )
     images_on: str = option(
         AUTO,
-        "Where level images and cached predictions are kept: gpu, memory, disk, or auto by their size.",
+        "Where training images and cached predictions of coarser levels are kept: gpu, memory, disk, or auto by their "
+        "size.",
         panel=STORAGE,
         names=("--images-on", "--cache"),
     )
     prediction_precision: str = option(
         AUTO,
-        "Precision of cached predictions before they are upsampled: float32, float16 or uint8. auto: float16 on a GPU, "
-        "else float32.",
+        "Precision of cached predictions of coarser levels: float32, float16 or uint8. auto: float16 on a GPU, float32 "
+        "on a CPU.",
         panel=STORAGE,
         names=("--prediction-precision", "--cache-precision"),
     )
-    seed: int = option(0, "Seed of every random choice that lapgs makes.")
+    seed: int = option(0, "Seed of all random choices of lapgs.")
 
     def __post_init__(self) -> None:
+        _require("--protocol", self.protocol, PROTOCOLS)
+        if self.protocol == "paper":
+            self._follow_the_paper()
         kind = self.kind
-        SUPERVISIONS[self.supervision]  # raises what is to be said of an unknown one
+        SUPERVISIONS[self.supervision]  # raises for an unknown name
         _require("--grid", self.grid, GRIDS)
         _require("--images-on", self.images_on, (AUTO, *PLACES))
         _require("--prediction-precision", self.prediction_precision, (AUTO, *PRECISIONS))
@@ -146,7 +172,7 @@ class HierarchySettings:
             )
         if not 0.0 <= self.prune < 1.0:
             raise UserInputError(
-                f"--prune {self.prune}: expected a share from 0, where nothing is pruned, to below 1, as 0.005"
+                f"--prune {self.prune}: expected a share from 0, where nothing is pruned, to below 1, such as 0.005"
             )
         for name, factor in (
             ("--residual-color-rate", self.color_factor),
@@ -157,6 +183,25 @@ class HierarchySettings:
                 raise UserInputError(f"{name} {factor}: expected a positive factor")
         if kind is Hierarchy.NESTED:
             self._refuse_residual_settings()
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """Values of `--protocol paper` by field."""
+        return {**PAPER, **({"split": PAPER_SPLIT} if self.levels == 2 else {})}
+
+    def _follow_the_paper(self) -> None:
+        """Set the paper's values.
+
+        Raises:
+            UserInputError: another value was given.
+        """
+        defaults = {each.name: each.default for each in fields(self)}
+        for name, value in self.paper_settings.items():
+            if (given := getattr(self, name)) not in (defaults[name], value):
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} {given} with --protocol paper: the paper has {value}; leave one out"
+                )
+            object.__setattr__(self, name, value)  # the dataclass is frozen
 
     def _refuse_residual_settings(self) -> None:
         idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0, "residual_threshold": 1.0}
@@ -169,7 +214,7 @@ class HierarchySettings:
 
     @property
     def kind(self) -> Hierarchy:
-        """What finer levels are."""
+        """The kind of hierarchy."""
         _require("--hierarchy", self.hierarchy, [each.value for each in Hierarchy])
         return Hierarchy(self.hierarchy)
 
@@ -180,7 +225,7 @@ class HierarchySettings:
 
     @property
     def joint_share(self) -> float:
-        """Share of each residual stage, its last, that trains finished fields along, 0 to 1."""
+        """Share of each residual stage, at its end, that also trains the coarser fields; 0 to 1."""
         return JOINT_SHARE[self.kind] if self.joint is None else self.joint
 
     @property
@@ -200,24 +245,23 @@ class HierarchySettings:
 
     @property
     def inherit_mode(self) -> str:
-        """What a level starts from, a mode of `inheritance.inherit`."""
+        """What a level inherits, a mode of `inheritance.inherit`."""
         return "full" if self.nested else parse_inheritance(self.inherit or DEFAULT_INHERITANCE)[0]
 
     @property
     def inherit_ratio(self) -> float:
-        """Share of the coarser level's Gaussians that a level starts with."""
+        """Share of the coarser level's Gaussians that a level inherits."""
         return parse_inheritance(self.inherit or DEFAULT_INHERITANCE)[1]
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:
-        """Share of the iterations of each stage, coarsest first; None leaves them to `StagePlan`."""
+        """Share of each stage in the iterations, coarsest first; None for the default of `StagePlan`."""
         if self.split is not None:
             return parse_split(self.split)
-        two_levels = self.levels == len(RESIDUAL_SPLIT)
-        return RESIDUAL_SPLIT if two_levels and not self.nested else DEFAULT_SPLITS.get(self.levels)
+        return DEFAULT_SPLITS.get(self.levels)
 
     def resolved(self) -> dict[str, Any]:
-        """Return all fields with nothing left to the hierarchy's defaults, for manifests: these may change."""
+        """Return all fields for manifests, with the hierarchy's defaults filled in: these may change later."""
         values = asdict(self)
         values["split"] = None if self.shares is None else ",".join(map(str, self.shares))
         values["joint"], values["coarse_threshold"] = self.joint_share, self.coarse_factor
@@ -226,9 +270,9 @@ class HierarchySettings:
         return values
 
     def joint_from(self, stage: Stage) -> int | None:
-        """Return the first iteration, from 1, of a stage's joint training; None when it has none.
+        """Return the first iteration, from 1, of a stage's joint training; None if it has none.
 
-        There is none in the base's stage, and none where residuals are supervised alone: nothing is composed there.
+        The base has none, and neither have residuals that are supervised alone: no image is composed then.
 
         >>> HierarchySettings(hierarchy="laplacian", joint=0.25).joint_from(Stage(0, (800, 533), 20_000, signed=True))
         15001
@@ -240,13 +284,13 @@ class HierarchySettings:
 
 
 def _require(name: str, value: str, known: Collection[str]) -> None:
-    """Raise a UserInputError about a value that is not known."""
+    """Check that a value is known."""
     if value not in known:
         raise UserInputError(f"{name} {value}: expected {' or '.join(known) if len(known) == 2 else ', '.join(known)}")
 
 
 def parse_split(text: str) -> tuple[Fraction, ...]:
-    """Return the shares that a text such as "1/3,2/3" or "0.25,0.75" names.
+    """Parse shares such as "1/3,2/3" or "0.25,0.75".
 
     Raises:
         UserInputError: a share is not a number.
@@ -258,7 +302,7 @@ def parse_split(text: str) -> tuple[Fraction, ...]:
 
 
 def parse_inheritance(text: str) -> tuple[str, float]:
-    """Return mode and ratio of --inherit: MODE, RATIO or MODE:RATIO.
+    """Parse --inherit into mode and ratio: MODE, RATIO or MODE:RATIO.
 
     >>> parse_inheritance("xyz:0.5"), parse_inheritance("0.25")
     (('xyz', 0.5), ('geometry', 0.25))

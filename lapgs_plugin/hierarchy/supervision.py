@@ -1,4 +1,4 @@
-"""Decide which two images the loss of a residual stage compares. Imports no torch."""
+"""Choose the two images that the loss of a residual stage compares. Imports no torch."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 
 class Supervision(ABC):
-    """Supervise a residual stage (the paper's section on loss design). The base has only one way.
+    """Supervise a residual stage (the paper's section on loss design). A base is always compared with its target.
 
     Notation: I^l is level l of the ground truth's Gaussian pyramid, I_hat^l the composed prediction, R_hat^l the
     rendered residual, I_hat^l = Up(I_hat^(l+1)) + R_hat^l.
 
     Attributes:
-        needs_coarse: whether `pair` looks at Up(I^(l+1)) of the ground truth.
-        composes: whether the loss sees the composed image, so that coarser fields can be trained along.
+        needs_coarse: whether `pair` needs Up(I^(l+1)) of the ground truth.
+        composes: whether the loss sees the composed image, so that coarser fields can be trained as well.
     """
 
     needs_coarse: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class Supervision(ABC):
 
 
 class Reconstructed(Supervision):
-    """I_hat^l against I^l: the default. Finer levels correct the errors of coarser ones."""
+    """Compare I_hat^l with I^l, the default. Finer levels correct the errors of coarser ones."""
 
     composes = True
 
@@ -51,7 +51,7 @@ class Reconstructed(Supervision):
 
 
 class OnlineResidual(Supervision):
-    """R_hat^l against I^l - Up(I_hat^(l+1)), the residual of what was predicted so far; both are signed."""
+    """Compare R_hat^l with I^l - Up(I_hat^(l+1)), the residual of the prediction so far; both are signed."""
 
     def pair(
         self, image: Tensor, target: Tensor, accumulated: Tensor, coarse_target: Tensor | None
@@ -60,14 +60,14 @@ class OnlineResidual(Supervision):
 
 
 class GtLaplacian(Supervision):
-    """R_hat^l against I^l - Up(I^(l+1)), the ground truth's own Laplacian; both are signed."""
+    """Compare R_hat^l with I^l - Up(I^(l+1)), the ground truth's Laplacian; both are signed."""
 
     needs_coarse = True
 
     def pair(
         self, image: Tensor, target: Tensor, accumulated: Tensor, coarse_target: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        assert coarse_target is not None, "it is asked for by `needs_coarse`"
+        assert coarse_target is not None, "`needs_coarse` asks for it"
         return image - accumulated, target - coarse_target
 
 

@@ -1,4 +1,4 @@
-"""Which rasterizer renders a finished run here: the one it was trained with, or the nearest that there is."""
+"""Choose the rasterizer that renders a finished run: the one of its training, or the most similar one available."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers import gsplat
 from lapgs_plugin.rasterizers.extensions import (
     CONSTANTS,
     SEMANTICS,
@@ -20,6 +19,7 @@ from lapgs_plugin.rasterizers.extensions import (
     import_extension,
     options_of,
 )
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.runs.archive import Manifest
@@ -28,39 +28,39 @@ logger = logging.getLogger(__name__)
 
 DEVICES = ("auto", "cuda", "cpu")
 RASTER_SETTINGS = "raster"
-"""Key of a manifest's settings that holds those of the rasterizer which the images depend on, such as {"mult": 0.5}."""
+"""Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
 
 
 @dataclass(frozen=True)
 class PlacedRasterizer:
-    """A rasterizer and where its fields have to be.
+    """A rasterizer and the device of its fields.
 
     Attributes:
         rasterizer: renders the run.
         device: of the fields.
-        lost: settings of the run that it cannot honour.
+        unsupported: settings of the run that it does not have.
     """
 
     rasterizer: Rasterizer
     device: torch.device
-    lost: Mapping[str, Any]
+    unsupported: Mapping[str, Any]
 
 
 def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "auto") -> PlacedRasterizer:
-    """What renders a run, and one log line that says what and why.
+    """Choose what renders a run, and log the choice with its reason.
 
-    Left to itself it takes the rasterizer that the run was trained with, where it can be imported and there is a CUDA
-    device for it; then gsplat, where there is one; then the fast CPU rasterizer.
+    "auto" takes the rasterizer of the training if it can be imported and has its device, then gsplat if it can render
+    here, then the fast CPU rasterizer.
 
     Args:
         manifest: of the run.
-        device: "cuda" or "cpu"; "auto" takes CUDA where there is any.
-        rasterizer: "auto" for what is said above, "cpu", "oracle", "gsplat", or the module of an extension. On a CPU
-            that one's stand-in renders: exact in every setting, and slow.
+        device: "cuda" or "cpu"; "auto" takes CUDA if there is a device.
+        rasterizer: "auto", "cpu", "oracle", "gsplat", or the module of an extension. On a CPU the extension's stand-in
+            renders, which has all its settings and is slow.
 
     Raises:
-        UserInputError: another device or name, or a device that this machine or the rasterizer does not have.
-        MissingExtraError: the rasterizer asked for is not installed.
+        UserInputError: an unknown device or name, or a device that this machine or the rasterizer does not have.
+        MissingExtraError: the requested rasterizer is not installed.
     """
     if device not in DEVICES:
         raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
@@ -68,21 +68,21 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
         raise UserInputError("--device cuda: PyTorch sees no CUDA device; `lapgs doctor` says why, or use --device cpu")
     settings = _raster_settings(manifest)
     if rasterizer == "auto":
-        placed, why = _best(manifest.rasterizer, device, settings)
+        placed, why = _most_similar(manifest.rasterizer, device, settings)
     else:
         placed, why = _named(rasterizer, device, settings), "as asked for"
-    _say(manifest, placed, why)
+    _log_choice(manifest, placed, why)
     return placed
 
 
 def _raster_settings(manifest: Manifest) -> dict[str, Any]:
-    """The run's settings that are not what every rasterizer does anyway."""
+    """Return the run's rasterizer settings that differ from the defaults."""
     given = manifest.settings.get(RASTER_SETTINGS, {})
     return {name: value for name, value in given.items() if value != CONSTANTS.get(name)}
 
 
-def _best(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
-    """The nearest to the rasterizer a run was trained with, and why it is that one."""
+def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
+    """Return the available rasterizer that is most similar to that of the training, and the reason."""
     same = "the one it was trained with"
     if trained in CPU_RASTERIZERS and device != "cuda":
         return _named(trained, "cpu", settings), same
@@ -104,7 +104,7 @@ def _best(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[Place
 
 
 def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
-    """The rasterizer of that name with those of the settings that it knows."""
+    """Return the rasterizer of a name with the settings that it has."""
     if name in CPU_RASTERIZERS:
         if device == "cuda":
             raise UserInputError(f"--rasterizer {name} --device cuda: it runs on the CPU; leave --device out")
@@ -112,8 +112,8 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     if name == gsplat.NAME:
         if device == "cpu":
             raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
-        known, lost = _split(settings, {"antialiasing"})
-        return PlacedRasterizer(gsplat.GsplatRasterizer(**known), torch.device("cuda"), lost)
+        known, unsupported = _split(settings, {"antialiasing"})
+        return PlacedRasterizer(gsplat.GsplatRasterizer(**known), torch.device("cuda"), unsupported)
     if name in SEMANTICS:
         return _extension(name, device, settings)
     raise UserInputError(
@@ -122,30 +122,32 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
 
 
 def _extension(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
+    """Return an extension, or its stand-in on a CPU."""
     if device == "cpu" or not torch.cuda.is_available():
         from lapgs_plugin.reference_raster.standins import stand_ins
 
         place, module = "cpu", stand_ins(STAND_INS[name])[name]
     else:
         place, module = "cuda", import_extension(name)
-    known, lost = _split(settings, options_of(module))
+    known, unsupported = _split(settings, options_of(module))
     extension = CudaExtension(name, place, settings=known, module=module)
-    return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), lost)
+    return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
 
 
 def _split(settings: Mapping[str, Any], known: frozenset[str] | set[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split settings into known and other ones."""
     inside = {name: value for name, value in settings.items() if name in known}
     return inside, {name: value for name, value in settings.items() if name not in known}
 
 
-def _say(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
+def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     name = placed.rasterizer.name
     place = torch.cuda.get_device_name() if placed.device.type == "cuda" else "the CPU"
     line = f"rendering with {name} on {place}: {why}"
     if name != manifest.rasterizer:
         line += f"; the run was trained with {manifest.rasterizer}, images may differ slightly"
-    if placed.lost:
-        values = ", ".join(f"{key} = {value}" for key, value in placed.lost.items())
+    if placed.unsupported:
+        values = ", ".join(f"{key} = {value}" for key, value in placed.unsupported.items())
         line += f"; {name} cannot honour {values} of the training"
         if manifest.rasterizer in STAND_INS:
             line += f" (--rasterizer {manifest.rasterizer} can, slowly on a CPU)"

@@ -1,7 +1,7 @@
-"""CUDA rasterizers of the 3DGS family behind the one interface `fields.rasterizer.Rasterizer`.
+"""Wrap CUDA rasterizers of the 3DGS family for the interface `fields.rasterizer.Rasterizer`.
 
-They are forks of one another with the same Python face, so one wrapper serves all. What a build takes is read off the
-fields of its settings and the arguments of its rasterizer, never off a version: several forks share one module name.
+They are forks with the same Python interface, so one wrapper serves all. The features of a build are read from its
+settings' fields and its rasterizer's arguments, never from a version, because several forks share one module name.
 """
 
 from __future__ import annotations
@@ -37,60 +37,60 @@ SEMANTICS = {
         "few hundredths",
     ),
 }
-"""The modules, and where each departs from the oracle by design."""
+"""Known modules and their differences from the oracle by design."""
 
 STAND_INS = {"diff_gaussian_rasterization": "graphdeco-aa", "diff_gaussian_rasterization_fastgs": "fastgs"}
-"""The stand-in that knows every setting of a module's builds which changes the image."""
+"""Stand-in with every setting of a module's builds that changes the image."""
 
 CONSTANTS: dict[str, Any] = {
     "scale_modifier": 1.0,
     "prefiltered": False,
     "debug": False,
-    "antialiasing": False,  # another image than the paper's
-    "mult": 1.0,  # the ellipse alpha = 1/255 whole: less cuts off visible borders of Gaussians
+    "antialiasing": False,  # changes the image of the paper
+    "mult": 1.0,  # the whole ellipse alpha = 1/255; less cuts off visible borders of Gaussians
     "get_flag": False,
     "pixel_weights": None,
 }
-"""Settings that are the same in every call, unless a run was trained with others."""
+"""Settings of every call, unless a run was trained with others."""
 VARYING = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
     "metric_map",
 )  # fmt: skip
-"""Settings that each call sets."""
+"""Settings of a single call."""
 NEAR, FAR = 0.01, 100.0
-"""Clipping planes of the projection matrix; the kernels use its other rows only."""
+"""Clipping planes of the projection matrix; the kernels only use its other rows."""
 SH_REST_COUNT = 15
 """Coefficients above the first at degree 3."""
-LOOKED_AT = 65536
-"""Gaussians looked at, about, for one that is certain to be in a tile."""
+SAMPLED = 65536
+"""Approximate number of Gaussians in which `_surely_blends` searches."""
 MARGIN = 0.01
-"""How far inside the image, in pixels, a centre counts as certain to be."""
-MODERATE = 100.0
-"""Largest standard deviation, in pixels on the optical axis, of a Gaussian that counts as certain to be in a tile."""
+"""Least distance in pixels of a centre from the image border, for `_surely_blends`."""
+LARGEST_DEVIATION = 100.0
+"""Largest standard deviation in pixels on the optical axis, for `_surely_blends`."""
 VISIBLE_LOGIT = math.log(2.4 / (255 - 2.4))
-"""Opacity over exp(5/6) / 255, and still under the 0.01 that training resets opacities to."""
+"""Logit of an opacity above exp(5/6) / 255 and below the 0.01 to which training resets opacities."""
 COMPANION_OPACITY = 1.05 / 255
 POINT_DIMMING = 0.005
-"""What antialiasing leaves of the opacity of a Gaussian that is a point."""
+"""Factor of antialiasing on the opacity of a Gaussian without extent."""
 
 
 def installed_extensions() -> list[str]:
-    """Modules of `SEMANTICS` that can be imported, found without importing them."""
+    """Return the installed modules of `SEMANTICS`, without importing them."""
     return [name for name in SEMANTICS if importlib.util.find_spec(name) is not None]
 
 
 class CudaExtension:
-    """One installed extension; see `lapgs_plugin.rasterizers.signed_color.Extension`.
+    """Render with an installed extension; see `signed_color.Extension`.
 
     Args:
         name: of its module, one of `SEMANTICS`.
-        device: where it renders; a stand-in for the CPU renders there.
-        settings: what to set instead of `CONSTANTS`, such as {"mult": 0.5}.
+        device: that renders; the CPU for a stand-in.
+        settings: values that replace those of `CONSTANTS`, such as {"mult": 0.5}.
         module: the module of that name; None imports it.
 
     Raises:
         MissingExtraError: it is not installed, or was built for another PyTorch.
-        UserInputError: its settings have a field that is not known, or lack one of `settings`.
+        UserInputError: its settings have an unknown field, or lack one of `settings`.
     """
 
     def __init__(
@@ -113,9 +113,9 @@ class CudaExtension:
                 f"{', '.join(sorted(options_of(module)))}"
             )
         self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
-        # The first rasterizer to take DC apart also was the first to blend a tile's Gaussians in buckets of 32.
+        # Rasterizers that take SH of degree 0 separately also blend a tile's Gaussians in buckets of 32.
         self._in_buckets = self._takes_dc
-        # One that also sums absolute gradients puts them behind the ordinary ones.
+        # Rasterizers with this setting return absolute gradients after the ordinary ones.
         self._absolute = "metric_map" in self._settings
         self._module = module
 
@@ -129,15 +129,13 @@ class CudaExtension:
 
     @property
     def semantics(self) -> Semantics:
-        """Where it departs from the oracle."""
+        """Its differences from the oracle."""
         return SEMANTICS[self._name]
 
     def render(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
     ) -> RenderResult:
-        """Render without looking at `field.signed`; see `lapgs_plugin.rasterizers.signed_color.Extension`.
-
-        The result has no transmittance, which the extension does not return.
+        """Render without regard to `field.signed`; see `signed_color.Extension`. The result has no transmittance.
 
         Raises:
             UserInputError: a tensor is not float32, or not on `device`.
@@ -161,22 +159,20 @@ class CudaExtension:
         means2d: Tensor,
         absgrad2d: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """(3, h, w) image and (n,) radii."""
+        """Return image (3, h, w) and radii (n,)."""
         n = len(field)
         inputs = {
             "means3D": field.means,
-            "means2D": _Screen.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
+            "means2D": _ScreenPoints.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
                 means2d, camera.width, camera.height, 4 if self._absolute else 3, absgrad2d
             ),
             "opacities": torch.sigmoid(field.opacity_logits)[:, None],  # (n, 1)
             "scales": torch.exp(field.log_scales),
-            "rotations": torch.nn.functional.normalize(
-                field.quaternions, dim=-1
-            ),  # the kernels leave that to the caller
+            "rotations": torch.nn.functional.normalize(field.quaternions, dim=-1),  # the kernels expect it
             **(self._sh_inputs(field.sh) if colors is None else {"colors_precomp": colors}),
         }
-        # Without Gaussians the kernels leave out the background. With none in any tile, those that blend in buckets
-        # write beyond their tiles' ranges, or launch a grid of no blocks in the backward pass.
+        # Without Gaussians the kernels render no background. With none in any tile, those that blend in buckets write
+        # out of bounds, or launch an empty grid in the backward pass.
         antialiasing = "antialiasing" in self._settings and bool(self._constants["antialiasing"])
         if n == 0 or (self._in_buckets and (antialiasing or not _surely_blends(field, camera))):
             inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
@@ -196,7 +192,7 @@ class CudaExtension:
             return {"shs": sh}
         rest = sh[:, 1:]
         if rest.shape[1] == 0:
-            # A tensor without elements has no address, and without one their backward pass skips the first too.
+            # An empty tensor has no address, and without one the backward pass also skips degree 0.
             rest = sh.new_zeros(len(sh), SH_REST_COUNT, 3)
         return {"dc": sh[:, :1], "shs": rest}
 
@@ -222,10 +218,10 @@ class CudaExtension:
         return self._module.GaussianRasterizationSettings(**{name: values[name] for name in self._settings})
 
 
-class _Screen(torch.autograd.Function):
-    """(n, 2) centres in pixels -> (n, columns) zeros that the extension takes for its screen-space points.
+class _ScreenPoints(torch.autograd.Function):
+    """(n, 2) centres in pixels -> (n, columns) zeros for the extension's screen-space points.
 
-    Its gradient for them is by normalised device coordinates, of which the image is 2 wide and high.
+    Their gradient is by normalised device coordinates, in which the image is 2 wide and high.
     """
 
     @staticmethod
@@ -242,12 +238,12 @@ class _Screen(torch.autograd.Function):
 
 
 def options_of(module: ModuleType) -> frozenset[str]:
-    """Which of `CONSTANTS` the extension knows."""
+    """Return the names of `CONSTANTS` that the extension has."""
     return frozenset(CONSTANTS) & frozenset(module.GaussianRasterizationSettings._fields)
 
 
 def import_extension(name: str) -> ModuleType:
-    """The module of that name.
+    """Import an extension's module.
 
     Raises:
         MissingExtraError: it is not installed, or was built for another PyTorch.
@@ -261,7 +257,11 @@ def import_extension(name: str) -> ModuleType:
 
 
 def _known_settings(module: ModuleType) -> tuple[str, ...]:
-    """Names of the fields of the extension's settings."""
+    """Return the field names of the extension's settings.
+
+    Raises:
+        UserInputError: one is unknown.
+    """
     names: tuple[str, ...] = module.GaussianRasterizationSettings._fields
     unknown = [name for name in names if name not in CONSTANTS and name not in VARYING]
     if unknown:
@@ -273,35 +273,35 @@ def _known_settings(module: ModuleType) -> tuple[str, ...]:
 
 
 def _surely_blends(field: GaussianField, camera: Camera) -> bool:
-    """Whether some Gaussian is certain to be in a tile, however kernels round; False may mean that it was not found.
+    """Return whether some Gaussian is certainly in a tile, whatever kernels round. False may mean that none was found.
 
-    A tile takes in a Gaussian whose alpha reaches 1/255 somewhere between its first and last pixels. One whose centre
-    is in the image is at most half a pixel each way from such a place, where with 0.3 px^2 or more of variance alpha
-    is still exp(-5/6) of its opacity.
+    A tile includes a Gaussian whose alpha reaches 1/255 between the tile's first and last pixels. A centre in the image
+    is at most half a pixel in each direction from such a position, where alpha is, with a variance of 0.3 px^2 or more,
+    at least exp(-5/6) of the opacity.
     """
     with torch.no_grad():
-        step = len(field) // LOOKED_AT + 1
+        step = len(field) // SAMPLED + 1
         field = field.with_parameters({name: value[::step] for name, value in field.parameters.items()})
         pose = camera.world_to_camera.to(field.means)
         depths = field.means @ pose[2, :3] + pose[2, 3]  # (m,)
         centres = _centres(field, camera)  # (m, 2)
         last = centres.new_tensor([camera.width - 1, camera.height - 1])  # (2,)
         inside = ((centres >= MARGIN) & (centres <= last - MARGIN)).all(1)  # (m,)
-        # A footprint of a few hundred pixels at most: the determinant of its covariance cannot round to 0, which culls.
-        moderate = torch.exp(field.log_scales.amax(1)) * max(camera.fx, camera.fy) < MODERATE * depths  # (m,)
+        # The determinant of a large footprint's covariance could round to 0, which culls.
+        moderate = torch.exp(field.log_scales.amax(1)) * max(camera.fx, camera.fy) < LARGEST_DEVIATION * depths  # (m,)
         visible = field.opacity_logits > VISIBLE_LOGIT  # (m,)
         return bool((inside & moderate & visible & (depths > 2 * NEAR_DEPTH)).any())
 
 
 def _with_companion(inputs: dict[str, Tensor], camera: Camera, opacity: float) -> dict[str, Tensor]:
-    """A rasterizer's inputs with a last Gaussian that is in a tile and in no pixel: no bit of the image is another.
+    """Append a Gaussian that is in a tile but changes no pixel.
 
-    It is a point between the first four pixels, where its alpha, of that opacity, is just over 1/255. At the pixels,
-    which the 0.3 px^2 let it reach, it is less than half of that.
+    It is a point between the first four pixels, where its alpha is just over 1/255. At the pixels, which it reaches by
+    the 0.3 px^2 that are added to its variance, it is less than half of that.
     """
     rows = {name: value.new_zeros(1, *value.shape[1:]) for name, value in inputs.items()}
     pose = camera.world_to_camera.to("cpu", torch.float64)
-    # Far enough for float32, which knows the centre to an epsilon of the camera's distance from the origin.
+    # Far enough for float32, whose rounding of the centre grows with the camera's distance from the origin.
     depth = 1 + float(pose[:3, 3].norm())
     point = torch.tensor([(1 - camera.cx) / camera.fx, (1 - camera.cy) / camera.fy, 1.0], dtype=torch.float64) * depth
     rows["means3D"] = ((point - pose[:3, 3]) @ pose[:3, :3])[None].to(rows["means3D"])  # (1, 3)
@@ -312,7 +312,7 @@ def _with_companion(inputs: dict[str, Tensor], camera: Camera, opacity: float) -
 
 
 def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
-    """World to camera, and world to clip space, both (4, 4) float32 as the kernels read them: column after column."""
+    """Return world to camera and world to clip space, both (4, 4) float32 and transposed, as the kernels read them."""
     world_to_camera = camera.world_to_camera.to("cpu", torch.float64)
     x, y, width, height = camera.fx, camera.fy, camera.width, camera.height
     clip = torch.tensor(
@@ -330,8 +330,8 @@ def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def _centres(field: GaussianField, camera: Camera) -> Tensor:
-    """(n, 2) projected centres in pixels, of no meaning behind the camera."""
+    """Return projected centres in pixels, (n, 2); meaningless behind the camera."""
     pose = camera.world_to_camera.to(field.means)
     x, y, depth = (field.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)  # (n,) each
     centres = torch.stack([camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1)
-    return centres.nan_to_num(0, 0, 0)  # a depth of zero times the zero that culls it would stay not a number
+    return centres.nan_to_num(0, 0, 0)  # NaN of a depth of 0 would survive the multiplication by 0 that culls it

@@ -1,8 +1,8 @@
-"""Signed colour: how one call asks a CUDA rasterizer for the raw SH value instead of max(SH + 0.5, 0), and what happens
-where the installed one does not know how.
+"""Render signed colour, the raw SH value instead of max(SH + 0.5, 0), with CUDA rasterizers.
 
-Whether an extension knows is found by rendering one Gaussian with it, never by reading a version. Where it does not, SH
-is evaluated in PyTorch and the same rasterizer gets precomputed colours: the same image, slower.
+A patched extension takes a flag for it. Whether the installed one supports the flag is tested by rendering a Gaussian,
+not read from a version. If it does not, PyTorch evaluates SH and the extension gets precomputed colours: the same
+image, slower.
 """
 
 from __future__ import annotations
@@ -29,60 +29,60 @@ from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 logger = logging.getLogger(__name__)
 
 SIGNED_COLOR_SET = "signed-color"
-"""The set of edits in `patches/*.toml` that teaches a rasterizer the bit."""
+"""The set of edits in `patches/*.toml` that adds the flag to a rasterizer."""
 
 PROBE_TOLERANCE = 1e-3
-"""Largest error of the probe's image and gradient: float32 gives 1e-6, a colour map of another kind about 1."""
+"""Largest error of the probe's image and gradient: rounding gives 1e-6, a wrong colour map about 1."""
 
 
 class ColorPath(Enum):
-    """How the colours of a signed field reach the blending kernel."""
+    """How the colours of a signed field are computed: by the extension, or by PyTorch before it."""
 
     NATIVE = "native"
     PRECOMPUTED = "precomputed"
 
 
 class Extension(Protocol):
-    """A rasterizer as its adapter presents it, before signed colour is decided on."""
+    """A wrapped rasterizer that has to be told how to render signed colour."""
 
     @property
     def name(self) -> str:
-        """The name of its Python module."""
+        """Name of its Python module."""
         ...
 
     @property
     def device(self) -> torch.device:
-        """Where fields have to be."""
+        """Device of fields."""
         ...
 
     def render(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
     ) -> RenderResult:
-        """Render without looking at `field.signed`.
+        """Render without regard to `field.signed`.
 
         Args:
             field: n Gaussians on `device`.
             camera: the view.
             background: (3,) colour behind everything.
-            sh_degree: handed on as it is, flag included.
-            colors: (n, 3) the Gaussians' colours; the field's SH and `sh_degree` are then not looked at.
+            sh_degree: passed on unchanged, with the flag.
+            colors: (n, 3) the Gaussians' colours; SH and `sh_degree` are then ignored.
         """
         ...
 
 
 def signed_degree(degree: int) -> int:
-    """The `sh_degree` to pass for signed colour of this SH degree, 0 to 3."""
+    """Return the `sh_degree` that asks for signed colour of an SH degree, 0 to 3."""
     return degree | SIGNED_COLOR_BIT
 
 
 class SignedColorRasterizer:
-    """An extension as a `Rasterizer` that renders signed fields on the fastest path it has.
+    """Render with an extension as a `Rasterizer`, signed fields on its fastest path.
 
     Args:
-        extension: what renders.
-        path: the path for signed fields; None finds out with the first of them, and says once what it costs if it is
-            the slow one.
-        checkout: folder where the sources of the extension are looked for, to say what is wrong with the build.
+        extension: that renders.
+        path: for signed fields; None tests the extension at the first signed field, and logs advice once if it needs
+            the slow path.
+        checkout: folder with the extension's sources, for that advice.
     """
 
     def __init__(self, extension: Extension, *, path: ColorPath | None = None, checkout: Path | None = None) -> None:
@@ -96,7 +96,7 @@ class SignedColorRasterizer:
 
     @cached_property
     def path(self) -> ColorPath:
-        """How signed fields are rendered."""
+        """The path of signed fields."""
         if self._forced is not None:
             return self._forced
         if has_signed_color(self._extension):
@@ -119,12 +119,12 @@ class SignedColorRasterizer:
 
 
 def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Tensor:
-    """The Gaussians' colours seen from a camera, (n, 3), evaluated and differentiated by PyTorch.
+    """Evaluate the Gaussians' colours from a camera in PyTorch, (n, 3), with gradients.
 
     Args:
         field: n Gaussians; `field.signed` chooses the colour map.
         camera: the view.
-        degree: highest SH degree evaluated.
+        degree: highest SH degree to evaluate.
     """
     position = camera.position.to(field.means)  # (3,)
     directions = torch.nn.functional.normalize(field.means - position, dim=-1)  # (n, 3)
@@ -132,7 +132,7 @@ def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Ten
 
 
 def has_signed_color(extension: Extension) -> bool:
-    """Whether the extension as it is installed renders and differentiates signed colour, found by trying."""
+    """Test whether the installed extension renders and differentiates signed colour."""
     field, camera, degree = _probe_scene(extension.device)
     expected = precomputed_colors(field, camera, degree)[0]  # (3,) of both signs
     with torch.enable_grad():
@@ -149,15 +149,15 @@ def has_signed_color(extension: Extension) -> bool:
         unseen = extension.render(field, camera, background=white, sh_degree=0, colors=black).image[0]  # (h, w)
     weight = 1 - unseen  # of the only Gaussian
     image_error = (result.image.detach() - weight * expected[:, None, None]).abs().max()
-    # The image is weight * C0 * sh_0 in each channel, so all have the same gradient unless a clamp is remembered in the
-    # negative ones. Its size is not looked at: an extension whose backward pass loses part of it still has the colours.
+    # The image is weight * C0 * sh_0 in each channel, so all channels have the same gradient unless the negative ones
+    # were clamped. Its size is not tested: a backward pass that loses part of it does not make colours wrong.
     slope = float(weight.sum()) / math.sqrt(4 * math.pi)
     spread = float(gradient[0, 0].max() - gradient[0, 0].min())
     return bool(image_error <= PROBE_TOLERANCE) and slope > 0 and spread <= PROBE_TOLERANCE * slope
 
 
 def _probe_scene(device: torch.device) -> tuple[GaussianField, Camera, int]:
-    """One Gaussian before a camera, whose colour needs SH of degree 1 and is negative in two channels."""
+    """Return a Gaussian, a camera and an SH degree of 1, such that the colour is negative in two channels."""
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4, device=device))
     sh = torch.zeros(1, 4, 3)
     sh[0, 0] = torch.tensor([-2.0, 1.0, -1.0])
@@ -174,11 +174,11 @@ def _probe_scene(device: torch.device) -> tuple[GaussianField, Camera, int]:
 
 
 def explain_fallback(module: str, checkout: Path) -> str:
-    """Why signed colour takes the slow path, and the command that gets the fast one; one line.
+    """Explain in one line why signed colour takes the slow path, and the command for the fast one.
 
     Args:
         module: name of the extension's Python module.
-        checkout: folder of the backbone, or of the rasterizer alone; it need not be one.
+        checkout: folder of the backbone or of the rasterizer; it may be any folder.
     """
     slow = (
         f"{module} has no signed colour: residual fields are rendered with SH evaluated in PyTorch, correct but slower"
@@ -196,9 +196,9 @@ def explain_fallback(module: str, checkout: Path) -> str:
 
 
 def _sources(module: str, checkout: Path) -> Iterator[Target]:
-    """Known extensions in the checkout that install this module."""
+    """Yield the known extensions in the checkout that install this module."""
     try:
         targets = find_targets(checkout)
-    except PatchError:  # no checkout, or none with a rasterizer in it: the message says less then
+    except PatchError:  # no checkout with a rasterizer: the message is then more general
         return
     yield from (target for target in targets if (target.folder / module).is_dir())

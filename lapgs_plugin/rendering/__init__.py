@@ -1,5 +1,6 @@
-"""Rendering finished hierarchies: composing their levels, and writing the images."""
+"""Render finished hierarchies and write the images."""
 
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
+from lapgs_plugin.ops.composition import Composition
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
 __all__ = ["Composition", "HierarchyRenderer"]

@@ -1,4 +1,4 @@
-"""A camera path as a clip: a video, or a folder of numbered images."""
+"""Render a camera path to a video or a folder of numbered images."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.trajectory import with_size
 from lapgs_plugin.rendering.video import FrameSink, video_writer
@@ -26,14 +27,14 @@ from lapgs_plugin.scenes.images import write_image
 VIDEO = ".mp4"
 MIN_SIDE, MAX_SIDE = 16, 16384
 MAX_PENDING = 16
-"""Images that wait to be written; more would only fill the memory."""
+"""Most images that wait to be written; more would only take memory."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """A size as (width, height) from "1280x720".
+    """Parse a size such as "1280x720" into (width, height).
 
     Raises:
-        UserInputError: it is not of that form, or out of range.
+        UserInputError: the text has another form, or the size is out of range.
     """
     found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
     size = (int(found[1]), int(found[2])) if found else (0, 0)
@@ -46,20 +47,20 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def is_video(out: Path) -> bool:
-    """Whether a clip of that name is one file, and no folder of images."""
+    """Return whether a clip of this name is a video rather than a folder of images."""
     return out.suffix.lower() == VIDEO
 
 
 def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tuple[int, int]:
-    """Width and height of each view of a clip.
+    """Return width and height of each view of a clip.
 
     Args:
         camera: of the path.
-        wanted: as asked for, None for the camera's own size.
-        out: where the clip goes; a video's sides are even.
+        wanted: requested size, None for the camera's own, which is rounded down to even sides for a video.
+        out: video or folder.
 
     Raises:
-        UserInputError: a video of an odd size was asked for.
+        UserInputError: a video of an odd size was requested.
     """
     width, height = wanted or (camera.width, camera.height)
     if not is_video(out) or width % 2 == height % 2 == 0:
@@ -82,20 +83,20 @@ def render_clip(
     panels: bool,
     image_format: str = "png",
 ) -> None:
-    """Render a path and write it.
+    """Render a path to a file or a folder.
 
     Args:
         renderer: of the run.
-        cameras: one a frame.
+        cameras: one per frame.
         out: an .mp4 file, or a folder for frame_00000.png and so on.
-        level: finest level to add; coarser ones are brought to full size.
+        level: finest level to add; the image is upsampled to full size.
         size: (width, height) of a view.
         fps: frames a second of a video.
         panels: base, residuals and composition side by side instead of the composition alone.
-        image_format: "png" or "exr", of a folder's images; EXR holds residuals as they are.
+        image_format: "png" or "exr", of a folder's images; EXR stores residuals with their sign.
 
     Raises:
-        LapgsError: what is written cannot be.
+        LapgsError: the file or folder cannot be written.
     """
     shown = renderer.levels - level + 1 if panels else 1
     writer = video_writer(out, (size[0] * shown, size[1]), fps) if is_video(out) else _image_writer(out, image_format)
@@ -104,17 +105,17 @@ def render_clip(
         task = progress.add_task(f"Rendering {out.name}", total=len(cameras))
         for camera in cameras:
             sized = with_size(camera, size)
-            write(_panels(renderer, sized, level, raw) if panels else _whole(renderer, sized, level))
+            write(_panels(renderer, sized, level, raw) if panels else _composed(renderer, sized, level))
             progress.advance(task)
 
 
-def _whole(renderer: HierarchyRenderer, camera: Camera, level: int) -> Tensor:
-    """The composition down to `level` at the size of the view, (3, h, w)."""
+def _composed(renderer: HierarchyRenderer, camera: Camera, level: int) -> Tensor:
+    """Render the composition down to `level` at the size of the view, (3, h, w)."""
     return to_full_size(renderer.images([camera], level)[0], camera, level, renderer.pyramid)
 
 
 def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) -> Tensor:
-    """Base, residuals and composition side by side at the size of the view, (3, h, panels * w)."""
+    """Render base, residuals and composition side by side at the size of the view, (3, h, panels * w)."""
     composition = renderer.render(camera, level)
     whole = to_full_size(composition.composed[level], camera, level, renderer.pyramid)
     base = to_full_size(composition.base, camera, renderer.levels - 1, renderer.pyramid)
@@ -127,7 +128,7 @@ def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) 
 
 @contextmanager
 def _image_writer(folder: Path, image_format: str) -> Iterator[FrameSink]:
-    """Write frames as numbered images, on threads: compressing a PNG takes longer than rendering it."""
+    """Write frames as numbered images in threads, because compressing a PNG takes longer than rendering it."""
     pending: deque[Future[None]] = deque()
     numbers = count()
     with ThreadPoolExecutor() as pool:

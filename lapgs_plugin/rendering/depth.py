@@ -1,4 +1,4 @@
-"""How far away the things are that a field shows, by any rasterizer: it renders depths as colours."""
+"""Render depth with any rasterizer, by rendering depths as colours."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class DepthImage:
     """Depth of a view.
 
     Attributes:
-        depth: (h, w) along the optical axis, in world units: the mean of the Gaussians' own, weighted as their colours
-            are. Meaningless where nothing covers a pixel.
+        depth: (h, w) along the optical axis, in world units: the mean depth of the Gaussians with their blending
+            weights. Meaningless where nothing covers a pixel.
         cover: (h, w) sum of these weights, in [0, 1].
     """
 
@@ -29,22 +29,22 @@ class DepthImage:
     cover: Tensor
 
     def to(self, device: torch.device) -> DepthImage:
-        """The same on a device."""
+        """Return the depth image on a device."""
         return DepthImage(self.depth.to(device), self.cover.to(device))
 
 
 @torch.no_grad()
 def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> DepthImage:
-    """Depth of a field from a camera.
+    """Render the depth of a field from a camera.
 
     Args:
-        rasterizer: any; it renders the field with each Gaussian's depth as its (signed) red, and one as its green.
-        field: a base; what a residual adds and takes away has no depth.
+        rasterizer: any; it renders each Gaussian with its depth as (signed) red, and one as green.
+        field: ordinary or a base; a residual has no depth.
         camera: on the field's device or the CPU.
     """
     pose = camera.world_to_camera.to(field.means)
     along = field.means @ pose[2, :3] + pose[2, 3]  # (n,)
     colors = torch.stack([along, torch.ones_like(along), torch.zeros_like(along)], dim=1)  # (n, 3)
-    asking = replace(field.with_parameters({"sh": colors[:, None] / SH_C0}), signed=True)
-    weighted, cover, _ = rasterizer(asking, camera, background=torch.zeros(3).to(field.means), sh_degree=0).image
+    depth_field = replace(field.with_parameters({"sh": colors[:, None] / SH_C0}), signed=True)
+    weighted, cover, _ = rasterizer(depth_field, camera, background=torch.zeros(3).to(field.means), sh_degree=0).image
     return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)

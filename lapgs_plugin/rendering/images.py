@@ -1,4 +1,4 @@
-"""Renders as files: what is shown of each level, and under which name."""
+"""Name the image files of rendered views and convert residuals for viewing."""
 
 from __future__ import annotations
 
@@ -10,29 +10,28 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from lapgs_plugin.rendering.compose import Composition
+from lapgs_plugin.ops.composition import Composition
 
 if TYPE_CHECKING:
     from lapgs_plugin.scenes.scene import View
 
 
 def around_grey(signed: Tensor) -> Tensor:
-    """A signed image as one to look at: zero is mid-grey, -1 black, 1 white."""
+    """Map a signed image to [0, 1]: zero is mid-grey, -1 black, 1 white."""
     return 0.5 + 0.5 * signed
 
 
 def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> dict[str, Tensor]:
-    """The images of a rendered view by the suffix of their file, (3, h, w) each, at their level's size.
+    """Return the images of a rendered view by file suffix, (3, h, w) each, at their level's size.
 
     Args:
         composition: of one or more levels.
-        photo: when given, at the finest composed level's size, adds "compare": photo, composition and their
-            difference side by side.
-        raw: residuals and differences as they are, for formats that hold negative values; otherwise around mid-grey.
+        photo: at the finest composed level's size; adds "compare": photo, composition and difference side by side.
+        raw: keep the sign of residuals and differences, for formats with negative values; otherwise around mid-grey.
 
     Returns:
-        "base", "residual_<l>" for each residual, and "composed", or "composed_<l>" when l is not 0. A single image is
-        not written twice: one level gives "composed" alone, the coarsest level of several "base" alone.
+        "base", "residual_<l>" for each residual, and "composed", or "composed_<l>" if l is not 0. No image is returned
+        twice: a hierarchy of one level gives "composed" alone, the coarsest level of several "base" alone.
     """
     finest = min(composition.composed)
     composed = composition.composed[finest]
@@ -50,9 +49,9 @@ def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> di
 
 
 def file_stems(views: Sequence[View]) -> dict[str, str]:
-    """By view name, what its files are called: the name without extension, unless two views would share it.
+    """Return the file stem of each view: its name without extension, unless two views would share that.
 
-    Folders inside a name are kept, and nothing leads out of the folder that the files go to.
+    Folders in a name are kept, except steps upwards, so that no file is written outside the output folder.
     """
     paths = {view.name: _inside(view.name) for view in views}
     users = Counter(path.with_suffix("") for path in paths.values())
@@ -62,5 +61,5 @@ def file_stems(views: Sequence[View]) -> dict[str, str]:
 
 
 def _inside(name: str) -> PurePosixPath:
-    """The name as a relative path without steps upwards."""
+    """Return a name as a relative path without steps upwards."""
     return PurePosixPath(*(part for part in PurePosixPath(name).parts if part not in ("/", "..")))

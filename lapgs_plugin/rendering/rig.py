@@ -1,4 +1,4 @@
-"""What a scene's cameras have in common: the point they look at, which way is up, how far away they are."""
+"""Measure a scene's cameras together: the point they look at, the up direction, their distance."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from lapgs_plugin.fields.camera import Camera
 Vector = NDArray[np.float64]  # (3,)
 
 RIDGE = 1e-3
-"""Weight of the guess that settles where nearly parallel optical axes meet, against 1 for each axis."""
+"""Weight of the initial guess, against 1 for each optical axis; it matters for nearly parallel axes."""
 NO_LENGTH = 1e-9
-"""Directions of this length and less point nowhere."""
+"""Vectors up to this length have no direction."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene, seen as one thing.
+    """The cameras of a scene and their common geometry.
 
     Attributes:
         cameras: at least one.
-        focus: (3,) point that the optical axes pass nearest to, in world units.
-        up: (3,) unit vector, the mean of what is up in the images.
+        focus: (3,) point nearest to all optical axes, in world units.
+        up: (3,) unit vector, the mean up direction of the images.
         distance: median distance of a camera from the focus, in world units.
     """
 
@@ -58,41 +58,41 @@ class Rig:
 
 
 def camera_positions(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """Centres in world coordinates, (n, 3)."""
+    """Return camera centres in world coordinates, (n, 3)."""
     return np.stack([camera.position.double().numpy() for camera in cameras])
 
 
 def forward(camera: Camera) -> Vector:
-    """Unit vector along the optical axis in world coordinates, (3,)."""
+    """Return the unit vector along the optical axis in world coordinates, (3,)."""
     return np.asarray(_rotation(camera)[2])
 
 
 def unit(vector: Vector) -> Vector:
-    """The vector at length 1; it has one."""
+    """Normalize a vector that is not zero."""
     return vector / np.linalg.norm(vector)
 
 
 def looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
-    """A lens that stands at `place` and looks at `at`, with `up` upwards in its image; all (3,) in world units."""
+    """Return a camera with this lens at `place`, looking at `at`, with `up` upwards in its image; all (3,)."""
     ahead = unit(at - place)
     right = unit(np.cross(ahead, up))
     return posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
 
 
 def posed(lens: Camera, rotation: NDArray[np.float64], place: Vector) -> Camera:
-    """A lens with a pose: rotation camera to world, (3, 3), and centre, (3,)."""
+    """Return a camera with this lens and a pose: rotation camera to world, (3, 3), and centre, (3,)."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ place
     return replace(lens, world_to_camera=torch.from_numpy(pose).float())
 
 
 def _rotation(camera: Camera) -> NDArray[np.float64]:
-    """World to camera, (3, 3): its rows are the image's right, down and forward in world coordinates."""
+    """Return the rotation world to camera, (3, 3): its rows are right, down and forward in world coordinates."""
     return np.asarray(camera.world_to_camera[:3, :3].double().numpy())
 
 
 def _nearest_to_axes(positions: NDArray[np.float64], forwards: NDArray[np.float64]) -> Vector:
-    """The point with the least sum of squared distances from the lines positions + t * forwards, both (n, 3)."""
+    """Return the point with the least sum of squared distances to the lines positions + t * forwards, both (n, 3)."""
     spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
     guess = positions.mean(axis=0) + max(spread, 1.0) * forwards.mean(axis=0)
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # (n, 3, 3)

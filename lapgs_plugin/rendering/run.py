@@ -1,4 +1,4 @@
-"""A run folder put back together: its fields, its scene, and a rasterizer for them."""
+"""Load a run to render it: its fields, its scene, cameras of a path, and a rasterizer."""
 
 from __future__ import annotations
 
@@ -7,22 +7,26 @@ from pathlib import Path
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rasterizers.choice import rasterizer_for
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
 from lapgs_plugin.runs.archive import RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
+
+PATHS = ("orbit", "spline")
 
 
 def run_renderer(
     archive: RunArchive, device: str = "auto", rasterizer: str = "auto", *, finest: int = 0
 ) -> HierarchyRenderer:
-    """A renderer of a run's finished levels.
+    """Return a renderer of a run's finished levels.
 
     Args:
         archive: the run.
-        device, rasterizer: as `rasterizer_for` takes them; what is left to it is the rasterizer of the training, or the
-            nearest that runs here.
-        finest: the finest level that is wanted; fields of finer ones are not read.
+        device, rasterizer: as `rasterizer_for` takes them.
+        finest: the finest level to read.
 
     Raises:
         RunFolderError: no level is finished, or a field is damaged.
@@ -33,16 +37,17 @@ def run_renderer(
 
 
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
-    """The scene a run was trained on, read as it was then.
+    """Load the scene of a run with the settings of the training.
 
     Args:
-        moved_to: where the scene is now; None when it is still where the manifest says.
+        archive: the run.
+        moved_to: current folder of the scene; None if it is where the manifest says.
 
     Raises:
-        RunFolderError: it is not there, or not the scene that the run was trained on.
+        RunFolderError: it is missing, or not the scene that the run was trained on.
         SceneError: it cannot be read.
     """
-    reference, path = _scene_place(archive, moved_to)
+    reference, path = _scene_folder(archive, moved_to)
     scene = load_scene(
         path,
         resolution=reference.resolution,
@@ -55,12 +60,12 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
-    """The cameras a run was trained on and those held out, by view name, without reading their images.
+    """Load the training and held-out cameras of a run by view name, without reading images.
 
     Args, Raises:
         As `run_scene`.
     """
-    reference, path = _scene_place(archive, moved_to)
+    reference, path = _scene_folder(archive, moved_to)
     train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     cameras = [*train.values(), *test.values()]
     smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
@@ -68,8 +73,34 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     return train, test
 
 
-def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
-    """How a run read its scene, and where that is now."""
+def path_cameras(
+    archive: RunArchive, trajectory: str, frames: int | None, default: int, scene: Path | None
+) -> list[Camera]:
+    """Return the cameras of a path, one per frame.
+
+    Args:
+        archive: of the run whose training cameras the path surrounds or follows.
+        trajectory: "orbit", "spline" or a file for `trajectory.read_trajectory`.
+        frames: number of frames; None for `default`, or each camera of a file once.
+        default: frames of an orbit or a spline.
+        scene: current folder of the run's scene; None if it is where the run was trained.
+
+    Raises:
+        UserInputError: the file or one of its cameras cannot be used, or there are more frames than `limits.FRAMES`.
+        RunFolderError, SceneError: the scene is missing or not the run's.
+    """
+    if frames is not None:
+        FRAMES.check(frames, f"--frames {frames}")
+    if trajectory not in PATHS:
+        cameras = read_trajectory(Path(trajectory))
+        return cameras if frames is None else spline(cameras, frames)
+    train = list(run_cameras(archive, scene)[0].values())
+    count = default if frames is None else frames
+    return orbit(Rig.of(train), count) if trajectory == "orbit" else spline(walking_order(train), count)
+
+
+def _scene_folder(archive: RunArchive, moved_to: Path | None) -> tuple[SceneReference, Path]:
+    """Return how a run read its scene, and the current folder of the scene."""
     reference = archive.manifest.scene
     path = Path(reference.path) if moved_to is None else moved_to
     if moved_to is None and not path.is_dir():
@@ -80,7 +111,7 @@ def _scene_place(archive: RunArchive, moved_to: Path | None) -> tuple[SceneRefer
 
 
 def require_same_scene(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
-    """Refuse a scene whose images are not of the size that was trained, before figures of it mislead.
+    """Check that a scene's images have the size that was trained, because metrics would be wrong otherwise.
 
     Args:
         archive: the run.

@@ -1,4 +1,4 @@
-"""How fast a run renders: frames a second over real cameras, level by level, with and without streams."""
+"""Measure how fast a run renders: frames a second over real cameras, level by level, with and without streams."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import render_images
 from lapgs_plugin.hierarchy.cameras import level_camera
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
 ROUNDS = 5
 BATCH = 8
-"""Views that are rendered at once, on a GPU, where there are as many of one size."""
+"""Views in a batch; batches are measured on a GPU if there are as many views of one size."""
 
 Frame = Callable[[Sequence[Camera]], object]
 
@@ -31,8 +31,8 @@ class Speed:
         what: the kind.
         size: (width, height) of a frame of the first camera.
         gaussians: of all fields that are rendered for it.
-        milliseconds: median, over cameras and rounds, from the end of one frame to the end of the next; of a batch its
-            share.
+        milliseconds: median over cameras and rounds, from the end of one frame to the end of the next; for a batch,
+            divided by its views.
     """
 
     what: str
@@ -48,9 +48,9 @@ class Speed:
 def measure_speed(
     renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, rounds: int = ROUNDS
 ) -> list[Speed]:
-    """The speeds of a hierarchy: composed down to `level`, to each coarser one, and each field alone.
+    """Measure a hierarchy: composed down to `level`, to each coarser level, and each field alone.
 
-    Images are composed and clamped, and stay where they are. Every kind is run over all cameras once before.
+    Images are composed and clamped, and stay on the device. Each kind is run over all cameras once before it is timed.
 
     Args:
         renderer: of the run.
@@ -64,14 +64,14 @@ def measure_speed(
 
 
 def composed_speed(renderer: HierarchyRenderer, cameras: Sequence[Camera], rounds: int = ROUNDS) -> Speed:
-    """The fastest of the ways in which all levels are composed, otherwise as `measure_speed`."""
+    """Measure the fastest way to compose all levels; arguments as `measure_speed` takes them."""
     kinds = [kind for kind in _kinds(renderer, 0) if kind.whole]
     return max((_measured(renderer, kind, cameras, rounds) for kind in kinds), key=lambda speed: speed.fps)
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """What is measured.
+    """A kind of frame to measure.
 
     Attributes:
         what: its name.
@@ -79,7 +79,7 @@ class _Kind:
         fields: levels whose fields are rendered.
         size_level: level whose size a frame has.
         views: of a frame.
-        whole: whether a frame is what the hierarchy makes of a view, at full resolution.
+        whole: whether a frame is the complete hierarchy's image at full resolution.
     """
 
     what: str
@@ -99,19 +99,20 @@ def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera
 
 
 def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> Iterator[_Kind]:
-    in_turn = replace(renderer, concurrent=False)
-    ways = {"one after the other": in_turn}
-    if renderer.can_be_concurrent:
-        ways["beside each other"] = replace(renderer, concurrent=True, at_once=0)
-    # Whatever the size: how large an image may be for it to pay is to be seen here.
-    at_once = replace(renderer, concurrent=True, at_once=sys.maxsize) if renderer.can_be_at_once else None
-    if at_once is not None:
-        ways["all at once"] = at_once
+    sequential = replace(renderer, concurrent=False)
+    ways = {"one after the other": sequential}
+    if renderer.by_field.can_use_streams:
+        ways["beside each other"] = replace(renderer, concurrent=True, stack_pixels=0)
+    # At any size: these figures show up to which size it is faster.
+    can_stack = renderer.by_field.can_stack
+    stacked = replace(renderer, concurrent=True, stack_pixels=sys.maxsize) if can_stack else None
+    if stacked is not None:
+        ways["all at once"] = stacked
     coarsest = renderer.levels - 1
     for finest in range(level, coarsest):
         fields = renderer.fields_for(finest)
-        if len(fields) == 1:  # nested levels: there is nothing to be rendered beside it
-            what, of_field = f"level {finest}", {"": in_turn, **({", at once": at_once} if at_once is not None else {})}
+        if len(fields) == 1:  # nested levels: one field, which has nothing to be concurrent with
+            what, of_field = f"level {finest}", {"": sequential, **({", at once": stacked} if stacked else {})}
         else:
             what, of_field = f"levels {coarsest} to {finest}", {f", {way}": composer for way, composer in ways.items()}
         for way, composer in of_field.items():
@@ -120,17 +121,14 @@ def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> It
         fields = renderer.fields_for(level)
         what = "all" if len(fields) > 1 else "field" if coarsest == 0 else f"level {level}"
         yield _Kind(f"{what}, {BATCH} views at once", _composing(renderer, level), fields, level, views=BATCH)
-    yield _Kind(
-        "base" if coarsest > 0 else "field", _composing(in_turn, coarsest), [coarsest], coarsest, whole=coarsest == 0
-    )
-    if at_once is not None and coarsest == 0:
-        # What a hierarchy rendered so compares with.
-        yield _Kind("field, at once", _composing(at_once, 0), [0], 0, whole=True)
-    if coarsest > level:
-        # What it would cost to render it as large as it is shown, instead of bringing it up.
-        yield _Kind(f"base as large as level {level}", _alone(in_turn, coarsest, level), [coarsest], level)
+    base = "base" if coarsest > 0 else "field"
+    yield _Kind(base, _composing(sequential, coarsest), [coarsest], coarsest, whole=coarsest == 0)
+    if stacked is not None and coarsest == 0:  # to compare a stacked hierarchy with
+        yield _Kind("field, at once", _composing(stacked, 0), [0], 0, whole=True)
+    if coarsest > level:  # the cost of rendering the base at full size instead of upsampling it
+        yield _Kind(f"base as large as level {level}", _alone(sequential, coarsest, level), [coarsest], level)
     for residual in range(coarsest - 1, level - 1, -1) if not renderer.nested else ():
-        yield _Kind(f"residual {residual} alone", _alone(in_turn, residual, residual), [residual], residual)
+        yield _Kind(f"residual {residual} alone", _alone(sequential, residual, residual), [residual], residual)
 
 
 def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
@@ -138,15 +136,15 @@ def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
-    field, behind = renderer.field(level), renderer.behind(level)
+    field, background = renderer.field(level), renderer.by_field.background_of(level)
     return lambda cameras: render_images(
-        renderer.rasterizer, field, [level_camera(camera, size_level) for camera in cameras], behind
+        renderer.rasterizer, field, [level_camera(camera, size_level) for camera in cameras], background
     )
 
 
 @torch.no_grad()
 def _median_milliseconds(frame: Frame, frames: Sequence[Sequence[Camera]], warm: int, device: torch.device) -> float:
-    """Median time of a frame; the first `warm` ones only compile kernels and fill PyTorch's caches."""
+    """Return the median time of a frame. The first `warm` frames are not timed: they compile and fill caches."""
     for cameras in frames[:warm]:
         frame(cameras)
     if device.type != "cuda":

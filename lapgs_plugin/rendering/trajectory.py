@@ -1,4 +1,4 @@
-"""Camera paths: around what a scene's cameras look at, through the cameras themselves, or from a file."""
+"""Make camera paths: around the focus of a scene's cameras, through the cameras, or from a file."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from lapgs_plugin.scenes.source import LARGEST, LONGEST_FOCAL, LONGEST_SIDE
 from lapgs_plugin.untrusted import read_json
 
 MAX_KEYS = 24
-"""Cameras that a path through a scene passes; photos taken by hand are too shaky to pass all of many."""
+"""Most cameras that a spline passes; handheld photos are too shaky to pass all of many."""
 
 JUMPING = 2.0
-"""How much longer than a short way through all cameras their order makes it, where it is not one they were taken in."""
+"""Path length in the given order, relative to a short tour, above which the order is not that of capture."""
 
 FACING_SHARE = 0.5
-"""Radius of an orbit before cameras that all stand on one side, as a share of their spread."""
+"""Radius of an orbit, as a share of the cameras' spread, if all cameras are on one side."""
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 1e-3
 
 
 def orbit(rig: Rig, frames: int) -> list[Camera]:
-    """A closed circle, always looking at the rig's focus.
+    """Make a closed circle that looks at the rig's focus.
 
-    Around the focus at the cameras' mean height and distance where they surround it; otherwise a small circle about
-    their mean position, so that nothing is seen from where no photo was taken.
+    If the cameras surround the focus, the circle is around it at their mean height and median distance. Otherwise it is
+    a small circle around their mean position, so that nothing is shown from where no photo was taken.
 
     Args:
         rig: the scene's cameras; the path has the size and lens of the median one.
-        frames: of the clip; the one after the last would be the first again.
+        frames: number of frames; the next would be the first again.
     """
     positions = camera_positions(rig.cameras)
     middle = positions.mean(axis=0)
@@ -64,21 +64,22 @@ def orbit(rig: Rig, frames: int) -> list[Camera]:
 
 
 def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth path through cameras in the order given, from the first to the last.
+    """Make a smooth path through cameras in the given order, from the first to the last.
 
-    Positions follow a cubic spline, orientations one of constant angular acceleration between two cameras; the time
-    between two grows with their distance, so that the speed is about even. Of many cameras every n-th is passed.
+    Positions follow a cubic spline, orientations a spline of constant angular acceleration between two cameras. The
+    time between two cameras grows with their distance, so that the speed is nearly constant. Of many cameras every n-th
+    is passed.
 
     Args:
         cameras: at least one; the path has the size and lens of the median one.
-        frames: of the clip.
+        frames: number of frames.
     """
     keys = [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, MAX_KEYS).round().astype(int))]
     lens = _median_lens(cameras)
     positions = camera_positions(keys)
     rotations = np.stack([key.world_to_camera[:3, :3].double().numpy().T for key in keys])  # (k, 3, 3) camera to world
-    times = _times(positions, rotations)
-    kept = np.concatenate([[True], np.diff(times) > 0])  # two photos from one tripod
+    times = _passing_times(positions, rotations)
+    kept = np.concatenate([[True], np.diff(times) > 0])  # without cameras of the same pose
     times, positions, rotations = times[kept], positions[kept], rotations[kept]
     if len(times) == 1:
         return [posed(lens, rotations[0], positions[0])] * frames
@@ -89,10 +90,9 @@ def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras in an order in which somebody could have walked.
+    """Return cameras in an order for a walk: the given order, or a short tour if that jumps back and forth.
 
-    The order given, which for a video and for most people with a camera is how they walked; where that jumps to and
-    fro, a short way from the first camera past all others.
+    The order of a video, and usually of photos, is how somebody walked.
     """
     positions = camera_positions(cameras)
     distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)  # (n, n)
@@ -103,16 +103,16 @@ def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def read_trajectory(path: Path) -> list[Camera]:
-    """The cameras of a file, in its order: the layout of a Blender-style transforms.json, without images.
+    """Read the cameras of a file in the format of a Blender-style transforms.json, without images.
 
     {"w": 1280, "h": 720, "fl_x": 1100, "frames": [{"transform_matrix": [[...], [...], [...], [...]]}, ...]}
 
-    Each matrix is camera to world with OpenGL's axes (x right, y up, z back). "fl_y" is "fl_x" unless given, "cx" and
-    "cy" the middle, and "camera_angle_x" in radians may replace "fl_x". A frame may have its own of all these but the
-    size.
+    Each matrix is camera to world with OpenGL's axes (x right, y up, z back). "fl_y" defaults to "fl_x", "cx" and "cy"
+    to the image centre, and "camera_angle_x" in radians may replace "fl_x". A frame may override any of these, but
+    not the size.
 
     Raises:
-        UserInputError: the file or one of its cameras is not usable; names the frame.
+        UserInputError: the file or one of its cameras cannot be used; names the frame.
     """
     advice = "give orbit, spline or a JSON file of cameras as in transforms.json"
     values = read_json(path, advice=advice, finite=False)
@@ -137,7 +137,7 @@ def read_trajectory(path: Path) -> list[Camera]:
 
 
 def trajectory_json(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Cameras as `read_trajectory` reads them, all of the first one's size."""
+    """Return cameras in the format of `read_trajectory`, all with the size of the first."""
     first = cameras[0]
     frames = [
         {
@@ -150,7 +150,7 @@ def trajectory_json(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 
 def with_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera with another size and shape: the same vertical field of view, more or less to see at the sides."""
+    """Return the camera with another size and the same vertical field of view."""
     width, height = size
     scale = height / camera.height
     return replace(
@@ -165,7 +165,7 @@ def with_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def _short_tour(distances: NDArray[np.float64]) -> list[int]:
-    """Indices of all points in an order from the first on that is short: to the nearest each time, then 2-opt."""
+    """Return indices of all points in the order of a short tour from the first: nearest neighbour, then 2-opt."""
     tour, left = [0], set(range(1, len(distances)))
     while left:
         tour.append(min(left, key=lambda i: (distances[tour[-1], i], i)))
@@ -215,8 +215,8 @@ def _read_camera(values: dict[str, Any]) -> Camera:
     return Camera(width, height, focal, focal_y, cx, cy, pose)
 
 
-def _times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """When each key is passed, (k,): after the way from the first, a turn counting as half the usual way with it."""
+def _passing_times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return when each key is passed, (k,): by path length, with half the usual length added for a usual turn."""
     ways = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     turns = np.linalg.norm(np.diff(rotations[:, :, 2], axis=0), axis=1)
     usual_way, usual_turn = (float(np.median(steps)) if len(steps) else 0.0 for steps in (ways, turns))
@@ -225,5 +225,5 @@ def _times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> ND
 
 
 def _median_lens(cameras: Sequence[Camera]) -> Camera:
-    """The camera in the middle by field of view; its pose means nothing."""
+    """Return the camera with the median field of view; its pose is not used."""
     return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2]

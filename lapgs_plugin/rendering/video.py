@@ -1,7 +1,7 @@
-"""Video files, by the ffmpeg that imageio-ffmpeg brings: a program of its own, fed with pixels through a pipe.
+"""Write videos with the ffmpeg program of imageio-ffmpeg, which gets pixels through a pipe.
 
-The other well-kept way, PyAV, links FFmpeg's libraries (and x264, which is GPL) into this process; a program beside it
-leaves our licence alone, is what gsplat and nerfstudio use, and a crash of the encoder is an error we can report.
+The alternative, PyAV, links FFmpeg and x264, which is GPL, into this process. A separate program does not affect our
+licence, and its crash is an error that we can report. gsplat and nerfstudio use it as well.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from torch import Tensor
 from lapgs_plugin.errors import LapgsError, MissingExtraError
 
 QUALITY = 8
-"""Of imageio-ffmpeg's 0 to 10, variable bit rate."""
+"""Quality from 0 to 10 for imageio-ffmpeg, at a variable bit rate."""
 
 
 class FrameSink(Protocol):
-    """Takes the frames of a clip, one after the other."""
+    """Take the frames of a clip, one after the other."""
 
     def __call__(self, image: Tensor) -> None:
         """Add a frame.
 
         Args:
-            image: (3, h, w) in [0, 1]; values outside are clamped.
+            image: (3, h, w) in [0, 1]; other values are clamped.
         """
         ...
 
 
 def require_video() -> None:
-    """Check that videos can be written.
+    """Check that imageio-ffmpeg is installed.
 
     Raises:
-        MissingExtraError: they cannot.
+        MissingExtraError: it is not.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingExtraError(
@@ -49,10 +49,10 @@ def require_video() -> None:
 
 @contextmanager
 def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[FrameSink]:
-    """Write an H.264 video that every player knows (yuv420p); the file appears under its name when it is complete.
+    """Write an H.264 video (yuv420p), which every player supports; the file appears when it is complete.
 
     Args:
-        path: an .mp4 file; missing folders are made.
+        path: an .mp4 file; missing folders are created.
         size: (width, height) of every frame, both even.
         fps: frames a second.
 
@@ -63,7 +63,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
     require_video()
     import imageio_ffmpeg
 
-    assert size[0] % 2 == size[1] % 2 == 0, "yuv420p has one colour for two by two pixels"
+    assert size[0] % 2 == size[1] % 2 == 0, "yuv420p has one colour for 2 x 2 pixels"
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,9 +89,9 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
             yield add
         finally:
             writer.close()
-        # Where the disk is full ffmpeg may end early, and nothing says so.
+        # On a full disk ffmpeg may end early without an error.
         if _count_frames(unfinished) != frames:
-            raise OSError("it was cut short")
+            raise OSError("it is truncated")
         unfinished.replace(path)
     except OSError as error:
         reason = " ".join(str(error).split())[-300:]
@@ -102,7 +102,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
 
 
 def _count_frames(path: Path) -> int:
-    """Frames of a video; 0 where it is none."""
+    """Return the number of frames of a video, 0 if the file is not a video."""
     import imageio_ffmpeg
 
     try:

@@ -1,4 +1,4 @@
-"""Charts as geometry: numbers in, coordinates and labels out. The report's template turns them into SVG."""
+"""Lay out charts: turn numbers into coordinates and labels. The report's template turns these into SVG."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 CHARACTER_WIDTH, LINE_HEIGHT = 7.5, 14.0
-"""Of a label, about."""
+"""Approximate size of a label's text."""
 TICKS, INSET_TICKS = 5, 3
 HEADROOM = 1.04
 INSET_POINTS = 3
-"""Points that a line must have at the start for an inset to show more than the chart does."""
+"""Least number of points at the start of a line for an inset."""
 LEAST_SPAN = 0.02
-"""Of an axis, as a share of its largest value: a line that is all but flat needs no labels of six digits."""
+"""Least span of an axis as a share of its largest value, so that labels of a flat line stay short."""
 BAR_STEP = 30.0
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The size of a chart and the margins around its plot, in the chart's own units."""
+    """The size of a chart and the margins around its plot, in chart units."""
 
     width: float
     height: float
@@ -37,20 +37,20 @@ class Frame:
         return self.height - self.top - self.bottom
 
     def x(self, share: float) -> float:
-        """From 0 at the left end of the plot to 1 at its right end."""
+        """Place a share of the plot's width, 0 at the left."""
         return round(self.left + self.plot_width * share, 1)
 
     def y(self, share: float) -> float:
-        """From 0 at the bottom of the plot to 1 at its top."""
+        """Place a share of the plot's height, 0 at the bottom."""
         return round(self.height - self.bottom - self.plot_height * share, 1)
 
 
 WHOLE = Frame(420, 260, left=50, right=14, top=22, bottom=42)
-"""Narrow enough that a phone shows the labels at a readable size."""
+"""Frame of a whole chart, narrow enough that a phone shows readable labels."""
 INSET = Frame(200, 112, left=42, right=10, top=8, bottom=20)
-"""Drawn inside another chart, in the corner that curves which rise and flatten out leave free."""
+"""Frame of an inset, in the corner that rising and flattening curves leave free."""
 INSET_AT = WHOLE.width - WHOLE.right - INSET.width, WHOLE.height - WHOLE.bottom - INSET.height - 6
-"""Of its upper left corner."""
+"""Upper left corner of the inset."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Series:
     """One line.
 
     Attributes:
-        kind: the line's style.
+        kind: style of the line.
         points: (x, y) in data units, by increasing x.
     """
 
@@ -68,19 +68,19 @@ class Series:
 
 @dataclass(frozen=True)
 class Mark:
-    """A moment to point out: a vertical line at x with a word beside it."""
+    """A vertical line at x with a label."""
 
     x: float
     label: str
 
 
 @dataclass(frozen=True)
-class Move:
-    """From one point to another, such as from a backbone alone to the backbone with a hierarchy.
+class Arrow:
+    """An arrow between two points, such as from a baseline to a hierarchy.
 
     Attributes:
-        kind: the arrow's style.
-        label: said where the arrow is pointed at.
+        kind: style of the arrow.
+        label: tooltip.
         start, end: (x, y) in data units.
     """
 
@@ -92,11 +92,11 @@ class Move:
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar of parts that add up.
+    """A bar of parts that add up.
 
     Attributes:
-        label: beside it.
-        parts: name and value of each, in their order.
+        label: text above the bar.
+        parts: name and value of each part, in order.
     """
 
     label: str
@@ -109,7 +109,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Tick:
-    """Where a label of an axis stands, in chart units."""
+    """A label of an axis, in chart units."""
 
     at: float
     label: str
@@ -120,9 +120,9 @@ class PlacedMark:
     """A mark in chart units.
 
     Attributes:
-        at: x of its line and of the start of its label.
-        label: the word.
-        y: baseline of its label; labels that would overlap stand below each other.
+        at: x of the line and of the start of the label.
+        label: text.
+        y: baseline of the label; overlapping labels are stacked.
     """
 
     at: float
@@ -132,7 +132,7 @@ class PlacedMark:
 
 @dataclass(frozen=True)
 class Line:
-    """One line in chart units, as the value of an SVG polyline's "points"."""
+    """One line in chart units; `points` is the attribute of an SVG polyline."""
 
     kind: str
     points: str
@@ -140,8 +140,8 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Arrow:
-    """A move in chart units; its end is short of the point by the length of an arrow head."""
+class PlacedArrow:
+    """An arrow in chart units; its end leaves room for the head."""
 
     kind: str
     label: str
@@ -158,8 +158,8 @@ class Chart:
         frame: its size.
         lines, arrows: in drawing order.
         x_ticks, y_ticks: from the origin on.
-        marks: at their place.
-        inset: the start of the lines, larger, at `INSET_AT`.
+        marks: placed marks.
+        inset: the start of the lines, enlarged, at `INSET_AT`.
     """
 
     title: str
@@ -168,7 +168,7 @@ class Chart:
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     lines: tuple[Line, ...] = ()
-    arrows: tuple[Arrow, ...] = ()
+    arrows: tuple[PlacedArrow, ...] = ()
     marks: tuple[PlacedMark, ...] = ()
     inset: Chart | None = None
 
@@ -179,9 +179,9 @@ class Segment:
 
     Attributes:
         name: of the part.
-        x, width: its place.
-        text: its value, for whoever points at it.
-        shown: what is written on it, "" where there is no room.
+        x, width: position and length.
+        text: value, as a tooltip.
+        shown: value written on the bar, "" when there is no room.
     """
 
     name: str
@@ -193,7 +193,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class PlacedBar:
-    """A bar in chart units: where it is, its parts, and where its total is written."""
+    """A bar in chart units; `end` is the position of its total."""
 
     label: str
     y: float
@@ -210,7 +210,7 @@ class BarChart:
         title: text.
         frame: its size.
         bars: from the top.
-        names: of all parts, in the order of the first bar that has them.
+        names: of all parts, in the order of their first bars.
     """
 
     title: str
@@ -219,7 +219,7 @@ class BarChart:
     names: tuple[str, ...]
 
 
-def draw(
+def draw_lines(
     title: str,
     x_label: str,
     series: Sequence[Series],
@@ -231,13 +231,13 @@ def draw(
     inset_until: float | None = None,
     frame: Frame = WHOLE,
 ) -> Chart:
-    """Place lines, ticks and marks.
+    """Lay out a chart of lines.
 
     Args:
-        series: at least one, none of them empty.
+        series: at least one; none is empty.
         from_zero: start the y axis at 0; otherwise just below the smallest value.
-        format_x, format_y: text of a tick.
-        inset_until: also draw what lies before this x as a chart of its own, if that has points enough.
+        format_x, format_y: format a tick's value.
+        inset_until: also draw the part before this x as an inset, if it has enough points.
         frame: size of the chart.
     """
     xs = [x for line in series for x, _ in line.points]
@@ -247,7 +247,7 @@ def draw(
     y_ticks = _ticks(0.0 if from_zero else min(ys), highest * HEADROOM if from_zero else highest, count)
     inset = None if inset_until is None else _start(x_label, series, inset_until, format_x, format_y)
     if inset is not None:
-        y_ticks = _above_inset(series, right, y_ticks)
+        y_ticks = _clear_inset(series, right, y_ticks)
     bottom, top = y_ticks[0], y_ticks[-1]
     lines = []
     for line in series:
@@ -272,16 +272,16 @@ def _start(
     format_x: Callable[[float], str],
     format_y: Callable[[float], str],
 ) -> Chart | None:
-    """What lies before `until`."""
+    """Draw the part before `until` as an inset; None if it has too few points."""
     begins = [Series(line.kind, [point for point in line.points if point[0] <= until]) for line in series]
     begins = [line for line in begins if len(line.points) > 1]
     if not any(len(line.points) >= INSET_POINTS for line in begins):
         return None
-    return draw("the start", x_label, begins, from_zero=False, format_x=format_x, format_y=format_y, frame=INSET)
+    return draw_lines("the start", x_label, begins, from_zero=False, format_x=format_x, format_y=format_y, frame=INSET)
 
 
-def _above_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
-    """Ticks of a y axis that begins so low that no line runs behind the inset."""
+def _clear_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
+    """Extend the y axis downwards until no line runs behind the inset."""
     begin = right * (INSET_AT[0] - WHOLE.left) / WHOLE.plot_width
     behind = [
         y
@@ -290,7 +290,7 @@ def _above_inset(series: Sequence[Series], right: float, ticks: list[float]) -> 
         if max(x, after) >= begin
     ]
     room = (WHOLE.height - WHOLE.bottom - INSET_AT[1] + 6) / WHOLE.plot_height
-    for _ in range(TICKS):  # rounder ticks may lift the upper end again
+    for _ in range(TICKS):  # rounder ticks may raise the upper end again
         bottom, top = ticks[0], ticks[-1]
         if not behind or min(behind) - bottom >= room * (top - bottom):
             break
@@ -298,23 +298,23 @@ def _above_inset(series: Sequence[Series], right: float, ticks: list[float]) -> 
     return ticks
 
 
-def draw_moves(
+def draw_arrows(
     title: str,
     x_label: str,
-    moves: Sequence[Move],
+    arrows: Sequence[Arrow],
     *,
     format_x: Callable[[float], str] = "{:g}".format,
     format_y: Callable[[float], str] = "{:g}".format,
     head: float = 4.0,
 ) -> Chart:
-    """Place arrows on axes that begin at 0.
+    """Lay out a chart of arrows, with both axes from 0.
 
     Args:
-        moves: at least one.
-        format_x, format_y: text of a tick.
-        head: chart units by which an arrow ends before its point, so that its head ends at it.
+        arrows: at least one.
+        format_x, format_y: format a tick's value.
+        head: length of an arrow's head in chart units; the line ends so far before its point.
     """
-    points = [point for move in moves for point in (move.start, move.end)]
+    points = [point for arrow in arrows for point in (arrow.start, arrow.end)]
     right = max(x for x, _ in points) * HEADROOM or 1.0
     y_ticks = _ticks(0.0, max(y for _, y in points) * HEADROOM, TICKS)
     top = y_ticks[-1]
@@ -322,29 +322,29 @@ def draw_moves(
     def place(point: tuple[float, float]) -> tuple[float, float]:
         return WHOLE.x(point[0] / right), WHOLE.y(point[1] / top)
 
-    arrows = []
-    for move in moves:
-        start, end = place(move.start), place(move.end)
+    placed = []
+    for arrow in arrows:
+        start, end = place(arrow.start), place(arrow.end)
         length = math.dist(start, end)
         share = max(0.0, 1.0 - head / length) if length else 1.0
         tip = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
-        arrows.append(Arrow(move.kind, move.label, start, (round(tip[0], 1), round(tip[1], 1))))
+        placed.append(PlacedArrow(arrow.kind, arrow.label, start, (round(tip[0], 1), round(tip[1], 1))))
     return Chart(
         title,
         x_label,
         WHOLE,
         x_ticks=_x_ticks(right, TICKS, format_x, WHOLE),
         y_ticks=tuple(Tick(WHOLE.y(y / top), format_y(y)) for y in y_ticks),
-        arrows=tuple(arrows),
+        arrows=tuple(placed),
     )
 
 
 def draw_bars(title: str, bars: Sequence[Bar], *, format_value: Callable[[float], str] = "{:g}".format) -> BarChart:
-    """Place bars, each with its label above it and its total at its end.
+    """Lay out bars, each with its label above it and its total at its end.
 
     Args:
         bars: at least one.
-        format_value: text of a part or a total.
+        format_value: format a part or a total.
     """
     step = BAR_STEP + LINE_HEIGHT
     frame = Frame(WHOLE.width, step * len(bars), left=0, right=62, top=0, bottom=0)
@@ -365,7 +365,7 @@ def draw_bars(title: str, bars: Sequence[Bar], *, format_value: Callable[[float]
 
 
 def _place_marks(marks: Sequence[tuple[float, str]], frame: Frame) -> tuple[PlacedMark, ...]:
-    """Marks by increasing x, each label in the first row that is free."""
+    """Place marks by increasing x, each label in the first free row."""
     ends: list[float] = []
     placed = []
     for x, label in marks:
@@ -376,13 +376,13 @@ def _place_marks(marks: Sequence[tuple[float, str]], frame: Frame) -> tuple[Plac
 
 
 def _x_ticks(right: float, count: int, text: Callable[[float], str], frame: Frame) -> tuple[Tick, ...]:
-    """From 0 to the last that lies in the plot."""
+    """Place ticks from 0 to the last one in the plot."""
     return tuple(Tick(frame.x(x / right), text(x)) for x in _ticks(0.0, right, count) if x <= right * 1.001)
 
 
 def _ticks(low: float, high: float, count: int) -> list[float]:
-    """About `count` round numbers, steps of 1, 2 or 5 times a power of ten, the first at or below `low`, the last at
-    or above `high`."""
+    """Return about `count` round numbers from at or below `low` to at or above `high`, in steps of 1, 2 or 5 times a
+    power of ten."""
     span = max(high - low, LEAST_SPAN * max(abs(high), 1e-6))
     power = 10.0 ** math.floor(math.log10(span / count))
     step = next(factor * power for factor in (1, 2, 5, 10) if span / (factor * power) <= count)

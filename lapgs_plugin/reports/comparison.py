@@ -1,4 +1,4 @@
-"""A hierarchy beside its baseline: the table that `lapgs report` prints and its page shows."""
+"""Compare the figures of a run with those of its baseline: the table of `lapgs report` and its page."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 from lapgs_plugin.runs.archive import Manifest
 
 Metrics = dict[str, Any]
-"""What metrics.json holds, see `figures.run_figures`."""
+"""Content of metrics.json, see `figures.run_figures`."""
 
-NOT_EVERYWHERE = {"mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
-"""Left out where no run has them: imported runs tell little of their training, and there is no GPU on a CPU."""
+OPTIONAL_ROWS = {"mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
+"""Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
 PAIR = 2
 
 
@@ -23,9 +23,9 @@ class Cell:
     """One figure of one run.
 
     Attributes:
-        value: the number; None where it was not measured.
-        text: how it is written.
-        parts: what it is the sum of, each with its name; empty when it is no sum.
+        value: the number; None when it was not measured.
+        text: the number as shown.
+        parts: the parts of a sum, each with its name; empty otherwise.
     """
 
     value: float | None
@@ -35,13 +35,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of every run.
+    """One figure of each run.
 
     Attributes:
         key: short name for scripts.
-        label: what people read, with the unit.
-        cells: the run's, then the baseline's when there is one.
-        change: the run against the baseline, "" without one.
+        label: name for people, with the unit.
+        cells: of the run, then of the baseline if there is one.
+        change: change from the baseline to the run, "" without a baseline.
     """
 
     key: str
@@ -51,10 +51,10 @@ class Row:
 
 
 def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
-    """The figures of a run, and of its baseline beside it.
+    """Return the rows of a run, with its baseline if there is one.
 
     Args:
-        metrics: of the run, and of the baseline when there is one.
+        metrics: of the run, then of the baseline if there is one.
     """
     views = "held-out" if metrics[0]["split"] == "test" else "training"
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
@@ -79,14 +79,14 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     for key, label, pattern, compare in table:
         cells = tuple(_cell(each.get(key), pattern, 1e-9 if key.endswith("_bytes") else 1.0) for each in metrics)
         values = [cell.value for cell in cells if cell.value is not None]
-        if not values and key in NOT_EVERYWHERE:
+        if not values and key in OPTIONAL_ROWS:
             continue
         rows.append(Row(key, label, cells, compare(*values) if len(values) == PAIR else ""))
     return tuple(rows)
 
 
 def _cell(value: float | dict[str, float] | None, pattern: str, scale: float) -> Cell:
-    """A number, or the sum of named numbers."""
+    """Make the cell of a number, or of the sum of named numbers."""
     if value is None:
         return Cell(None, "not measured")
     if not isinstance(value, dict):
@@ -109,8 +109,8 @@ def _ratio(run: float, baseline: float) -> str:
     return f"{run / baseline:.2f}x" if baseline else ""
 
 
-def unlike(run: Manifest, baseline: Manifest) -> list[str]:
-    """In what the two runs differ that makes their figures no comparison of methods, in words."""
+def setup_differences(run: Manifest, baseline: Manifest) -> list[str]:
+    """List the differences in setup, in words, that keep two runs from being a comparison of methods."""
     pairs = {
         "scene": (run.scene.path, baseline.scene.path),
         "images": (run.scene.images, baseline.scene.images),

@@ -1,4 +1,4 @@
-"""Views of runs as pictures for a page: photo, base, residuals, composition, baseline; whole, and cut out enlarged."""
+"""Render views of runs as pictures for a page: photo, base, residuals, composition, baseline; whole and in detail."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.ops.composition import to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.scenes.images import resize_image, write_image
 from lapgs_plugin.scenes.scene import View
 
 IMAGE_SIDE = 800
-"""Longest side in pixels of a whole image on a page."""
+"""Longest side of a whole image on a page, in pixels."""
 MOST_COLUMNS = 5
 CUTOUTS = 2
-"""Enlarged parts of a view."""
+"""Number of enlarged parts of a view."""
 CUTOUT_SHARE, CUTOUT_LEAST, CUTOUT_MOST = 1 / 6, 16, 96
 """Side of a cut-out as a share of the image's shorter side, and its limits in pixels."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One image of the page.
+    """An image on the page.
 
     Attributes:
-        caption, detail: what it is, in words.
-        width, height: in pixels, of what is embedded.
-        data: a data URI.
+        caption, detail: description.
+        width, height: of the embedded image, in pixels.
+        data: data URI.
     """
 
     caption: str
@@ -45,12 +46,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Cutout:
-    """A part of a view with strong edges, in every picture of the view.
+    """A part of a view with strong edges, cut out of every picture of the view.
 
     Attributes:
-        left, top, width, height: where, in percent of the image's width and height.
-        side: in pixels of the full-resolution image.
-        pictures: pixel by pixel, in the order of the view's pictures.
+        left, top, width, height: its place in percent of the image.
+        side: of the square in pixels, at full resolution.
+        pictures: in the order of the view's pictures, at full resolution.
     """
 
     left: float
@@ -63,13 +64,13 @@ class Cutout:
 
 @dataclass(frozen=True)
 class Strip:
-    """The pictures of one view, from the photo to the composition, and why this view is shown.
+    """The pictures of one view, from the photo to the composition.
 
     Attributes:
         name: of the view.
-        why, figures: texts.
+        why, figures: the reason for showing the view, and its metrics.
         pictures: whole, all of the same size.
-        cutouts: parts of them.
+        cutouts: enlarged parts.
     """
 
     name: str
@@ -80,20 +81,20 @@ class Strip:
 
     @property
     def columns(self) -> int:
-        """Pictures in a row of a wide page: all of them, or half when they would get too small."""
+        """Pictures in a row of a wide page: all, or half of them when they would get too small."""
         count = len(self.pictures)
         return count if count <= MOST_COLUMNS else (count + 1) // 2
 
     @property
     def compared(self) -> tuple[int, int]:
-        """Which pictures lie beside each other at first: the baseline, or else the photo, and the composition."""
+        """Indices of the pictures that are compared first: the baseline, or else the photo, and the composition."""
         captions = [picture.caption for picture in self.pictures]
         return captions.index("Baseline") if "Baseline" in captions else 0, captions.index("Composition")
 
 
 @dataclass(frozen=True)
 class _Layer:
-    """What one picture shows: (3, h, w) at full resolution."""
+    """Content of a picture: (3, h, w) at full resolution."""
 
     caption: str
     detail: str
@@ -105,17 +106,17 @@ def make_strip(view: View, why: str, figures: str, renderers: Sequence[Hierarchy
     """Render a view with a run, and with its baseline if there is one.
 
     Args:
-        view: with its photo.
+        view: a view with its photo.
         why, figures: see `Strip`.
-        renderers: of the run, and of the baseline.
+        renderers: of the run, then of its baseline.
     """
     layers = _layers(view, renderers)
     cutouts = tuple(_cut_out(layers, place) for place in edge_squares(view.image, CUTOUTS))
-    return Strip(view.name, why, figures, tuple(_whole(layer) for layer in layers), cutouts)
+    return Strip(view.name, why, figures, tuple(_shrink(layer) for layer in layers), cutouts)
 
 
 def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
-    """Everything brought to full resolution with Up, so that it lies on each other pixel by pixel."""
+    """Render the layers of a view, upsampled to full resolution."""
     renderer = renderers[0]
     composition = renderer.render(view.camera)
     layers = [_Layer("Photo", "ground truth", view.image)]
@@ -125,31 +126,31 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
 
     coarsest = renderer.levels - 1
     if composition.residuals:
-        layers.append(_Layer("Base", _of_level(coarsest, composition.base), whole(composition.base, coarsest)))
+        layers.append(_Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
     for level, residual in composition.residuals.items():
-        detail = f"{_of_level(level, residual)}, zero is grey"
+        detail = f"{_level_label(level, residual)}, zero is grey"
         layers.append(_Layer("Residual", detail, around_grey(whole(residual, level))))
-    layers.append(_Layer("Composition", "what the run renders", composition.composed[0].cpu()))
+    layers.append(_Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
     for baseline in renderers[1:]:
         image = baseline.render(view.camera).composed[0].cpu()
-        layers.append(_Layer("Baseline", "what it renders", image))
+        layers.append(_Layer("Baseline", "rendered by the baseline", image))
     return layers
 
 
-def _of_level(level: int, image: Tensor) -> str:
+def _level_label(level: int, image: Tensor) -> str:
     height, width = image.shape[-2:]
     return f"level {level}, {width}x{height}"
 
 
 def edge_squares(photo: Tensor, count: int) -> list[tuple[int, int, int]]:
-    """Where a photo's edges are strongest: where most of it is lost one pyramid level down.
+    """Find squares with strong edges: those that lose most in one pyramid level.
 
     Args:
         photo: (3, h, w).
-        count: of squares, at most; fewer where there is no more room.
+        count: most squares to return; fewer when there is no room.
 
     Returns:
-        Left, top and side in pixels of squares that do not overlap, strongest first.
+        Left, top and side in pixels of squares that do not overlap, the strongest first.
     """
     height, width = photo.shape[-2:]
     side = min(height, width, max(CUTOUT_LEAST, min(CUTOUT_MOST, round(min(height, width) * CUTOUT_SHARE))))
@@ -176,7 +177,7 @@ def _cut_out(layers: Sequence[_Layer], square: tuple[int, int, int]) -> Cutout:
     )
 
 
-def _whole(layer: _Layer) -> Picture:
+def _shrink(layer: _Layer) -> Picture:
     height, width = layer.image.shape[-2:]
     scale = min(1.0, IMAGE_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -185,7 +186,7 @@ def _whole(layer: _Layer) -> Picture:
 
 
 def _data_uri(image: Tensor, kind: str) -> str:
-    """(3, h, w) as the text of a JPEG or PNG file in a page."""
+    """Encode an image (3, h, w) as the data URI of a JPEG or PNG file."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"picture.{kind}"
         write_image(file, image)

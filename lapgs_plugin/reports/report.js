@@ -1,4 +1,4 @@
-// Two pictures of a view on top of each other, with a divider that is dragged, or moved with the arrow keys.
+// Show two pictures of a view on top of each other, with a divider to drag or to move with the arrow keys.
 "use strict";
 for (const strip of document.querySelectorAll(".strip")) {
   const pictures = [...strip.querySelectorAll(".zoom img")];
@@ -16,7 +16,7 @@ for (const strip of document.querySelectorAll(".strip")) {
     place((100 * (event.clientX - box.left)) / box.width);
   };
   pair.addEventListener("pointerdown", (event) => {
-    event.preventDefault();  // the pictures are not to be dragged away
+    event.preventDefault();  // do not drag the pictures themselves
     divider.focus({ preventScroll: true });
     pair.setPointerCapture(event.pointerId);
     follow(event);

@@ -1,4 +1,4 @@
-"""report.html: one page about a run, beside its baseline if there is one, that needs no other file and no network."""
+"""Write report.html: one page about a run and its baseline that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from lapgs_plugin.files import atomic_write, one_line_errors
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.reports.charts import (
     INSET_AT,
+    Arrow,
     Bar,
     BarChart,
     Chart,
     Mark,
-    Move,
     Series,
-    draw,
+    draw_arrows,
     draw_bars,
-    draw_moves,
+    draw_lines,
 )
-from lapgs_plugin.reports.comparison import Metrics, comparison_rows, unlike
+from lapgs_plugin.reports.comparison import Metrics, comparison_rows, setup_differences
 from lapgs_plugin.reports.pictures import Strip, make_strip
 from lapgs_plugin.runs.archive import METRICS, REPORT, RunArchive
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"
 MINUTES_FROM = 300.0
-"""Runs at least this many seconds long are charted in minutes."""
+"""Least length of a run, in seconds, whose charts show minutes."""
 START_SHARE = 0.15
-"""Of the longest run's time, drawn once more as an inset."""
+"""Share of the longest run's time that the inset shows."""
 RUN, BASELINE = "run", "baseline"
 """Styles of lines and arrows."""
 
@@ -49,7 +49,7 @@ class MeasuredRun:
 
     Attributes:
         archive: the run folder.
-        metrics: what its metrics.json holds.
+        metrics: content of its metrics.json.
     """
 
     archive: RunArchive
@@ -62,11 +62,11 @@ class MeasuredRun:
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One view in the table of all.
+    """One view in the table of all views.
 
     Attributes:
         name: of the view.
-        cells: value and text of every metric of the run, then of the baseline's PSNR and how much the run gains on it.
+        cells: value and text of every metric of the run, then of the baseline's PSNR and of the gain over it.
     """
 
     name: str
@@ -84,16 +84,16 @@ def write_report(
     """Write RUN/report.html.
 
     Args:
-        run: what the page is about.
-        baseline: what it is compared with.
-        moved_to: where the run's scene is now; None when it did not move.
-        device, rasterizer: what renders the pictures, see `rendering.run.run_renderer`.
+        run: the run that the page is about.
+        baseline: the run that it is compared with.
+        moved_to: the scene's folder now; None when it did not move.
+        device, rasterizer: see `rendering.run.run_renderer`.
 
     Returns:
-        The file.
+        The path of the page.
 
     Raises:
-        RunFolderError: the scene is not where it was, or the file cannot be written.
+        RunFolderError: the scene is missing, or the file cannot be written.
     """
     runs = [run] if baseline is None else [run, baseline]
     kinds = [RUN, BASELINE][: len(runs)]
@@ -106,10 +106,10 @@ def write_report(
         manifest=run.archive.manifest,
         metrics=run.metrics,
         baseline_name=baseline.name if baseline else None,
-        unlike=unlike(run.archive.manifest, baseline.archive.manifest) if baseline else [],
+        differences=setup_differences(run.archive.manifest, baseline.archive.manifest) if baseline else [],
         rows=comparison_rows([each.metrics for each in runs]),
         charts=training_charts(runs, kinds, marked=run),
-        moves=_moves(run, baseline) if baseline else None,
+        arrows=_time_arrows(run, baseline) if baseline else None,
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
         strips=view_strips(run, renderers, moved_to),
@@ -121,7 +121,7 @@ def write_report(
 
 
 def render_page(template: str, **values: Any) -> str:
-    """A template of this folder, filled in."""
+    """Render a template of this folder."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -133,7 +133,7 @@ def render_page(template: str, **values: Any) -> str:
 
 
 def write_page(path: Path, page: str) -> Path:
-    """Write a whole page or none.
+    """Write a page, whole or not at all.
 
     Raises:
         RunFolderError: it cannot be written.
@@ -143,18 +143,18 @@ def write_page(path: Path, page: str) -> Path:
     return path
 
 
-# What was recorded during training.
+# Charts of training.
 
 
 def training_charts(
     runs: Sequence[MeasuredRun], kinds: Sequence[str], marked: MeasuredRun | None = None
 ) -> dict[str, list[Chart]]:
-    """Loss, held-out PSNR and number of Gaussians, over seconds and over iterations; without what was not recorded.
+    """Draw loss, held-out PSNR and number of Gaussians over time and over iterations, as far as they were recorded.
 
     Args:
-        runs: whose lines are drawn, the first on top.
-        kinds: style of each one's lines.
-        marked: whose stages are marked; None marks nothing.
+        runs: the runs to draw, the first on top.
+        kinds: line style of each run.
+        marked: the run whose stages are marked; None marks nothing.
     """
     longest = max(run.metrics["train_seconds"] for run in runs)
     unit, scale = ("minutes", 60.0) if longest >= MINUTES_FROM else ("seconds", 1.0)
@@ -170,14 +170,14 @@ def training_charts(
 
 
 def _elapsed(run: MeasuredRun, entry: dict[str, Any]) -> float:
-    """Seconds of optimization since the start of the run; what is noted after a stage has no time of its own."""
+    """Return the seconds of optimization since the start of the run; entries made after a stage have its end."""
     if "elapsed" in entry:
         return float(entry["elapsed"])
     return sum(record.train_seconds for record in run.archive.manifest.records if record.level >= entry["level"])
 
 
 def _iteration(run: MeasuredRun, entry: dict[str, Any]) -> float:
-    """Iterations since the start of the run; the history counts within a stage."""
+    """Return the iterations since the start of the run; the history counts within a stage."""
     before = sum(record.iterations for record in run.archive.manifest.records if record.level > entry["level"])
     return float(before + entry["iteration"])
 
@@ -202,12 +202,12 @@ def _chart_row(
     ):
         series = [
             Series(kind, points)
-            for run, kind in reversed(list(zip(runs, kinds, strict=True)))  # the first on top
+            for run, kind in reversed(list(zip(runs, kinds, strict=True)))  # draws the first on top
             for points in _lines(run, key, by_stage, x_of)
         ]
         if series:
             charts.append(
-                draw(
+                draw_lines(
                     title,
                     x_label,
                     series,
@@ -222,7 +222,7 @@ def _chart_row(
 
 
 def _lines(run: MeasuredRun, key: str, by_stage: bool, x_of: Position) -> list[list[tuple[float, float]]]:
-    """What the history says about `key`: one line, or one a stage where stages do not continue each other."""
+    """Return the recorded values of `key`: one line, or one for each stage when stages do not continue each other."""
     lines: dict[int, list[tuple[float, float]]] = {}
     for entry in run.archive.history():
         if key in entry:
@@ -231,7 +231,7 @@ def _lines(run: MeasuredRun, key: str, by_stage: bool, x_of: Position) -> list[l
 
 
 def _stage_marks(run: MeasuredRun, x_of: Position) -> list[Mark]:
-    """Where each stage of a hierarchy begins; nothing for a single field."""
+    """Mark the start of each stage of a hierarchy; nothing for a single field."""
     begins: dict[int, float] = {}
     end = 0.0
     for entry in run.archive.history():
@@ -241,35 +241,35 @@ def _stage_marks(run: MeasuredRun, x_of: Position) -> list[Mark]:
 
 
 def count_text(value: float) -> str:
-    """A number short enough for an axis: 1.5k, 20k, 1.2M."""
+    """Format a number for an axis: 1.5k, 20k, 1.2M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:.3g}{suffix}"
     return f"{value:g}"
 
 
-# What it took.
+# Time and number of Gaussians.
 
 
 def seconds_text(value: float) -> str:
-    """Seconds with three digits."""
+    """Format seconds with three digits."""
     return f"{value:.3g} s" if value < 1e3 else f"{value:,.0f} s"
 
 
-def _moves(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
-    """Time against Gaussians, an arrow from the baseline to the run."""
+def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
+    """Draw time against Gaussians, as an arrow from the baseline to the run."""
     ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
-    return draw_moves(
+    return draw_arrows(
         "Optimization (s) against Gaussians",
         "Gaussians, mean of levels by iterations",
-        [Move(RUN, "", *ends)],
+        [Arrow(RUN, "", *ends)],
         format_x=count_text,
         format_y=count_text,
     )
 
 
 def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
-    """Where the time of iterations went, a bar for each level of each run that was broken down."""
+    """Draw the time of iterations by part, a bar for each level of each run that recorded it."""
     bars = []
     for run in runs:
         for record in run.archive.manifest.records:
@@ -282,9 +282,9 @@ def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
 
 
 def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
-    """What was spent beside the optimization."""
+    """Draw the time outside the optimization."""
     bars = [Bar(run.name, list(run.metrics["overhead_seconds"].items())) for run in runs]
-    return draw_bars("Beside the optimization", bars, format_value=seconds_text) if any(b.parts for b in bars) else None
+    return draw_bars("Overhead", bars, format_value=seconds_text) if any(b.parts for b in bars) else None
 
 
 # Views.
@@ -293,18 +293,18 @@ def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
 def view_strips(
     run: MeasuredRun, renderers: Sequence[HierarchyRenderer], moved_to: Path | None, most: int = 3
 ) -> list[Strip]:
-    """The worst, the median and the best view of the run, in pictures of it and of its baseline.
+    """Render the worst, the median and the best view of the run, with its baseline.
 
     Args:
-        run: by whose metrics views are chosen.
-        renderers: of the run, and of its baseline.
-        moved_to: where the scene is now; None when it did not move.
-        most: of these views, from the worst on.
+        run: the run whose metrics choose the views.
+        renderers: of the run, then of its baseline.
+        moved_to: the scene's folder now; None when it did not move.
+        most: number of these views, from the worst on.
 
     Raises:
-        RunFolderError: the scene is not where it was.
+        RunFolderError: the scene is missing.
     """
-    shown = dict(list(_shown_views(run.metrics).items())[:most])
+    shown = dict(list(_select_views(run.metrics).items())[:most])
     figures = {view["name"]: f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}" for view in run.metrics["views"]}
     with one_pool():
         scene = run_scene(run.archive, moved_to)
@@ -321,8 +321,8 @@ def view_strips(
             ]
 
 
-def _shown_views(metrics: Metrics) -> dict[str, str]:
-    """Names of the views to show, with the reason."""
+def _select_views(metrics: Metrics) -> dict[str, str]:
+    """Choose the views to show, and the reason of each."""
     ranked = [view["name"] for view in sorted(metrics["views"], key=lambda view: float(view["psnr"]))]
     chosen = {"worst": ranked[0], "median": ranked[(len(ranked) - 1) // 2], "best": ranked[-1]}
     reasons: dict[str, str] = {}
@@ -332,10 +332,10 @@ def _shown_views(metrics: Metrics) -> dict[str, str]:
 
 
 def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
-    """All views by the run's PSNR, the worst first; the columns' headings, and the rows.
+    """Return headings and rows of all views, sorted by the run's PSNR, the worst first.
 
     Args:
-        runs: the run, and its baseline if there is one.
+        runs: the run, then its baseline if there is one.
     """
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
     keys = {"psnr": "PSNR (dB)", "ssim": "SSIM"}
@@ -357,7 +357,7 @@ def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
 
 
 def _settings(run: MeasuredRun) -> dict[str, str]:
-    """What decides a run's result, by name, flat; and the versions it was measured with."""
+    """Return the settings that decide a run's result, flat and by name, and the versions of its measurement."""
     manifest = run.archive.manifest
     nested = manifest.settings.get("hierarchy") == Hierarchy.NESTED.value
     values: dict[str, Any] = {

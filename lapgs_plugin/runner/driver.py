@@ -399,7 +399,9 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     residuals = Hierarchy.LAPLACIAN.value
     before = {
         "hierarchy": residuals,
+        "protocol": "default",
         "prune": 0.0,
+        "residual_threshold": 1.0,
         "residual_resets": settings.get("hierarchy", residuals) == residuals,
     }
     return {**before, **values, **settings, **backbone}

@@ -31,7 +31,7 @@ from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CONSTANTS
-from lapgs_plugin.rendering.compose import CLAMPED
+from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runs.archive import LevelRecord, Manifest, PathText, RunArchive, SceneReference, read_bare_record
 from lapgs_plugin.scenes import smallest_size
 from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked, read_json, read_text

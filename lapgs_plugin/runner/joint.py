@@ -20,7 +20,8 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ADAM_EPS
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.ops.composition import compose
+from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.run_state import RunContext
 from lapgs_plugin.runner.shim import StageRendering
@@ -122,14 +123,10 @@ class JointLevels:
     def get(self, key: str) -> Tensor:
         """(3, h, w) Up of what the finished fields make of a view, with gradients where they are recorded."""
         camera = self._cameras[key]
-        composed: Tensor | None = None
-        for one in self._fields:
-            width, height = self._images.size(camera, one.of.stage.level)
-            image = self._render(one, key, (width, height))
-            composed = image if composed is None else upsample_add(self._pyramid, composed, image)
-        assert composed is not None
-        width, height = self._images.size(camera, self._fields[-1].of.stage.level - 1)
-        return upsample(self._pyramid, composed, (height, width))
+        levels = [(one, one.of.stage.level) for one in self._fields]
+        renders = ((level, self._render(one, key, self._images.size(camera, level))) for one, level in levels)
+        width, height = self._images.size(camera, levels[-1][1] - 1)
+        return upsample(self._pyramid, compose(self._pyramid, renders).image, (height, width))
 
     def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
         """(3, h, w) of one field alone."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
 from lapgs_plugin.runs.image_store import ImageStore
 
@@ -86,7 +87,7 @@ class StageRendering:
         below = None
         if self.accumulated is not None and key in self.composed:
             below = self.accumulated.get(key)
-            image = image + below
+            image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
         return image

@@ -7,8 +7,8 @@ import torch
 from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.rasterizers import gsplat
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
 from lapgs_plugin.training.settings import TrainSettings
 

@@ -13,8 +13,7 @@ from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveInt, 
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError
-from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats
+from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import problem

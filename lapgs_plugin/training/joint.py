@@ -19,7 +19,8 @@ from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_i
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.ops.composition import compose
+from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.training.model import TrainableField
 
 
@@ -60,15 +61,13 @@ class JointFields:
     def _predict(
         self, names: Sequence[str], render: Callable[[GaussianField, Sequence[Camera], Tensor], Tensor]
     ) -> Tensor:
-        composed: Tensor | None = None
-        for level, model in self.models.items():
+        def render_level(level: int, model: TrainableField) -> Tensor:
             cameras = [self._camera(name, level) for name in names]
-            background = self.background.new_zeros(3) if model.signed else self.background
-            image = render(model.field, cameras, background)
-            composed = image if composed is None else upsample_add(self.pyramid, composed, image)
-        assert composed is not None
+            return render(model.field, cameras, self.background.new_zeros(3) if model.signed else self.background)
+
+        renders = ((level, render_level(level, model)) for level, model in self.models.items())
         camera = self._camera(names[0], min(self.models) - 1)
-        return upsample(self.pyramid, composed, (camera.height, camera.width))
+        return upsample(self.pyramid, compose(self.pyramid, renders).image, (camera.height, camera.width))
 
     def _camera(self, name: str, level: int) -> Camera:
         """A view's camera, always the same object: a rasterizer may know it by that."""

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.splats import SPLAT_NAMES, field_from_splats, splats_from_field
+from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats, splats_from_field
 from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, adam_in_triton, step_together
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.training.settings import LearningRates

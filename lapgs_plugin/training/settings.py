@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, nested_densify_until
+from lapgs_plugin.hierarchy.plan import (
+    REFERENCE_DENSIFY_FROM,
+    REFERENCE_ITERATIONS,
+    Hierarchy,
+    Stage,
+    nested_densify_until,
+)
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import check_bounds, option
 from lapgs_plugin.runs.options import PANEL as RUN
@@ -21,17 +28,21 @@ if TYPE_CHECKING:
 LATE_SHARE = 0.25
 """Of a stage, its last, in which the gradients of some views make one step, once densification has ended. Positions
 hardly move any more, and what single views disagree about is noise; earlier, steps are what is short."""
+VIEWS_OF_RATE = 32
+MOST_RATE = 8.0
+"""SH above degree 0 learn faster in proportion to training views, from the first number on and up to the second: few
+views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Of one step, where the size of the images decides how many."""
-PIXELS_OF_A_STEP = 1 << 20
-"""Of all its views together, where that decides: about what it takes to keep a GPU busy while it is given its work."""
+PIXELS_OF_A_STEP = 1 << 22
+"""Of all its views together, where that decides."""
+STEPS_OF_A_STAGE = 900
+"""The fewest, where that decides: a short stage steps for fewer views."""
 PIXELS_OF_A_LAUNCH = 1 << 22
 """Of views that are rendered at once. More of them would take memory and no less time."""
 LEAST_STEPS = 40
 """In that share. Shorter stages step with every view: on the sample scene, 1,000 iterations, 40 steps of fewer views
 lost 0.08 dB, of one field 0.13."""
-REFERENCE_ITERATIONS = 30_000
-"""Length of the run that 3DGS's published schedule was made for; shorter runs shrink its constants in proportion."""
 
 STRATEGIES = ("default", "mcmc", "multiview")
 GROW_THRESHOLD = 2e-4
@@ -62,28 +73,12 @@ class LearningRates:
     opacities: float = 5e-2
     scales: float = 5e-3
     quats: float = 1e-3
-    sh_rest_factor: float = option(
-        1.0,
-        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in every field. 8 suits "
-        "scenes with hundreds of views, 1 those with few.",
-        panel=SCHEDULE,
-        names=("--sh-rate-factor",),
-    )
-    sh_rest_decay: bool = option(
-        False,
-        "Let that factor go exponentially to 1 within each stage.",
-        panel=SCHEDULE,
-        names=("--sh-rate-decay",),
-    )
 
     def check(self) -> None:
-        """Raise a UserInputError about a rate or factor that is not positive."""
+        """Raise a UserInputError about a rate that is not positive."""
         for each in fields(self):
-            if each.name not in ("sh_rest_factor", "sh_rest_decay") and not getattr(self, each.name) > 0:
+            if not getattr(self, each.name) > 0:
                 raise UserInputError(f"{each.name} {getattr(self, each.name)}: expected a positive learning rate")
-        _require_positive("--sh-rate-factor", self.sh_rest_factor, "factor")
-        if self.sh_rest_decay and self.sh_rest_factor == 1.0:
-            raise UserInputError("--sh-rate-decay: there is nothing to decay from; give --sh-rate-factor, such as 8")
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,11 @@ class Densification:
     __pydantic_config__: ClassVar[Any] = STRICT
 
     start: int | None = option(
-        None, "First densification. Default: 500 of 30000.", panel=SCHEDULE, names=("--densify-from",), least=0
+        None,
+        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        panel=SCHEDULE,
+        names=("--densify-from",),
+        least=0,
     )
     until: int | None = option(
         None,
@@ -218,7 +217,7 @@ class TrainSettings(HierarchySettings):
     __pydantic_config__: ClassVar[Any] = STRICT
 
     iterations: int = option(
-        30_000, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
     )
     gather: int = option(
         8,
@@ -228,15 +227,23 @@ class TrainSettings(HierarchySettings):
         names=("--accumulate-views", "--gather"),
     )
     views_per_step: str = option(
-        "1",
+        AUTO,
         "Training views of one optimizer step, rendered together on a GPU; step sizes grow with the root of their "
-        "number. auto: by the size of the images on a GPU, 1 on a CPU. Iterations count views.",
+        f"number. auto: up to {MOST_VIEWS} on a GPU, fewer of large images and in short stages; 1 on a CPU. Iterations "
+        "count views.",
         panel=SCHEDULE,
     )
     sh_degree: int = option(3, "Highest SH degree, 0 to 3.", panel=SCHEDULE)
     base_sh_degree: int | None = option(
         None,
         "With residuals: highest SH degree of the base, at most --sh-degree, which is the default.",
+        panel=SCHEDULE,
+    )
+    sh_rate_factor: float | None = option(
+        None,
+        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
+        "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
+        f"to {VIEWS_OF_RATE} to {MOST_RATE:g}.",
         panel=SCHEDULE,
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
@@ -261,6 +268,8 @@ class TrainSettings(HierarchySettings):
         if self.gather < 1:
             raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         _ = self.asked_views
+        if self.sh_rate_factor is not None:
+            _require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -336,6 +345,19 @@ class TrainSettings(HierarchySettings):
             changes["cap_max"] = given.base_cap_max
         return replace(given, **changes)
 
+    def sh_rate_factor_of(self, stage: Stage, training_views: int) -> float:
+        """Return the factor on the rate of SH above degree 0 that a stage starts with."""
+        if stage.signed:
+            return 1.0  # their rate is raised already, see `residual_color_rate`
+        if self.sh_rate_factor is not None:
+            return self.sh_rate_factor
+        return min(MOST_RATE, max(1.0, training_views / VIEWS_OF_RATE))
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """See `HierarchySettings.paper_settings`."""
+        return {**super().paper_settings, "gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0}
+
     def sh_degree_of(self, stage: Stage) -> int:
         """Return the highest SH degree of a stage's field."""
         return self.base_sh_degree if self._is_base(stage) and self.base_sh_degree is not None else self.sh_degree
@@ -384,6 +406,8 @@ def _of_this_version(given: dict[str, Any]) -> dict[str, Any]:
     # Before there was a choice, residual stages reset opacities.
     values = {**LEFT_OUT_ONCE, "residual_resets": given.get("hierarchy", "laplacian") == "laplacian", **given}
     density, rates = dict(values["densification"]), dict(values["learning_rates"])
+    rates.pop("sh_rest_factor", None)
+    rates.pop("sh_rest_decay", None)
     for name in ("coarse_threshold", "prune"):
         values.setdefault(name, density.pop(name, None if name == "coarse_threshold" else 0.0))
     for old, new in (("cache", "images_on"), ("cache_precision", "prediction_precision")):
@@ -406,7 +430,8 @@ def _of_this_version(given: dict[str, Any]) -> dict[str, Any]:
 
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
-    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0},
+    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
+    "protocol": "default",
 }
 """Settings that runs of the first weeks do not name, and what they were."""
 
@@ -444,7 +469,8 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
     asked = settings.asked_views
     if asked is None:
         pixels = stage.image_size[0] * stage.image_size[1]
-        asked = min(MOST_VIEWS, training_views, max(1, round(PIXELS_OF_A_STEP / pixels))) if batches else 1
+        limits = round(PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
+        asked = max(1, min(MOST_VIEWS, training_views, *limits)) if batches else 1
     return asked
 
 
@@ -473,14 +499,15 @@ class StageSchedule:
     means_first: float
     means_last: float
     sh_rest_factor: float
-    sh_rest_decay: bool
     gather_from: int
     gather: int
     before: int
     views: int = 1
 
     @classmethod
-    def create(cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1) -> StageSchedule:
+    def create(
+        cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1, training_views: int = 1
+    ) -> StageSchedule:
         shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
         given = settings.densification
 
@@ -501,7 +528,7 @@ class StageSchedule:
         late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         return cls(
             iterations=stage.iterations,
-            densify_start=constant(given.start, 500, 1),
+            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
             densify_until=densify_until,
             densify_every=given.every,
             reset_every=resets,
@@ -509,8 +536,7 @@ class StageSchedule:
             sh_degree=settings.sh_degree_of(stage),
             means_first=settings.learning_rates.means_first,
             means_last=settings.learning_rates.means_last,
-            sh_rest_factor=settings.learning_rates.sh_rest_factor,
-            sh_rest_decay=settings.learning_rates.sh_rest_decay,
+            sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),
             gather_from=stage.iterations - late + 1,
             gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
             before=before,
@@ -550,9 +576,7 @@ class StageSchedule:
         return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
 
     def sh_rest_factor_at(self, iteration: int) -> float:
-        """Factor on the rate of SH above degree 0: as set, or from that exponentially to 1 at the stage's end."""
-        if not self.sh_rest_decay:
-            return self.sh_rest_factor
+        """Return the factor on the rate of SH above degree 0, which falls exponentially to 1 at the stage's end."""
         left: float = 1.0 - min(iteration / self.iterations, 1.0)
         factor: float = self.sh_rest_factor**left
         return factor

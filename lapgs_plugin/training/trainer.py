@@ -25,9 +25,10 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.ops.adam import StepScale
+from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, LevelRecord, RunArchive
 from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
@@ -265,6 +266,7 @@ class Trainer:
             stage,
             coarser if continues_field(stage, self.plan.levels) else 0,
             views_per_step(self.settings, stage, len(self.scene.train), batches),
+            len(self.scene.train),
         )
         sizes = {(view.camera.width, view.camera.height) for view in self.scene.train}
         if schedule.views > 1 and batches and len(sizes) > 1:
@@ -427,10 +429,9 @@ class Trainer:
             for view in self.scene.test:
                 camera = level_camera(view.camera, run.stage.level)
                 image = self.rasterizer(run.model.field, camera, background=run.background).image
-                if run.joint is not None:
-                    image = image + run.joint.predict(view.name)
-                elif self._test_cache is not None:
-                    image = image + self._test_cache.get(view.name)
+                cached = None if self._test_cache is None else self._test_cache.get
+                predict = cached if run.joint is None else run.joint.predict
+                image = add_prediction(image, None if predict is None else predict(view.name))
                 whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
                 values.append(psnr(whole, view.image.to(self.device)))
             return math.fsum(values) / len(values)

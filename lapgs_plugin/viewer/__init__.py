@@ -1,1 +1,1 @@
-"""`lapgs view`: a run in a web browser, band by band. The page itself is viser's; the pictures are rendered here."""
+"""Show a run in a web browser, band by band: `lapgs view` and `--view`. The page is viser's, the pictures are ours."""

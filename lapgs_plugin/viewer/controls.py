@@ -1,4 +1,4 @@
-"""The panel of one client: what it shows of the bands, and what it lets them change."""
+"""Build the panel of one client, which shows and changes its settings."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ BY_SIZE = "by distance and window"
 
 
 class Controls:
-    """Builds a client's panel and reads it.
+    """The panel of one client.
 
     Args:
-        client: whose panel.
-        run: what is looked at.
-        other: what the split view shows to the right, None without.
-        views: names of the cameras that can be gone to.
-        before: the panel that this one replaces, since there are more or fewer levels; its choices are kept.
-        changed: called when another picture is wanted.
-        go_to: called with the index of a camera.
-        show_cameras: called with whether their frustums are wanted.
-        keep: called to remember the view; says how many there are.
-        save: called to hand out the views that were kept.
+        client: the client.
+        run: the run that is shown.
+        other: the run on the right of the split view, or None.
+        views: names of the scene's cameras.
+        before: the panel to replace, because the number of levels changed; its choices are kept.
+        changed: called when a new picture is needed.
+        go_to: called with the index of a camera to move to.
+        show_cameras: called with whether to show the cameras' frustums.
+        keep: called to store the current view; returns the number of stored views.
+        save: called to download the stored views.
     """
 
     def __init__(
@@ -64,15 +64,15 @@ class Controls:
         with self._folder("Figures"):
             self._figures = self._gui.add_markdown("")
         if before is not None:
-            self._choose_as(before)
+            self._copy_choices(before)
 
     def close(self) -> None:
-        """Take the panel off the page."""
+        """Remove the panel from the page."""
         for folder in self._folders:
             folder.remove()
 
     def fits(self, run: ShownRun, other: ShownRun | None) -> bool:
-        """Whether the panel has everything there is to choose of these runs; if so it is about them from now on."""
+        """Tell whether the panel fits these runs; if so, it shows them from now on."""
         if run.counts.keys() != self._run.counts.keys() or (other is None) != (self._split is None):
             return False
         self._run = run
@@ -80,7 +80,7 @@ class Controls:
 
     @property
     def settings(self) -> PictureSettings:
-        """What is chosen now."""
+        """The current choices."""
         gains = {level: gain.value if drawn.value else 0.0 for level, (drawn, gain) in self._bands.items()}
         shown = {self._band_name(level): level for level in self._run.counts}
         level = None if self._level.value == BY_SIZE else int(self._level.value.removeprefix("level "))
@@ -89,20 +89,20 @@ class Controls:
 
     @property
     def divider(self) -> float:
-        """Where the divider is, as a share of the picture's width, whether it is shown or not."""
+        """Position of the divider as a share of the picture's width, also while it is hidden."""
         return 0.5 if self._divider is None else float(self._divider.value)
 
     @divider.setter
     def divider(self, share: float) -> None:
-        assert self._divider is not None, "there is nothing to compare with"
+        assert self._divider is not None, "there is a second run"
         self._divider.value = min(max(share, 0.0), 1.0)
 
     def report(self, picture: Picture, seconds: float) -> None:
-        """Show what a picture took.
+        """Show the times of a picture.
 
         Args:
-            picture: as drawn.
-            seconds: from its request to the moment it was sent.
+            picture: the picture.
+            seconds: from its request until it was sent.
         """
         height, width = picture.image.shape[1:]
         rows = ["| band | Gaussians | ms |", "|:--|--:|--:|"]
@@ -119,8 +119,8 @@ class Controls:
         self._folders.append(folder)
         return folder
 
-    def _choose_as(self, before: Controls) -> None:
-        """Choose what was chosen in another panel, as far as this one has it."""
+    def _copy_choices(self, before: Controls) -> None:
+        """Take over the choices of another panel, as far as this one has them."""
         for level, handles in self._bands.items():
             if level in before._bands:
                 for handle, old in zip(handles, before._bands[level], strict=True):
@@ -170,7 +170,7 @@ class Controls:
             if offset == 0:
                 go_to(index)
             else:
-                chosen.value = views[index]  # tells `on_update`, which goes there
+                chosen.value = views[index]  # calls `on_update`, which moves the camera
 
         chosen.on_update(lambda _: go_to(views.index(chosen.value)))
 

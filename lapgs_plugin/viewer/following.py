@@ -1,4 +1,4 @@
-"""A run folder that may still be written: what of it can be shown now, and what is new since the last look."""
+"""Follow a run folder that may still be written, and show its new levels."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import PictureSettings, ShownRun, draw
-from lapgs_plugin.viewer.preview import keep_preview, read_preview
-from lapgs_plugin.viewer.server import Viewer
-from lapgs_plugin.viewer.session import Exhibit
-from lapgs_plugin.viewer.start import Start, start_at, start_outside
+from lapgs_plugin.viewer.poses import InitialView
+from lapgs_plugin.viewer.preview import read_preview, save_preview
+from lapgs_plugin.viewer.session import ViewerContent
+from lapgs_plugin.viewer.viewer import Viewer
 
-LOOK_SECONDS = 1.0
-"""Time between two looks at whether a run has changed."""
+POLL_SECONDS = 1.0
+"""Seconds between two checks for changes."""
 
-Stamp = tuple[int, int] | None  # nanoseconds of the last change and size of a file; None where there is none
+Stamp = tuple[int, int] | None  # time of the last change in nanoseconds, and size of a file; None without a file
 
 
 def load_rasterizer(placed: PlacedRasterizer) -> None:
-    """Render next to nothing, so that what a picture needs is there: on a GPU its context, kernels and compilers.
+    """Render a tiny picture, to load all that pictures need: on a GPU its context, kernels and compilers.
 
-    What fails here will fail in the first picture again, and is reported there.
+    Errors are ignored here, because the first real picture reports them.
     """
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
@@ -47,20 +47,20 @@ def load_rasterizer(placed: PlacedRasterizer) -> None:
 
 
 class FollowedRun:
-    """The levels of a run that can be shown: finished, there and whole, from the coarsest on without gaps.
+    """The levels of a run that can be shown: finished, undamaged, from the coarsest on without gaps.
 
     Attributes:
-        archive: as it was when last looked at.
-        shown: None while there is no level to show.
-        problem: one line about the first level that should be there and cannot be shown; None without.
+        archive: the archive when last read.
+        shown: the run; None while it has no level.
+        problem: one line about the first level that is missing or damaged; None without.
 
     Args:
-        folder: of the run.
-        device, rasterizer: as `rasterizer_for` takes them.
+        folder: the run folder.
+        device, rasterizer: see `rasterizer_for`.
 
     Raises:
-        RunFolderError: there is no run, it is of another version, or its coarsest level cannot be shown.
-        UserInputError, MissingExtraError: as `rasterizer_for`.
+        RunFolderError: there is no run, it has another version, or its coarsest level is damaged.
+        UserInputError, MissingExtraError: see `rasterizer_for`.
     """
 
     def __init__(self, folder: Path, device: str, rasterizer: str) -> None:
@@ -78,13 +78,13 @@ class FollowedRun:
             raise RunFolderError(self.problem)
 
     def refresh(self, rig: Rig | None) -> bool:
-        """Read what is new; False when nothing is.
+        """Read changes; False when there are none.
 
         Args:
-            rig: the cameras it was trained on, where they are known.
+            rig: the training cameras; None when unknown.
 
         Raises:
-            RunFolderError: the run is gone or damaged; what was read before is still there.
+            RunFolderError: the run is missing or damaged; the earlier state is kept.
         """
         if all(_stamp(path) == stamp for path, stamp in self._stamps.items()):
             return False
@@ -92,12 +92,12 @@ class FollowedRun:
         return True
 
     def place(self, rig: Rig) -> None:
-        """Say on which cameras the run was trained."""
+        """Set the training cameras."""
         if self.shown is not None:
             self.shown = ShownRun.of(self.shown.name, self.shown.renderer, rig)
 
     def status(self) -> str:
-        """What is shown, and what is not yet, in one line."""
+        """Describe in one line which levels are shown and which are missing."""
         manifest = self.archive.manifest
         levels = ", ".join(str(level) for level in self.shown.counts) if self.shown else "nothing"
         if self.problem is not None:
@@ -114,7 +114,7 @@ class FollowedRun:
             self._placed = rasterizer_for(manifest, self._device, self._rasterizer)
             self._created = manifest.created
             self._fields = {}
-            if self._placed.device.type == "cuda":  # beside the reading of the fields
+            if self._placed.device.type == "cuda":  # while the fields are read
                 threading.Thread(target=load_rasterizer, args=(self._placed,), daemon=True).start()
         fields: dict[int, GaussianField] = {}
         self.problem = None
@@ -135,16 +135,16 @@ class FollowedRun:
             self.shown = ShownRun.of(archive.path().name, renderer, rig)
 
 
-class Following:
-    """Keeps a viewer showing what there is of a run, and of the one beside it.
+class RunFollower:
+    """Keeps a viewer up to date with a run, and with a second one beside it.
 
     Args:
-        viewer: that shows them.
-        page: whose status says what is shown.
-        run: what is looked at.
-        other: what it is compared with, None without.
-        scene: where the scene is now, None where it was trained.
-        say: told each line worth reading, besides the page.
+        viewer: shows the runs.
+        page: shows the status.
+        run: the run.
+        other: the run to compare with, or None.
+        scene: the scene's folder now; None when it did not move.
+        report: called with each new line of status.
     """
 
     def __init__(
@@ -154,9 +154,9 @@ class Following:
         run: FollowedRun,
         other: FollowedRun | None,
         scene: Path | None,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
-        self._viewer, self._page, self._say = viewer, page, say
+        self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
         self._scene = scene
         self._cameras: dict[str, Camera] = {}
@@ -165,17 +165,17 @@ class Following:
         self._placed_clients = False
 
     def begin(self) -> None:
-        """Read the cameras, and show what there is.
+        """Read the cameras and show the available levels.
 
         Raises:
-            RunFolderError, SceneError: the scene that was named is not the run's.
+            RunFolderError, SceneError: the given scene is not the run's.
         """
         try:
             train, test = run_cameras(self._runs[0].archive, self._scene)
         except (RunFolderError, SceneError) as error:
             if self._scene is not None:
                 raise
-            self._say(f"without the scene's cameras: {error}")
+            self._report(f"without the scene's cameras: {error}")
         else:
             self._cameras, self._rig = {**test, **train}, Rig.of(list(train.values()))
             for run in self._runs:
@@ -183,50 +183,50 @@ class Following:
         self._show()
 
     def warm_up(self) -> None:
-        """Unless somebody waits for a picture: draw a small one that nobody sees, which loads what pictures need."""
+        """Render a small picture that loads all that pictures need, unless a client already waits for one."""
         shown = self._runs[0].shown
         if shown is None or self._viewer.watched:
             return
         draw(shown, None, self._start(shown).camera(32, 32), PictureSettings(), distance=1.0, zoom=1.0)
 
-    def keep_preview(self) -> None:
-        """Keep what the next viewer of the run begins with, where it is not there and nothing of the run is amiss."""
-        archive, shown = self._runs[0].archive, self._runs[0].shown  # `watch` may replace them meanwhile
+    def save_preview(self) -> None:
+        """Save a preview for the next viewer, if there is none and all levels are shown."""
+        archive, shown = self._runs[0].archive, self._runs[0].shown  # `watch` may replace them in the meantime
         if shown is None or len(shown.counts) < len(archive.manifest.records):
             return
         if read_preview(archive.path()) is None:
-            keep_preview(archive, shown, self._start(shown))
+            save_preview(archive, shown, self._start(shown))
 
     def watch(self, stop: threading.Event) -> None:
-        """Show what is new whenever there is something, until `stop` is set."""
-        while not stop.wait(LOOK_SECONDS):
+        """Show changes until `stop` is set."""
+        while not stop.wait(POLL_SECONDS):
             try:
                 changed = [run.refresh(self._rig) for run in self._runs]
                 if any(changed):
                     self._show()
-            except LapgsError as error:  # a run that is removed or begun anew is shown as it was
-                self._tell(str(error))
+            except LapgsError as error:  # a run that is removed or restarted stays visible
+                self._set_status(str(error))
 
     def _show(self) -> None:
-        self._tell("; ".join(run.status() for run in self._runs))
+        self._set_status("; ".join(run.status() for run in self._runs))
         shown, *others = [run.shown for run in self._runs]
         if shown is None:
             return
         if not self._placed_clients:
             self._placed_clients = True
-            self._viewer.begin_at(self._start(shown))
-        self._viewer.show(Exhibit(shown, others[0] if others else None, self._cameras, self._rig))
+            self._viewer.set_initial_view(self._start(shown))
+        self._viewer.show(ViewerContent(shown, others[0] if others else None, self._cameras, self._rig))
 
-    def _start(self, shown: ShownRun) -> Start:
+    def _start(self, shown: ShownRun) -> InitialView:
         if self._rig is None:
-            return start_outside(shown.renderer.fields[shown.renderer.levels - 1])
-        return start_at(next(iter(self._cameras.values())), self._rig)
+            return InitialView.of_field(shown.renderer.fields[shown.renderer.levels - 1])
+        return InitialView.of_camera(next(iter(self._cameras.values())), self._rig)
 
-    def _tell(self, line: str) -> None:
+    def _set_status(self, line: str) -> None:
         self._page.status = line
         if line not in self._said:
             self._said.add(line)
-            self._say(line)
+            self._report(line)
 
 
 def _stamp(path: Path) -> Stamp:

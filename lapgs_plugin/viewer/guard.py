@@ -1,9 +1,9 @@
-"""Refuse clients that a foreign web page sent: the page shows a run and can pause its training.
+"""Refuse clients that come from foreign web pages, because the page shows a run and can pause its training.
 
-A browser lets any page open a web socket to any address, and says in Origin which page it was. A page whose name is
-made to lead to this machine (DNS rebinding) has an Origin that fits, but its name stands in Host. So Host has to be a
-name of this machine, and Origin, where there is one, the same as Host. Neither stops a program: whoever reaches the
-port without a browser may claim anything.
+Browsers let any page open a web socket to any address, and send the page's address as Origin. A page whose name
+resolves to this machine (DNS rebinding) has a matching Origin, but its name is the Host. So Host must be a name of this
+machine, and Origin, if present, must be equal to Host. This does not stop programs other than browsers, which can send
+any headers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from lapgs_plugin.errors import LapgsError
 
 logger = logging.getLogger(__name__)
 
-LONGEST_PATH = 2048
-"""Characters of a path; the page's own files have less than a hundred."""
+MAX_PATH = 2048
+"""Most characters of a path; the page's own paths have less than a hundred."""
 
-MOST_LINES = 10
-"""Refusals that are logged: a page that tries again and again shall not fill a log."""
+MAX_LOGGED = 10
+"""Most refusals in the log, so that a page that keeps trying does not fill it."""
 
 _AUTHORITY = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[^\s:/?#@\[\]]+)(:\d{1,5})?", re.IGNORECASE | re.ASCII)
 
@@ -39,12 +39,12 @@ ProcessRequest = Callable[[ServerConnection, Request], Response | None]
 
 
 class Guard:
-    """Which names a browser may know this machine by.
+    """Decide by which names a browser may address this machine.
 
-    - Always localhost and the loopback addresses, with any port: a tunnel has another one than the viewer.
-    - If others are let in: `host`, the addresses that it stands for, and the names of this machine.
-    - On all addresses: any address besides. One that a browser shows has not been looked up, so it cannot be a page's
-      name, and behind a router or in a container the machine does not know its own.
+    - Always localhost and the loopback addresses with any port, because a tunnel has its own port.
+    - If other machines may connect: `host`, its addresses, and the names of this machine.
+    - On all addresses: any address too. A numeric address cannot be a page's name, and a machine behind a router or in
+      a container does not know its own.
 
     Args:
         host: address or name that the viewer listens on.
@@ -59,12 +59,12 @@ class Guard:
             return
         own = socket.gethostname().lower()
         self._names |= {own, own.partition(".")[0], own.partition(".")[0] + ".local"}
-        # A name server may take seconds to tell.
+        # A name server may take seconds to answer.
         threading.Thread(target=lambda: self._names.add(socket.getfqdn().lower()), daemon=True).start()
 
     def refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
-        """Status and reason for a request that is not answered; None for others."""
-        if len(request.path) > LONGEST_PATH:
+        """Return status and reason for refusing a request; None to accept it."""
+        if len(request.path) > MAX_PATH:
             return HTTPStatus.REQUEST_URI_TOO_LONG, f"the path has {len(request.path)} characters"
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or len(origins) > 1 or (authority := _AUTHORITY.fullmatch(hosts[0])) is None:
@@ -79,8 +79,8 @@ class Guard:
         return None
 
     def log(self, reason: str) -> None:
-        """Write a line about a refusal, unless it was written before or there have been many."""
-        if reason not in self._logged and len(self._logged) < MOST_LINES:
+        """Log a refusal, unless it was logged before or there were many."""
+        if reason not in self._logged and len(self._logged) < MAX_LOGGED:
             self._logged.add(reason)
             logger.warning("the viewer refused a browser: %s", reason)
 
@@ -93,13 +93,13 @@ class Guard:
 
 @contextmanager
 def guarded_server(guard: Guard) -> Iterator[None]:
-    """Guard the server of web sockets that viser starts inside the block.
+    """Guard the web socket server that viser starts inside the block.
 
-    viser offers no hook for it, so the function by which it starts its server is replaced while it does: `serve` of
-    websockets, whose own hooks do the work.
+    viser has no hook for this, so `serve` of websockets, by which it starts its server, is replaced in the block. The
+    hooks of `serve` do the work.
 
     Raises:
-        LapgsError: no server was started this way. It is not guarded then and has to be closed.
+        LapgsError: no server was started this way, so it is not guarded and must be closed.
     """
     module: Any = websockets.asyncio.server
     original = module.serve
@@ -130,10 +130,10 @@ def _guarded(guard: Guard, answer: ProcessRequest | None) -> ProcessRequest:
             return connection.respond(status, f"{reason}\n")
         try:
             response = None if answer is None else answer(connection, request)
-        except (OSError, ValueError, LookupError):  # a name that no file can have, a header twice
+        except (OSError, ValueError, LookupError):  # an invalid file name, or a repeated header
             return connection.respond(HTTPStatus.BAD_REQUEST, "there can be no such file\n")
         if response is not None:
-            # Pages that show ours inside of them could make somebody press its buttons.
+            # Other pages must not embed ours to get its buttons pressed.
             response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
         return response
 
@@ -141,7 +141,7 @@ def _guarded(guard: Guard, answer: ProcessRequest | None) -> ProcessRequest:
 
 
 def _clients_logger() -> logging.Logger:
-    """A logger for websockets, which would write a traceback for each client that sends garbage or goes away."""
+    """Return a logger for websockets without tracebacks for clients that send garbage or disconnect."""
     clients = logging.getLogger(f"{__name__}.clients")
     clients.setLevel(logging.WARNING)
     clients.addFilter(_one_line)
@@ -158,7 +158,7 @@ def _one_line(record: logging.LogRecord) -> bool:
 
 
 def _log_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What a message of a client led to outside of its connection, in one line."""
+    """Log an error outside of a connection's own code in one line."""
     error = context.get("exception")
     logger.warning("a browser's message failed: %s", context["message"] if error is None else _summary(error))
     logger.debug("the same with its traceback", exc_info=error)

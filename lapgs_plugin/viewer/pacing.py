@@ -1,48 +1,48 @@
-"""When to draw a client's next picture, and how small: small while something moves, larger step by step when still."""
+"""Decide when to draw a client's next picture and at which size: small during motion, larger step by step at rest."""
 
 from __future__ import annotations
 
 import math
 
 TARGET_SECONDS = 0.05
-"""What a picture may take while something moves; twenty a second leaves room for what a browser does with them."""
+"""Seconds of a picture during motion; twenty a second leave time for the browser."""
 
 SETTLE_SECONDS = 0.15
-"""How long nothing must have changed before the picture is drawn larger."""
+"""Seconds without a change until a picture is drawn larger."""
 
 SMALLEST, STEP = 1.0 / 8.0, 2.0
 
 
 class Pacing:
-    """Decides the scale of a client's next picture, from what the last ones took.
+    """Decides the scale of a client's next picture from the times of the last ones.
 
-    A scale is a share of the window's width and height, in (0, 1]. All times are of one clock, in seconds.
+    A scale is a share of the window's width and height, in (0, 1]. All times come from one clock, in seconds.
 
     Args:
-        moving: what a picture may take while something moves.
-        still: what one may take when nothing does.
+        moving: seconds of a picture during motion.
+        still: seconds of a picture at rest.
     """
 
     def __init__(self, moving: float = TARGET_SECONDS, still: float = math.inf) -> None:
         self._moving_seconds, self._still_seconds = moving, still
-        self._moving = 0.25  # scale; before anything was measured
-        self._largest = 1.0  # scale of a picture when nothing moves
-        self._changed: float | None = None  # time of the last change that was not drawn
-        self._renewed: float | None = None  # since when the scene is another than the one that is shown
+        self._moving = 0.25  # scale during motion, here before the first measurement
+        self._largest = 1.0  # scale at rest
+        self._changed: float | None = None  # time of the last change that is not drawn yet
+        self._renewed: float | None = None  # time since which the shown scene is outdated
         self._last_change = -math.inf
-        self._drawn = 1.0  # scale of the picture that is shown
+        self._drawn = 1.0  # scale of the shown picture
 
     def change(self, now: float) -> None:
-        """What is shown is out of date: the camera moved, a control was used, the window has another size."""
+        """Note a change of the camera, a control or the window's size."""
         self._changed = self._last_change = now
 
     def renew(self, now: float) -> None:
-        """The scene is another, seen as before: what is drawn next need not be smaller than what is shown."""
+        """Note a change of the scene alone: the next picture need not be smaller than the shown one."""
         if self._renewed is None:
             self._renewed = now
 
     def due(self) -> float | None:
-        """When the next picture is to be drawn; None while the one that is shown is as good as it gets."""
+        """Return the time of the next picture; None while the shown one cannot be improved."""
         if self._changed is not None:
             return self._changed
         settled = self._last_change + SETTLE_SECONDS
@@ -51,7 +51,7 @@ class Pacing:
         return settled if self._drawn < self._largest else None
 
     def begin(self) -> float:
-        """The scale to draw at now; changes from here on ask for another picture."""
+        """Return the scale to draw at now; later changes need another picture."""
         self._renewed = None
         if self._changed is None:
             return min(self._largest, STEP * self._drawn)
@@ -59,21 +59,21 @@ class Pacing:
         return self._moving
 
     def end(self, scale: float, seconds: float) -> None:
-        """A picture was drawn and sent.
+        """Note that a picture was drawn and sent.
 
         Args:
-            scale: what `begin` said.
-            seconds: what it took.
+            scale: the result of `begin`.
+            seconds: its time.
         """
         self._drawn = scale
-        # Half the step keeps noise out of the size.
+        # A damped step keeps noise out of the size.
         self._moving = math.sqrt(self._moving * _fitting(scale, seconds, self._moving_seconds))
         if self._moving > 0.9:
             self._moving = 1.0
-        # In steps, or every picture would be followed by one a little larger.
+        # Quantized, otherwise every picture would be followed by a slightly larger one.
         self._largest = 0.5 ** (math.ceil(-2.0 * math.log2(_fitting(scale, seconds, self._still_seconds))) / 2.0)
 
 
 def _fitting(scale: float, seconds: float, wanted: float) -> float:
-    """The scale at which a picture would take the time that is wanted. Time goes with the number of pixels."""
+    """Return the scale at which a picture would take the wanted time, which is proportional to its pixels."""
     return max(SMALLEST, min(1.0, scale * math.sqrt(wanted / max(seconds, 1e-6))))

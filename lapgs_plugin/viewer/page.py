@@ -1,6 +1,6 @@
-"""The page that browsers load: its port, and what stands on it before anything is drawn.
+"""Serve the page that browsers load, with a preview until the first picture.
 
-Nothing here needs torch, so a browser can load the page while the process still imports what draws.
+Does not import torch, so that browsers can load the page while the process still imports the renderer.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from PIL import Image
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.interrupt import signals_held
 from lapgs_plugin.viewer.guard import Guard, guarded_server
-from lapgs_plugin.viewer.preview import QUALITY, fitted
+from lapgs_plugin.viewer.preview import QUALITY, crop_to_aspect
 
 PORTS_TRIED = 100
 
 
 def free_port(host: str, port: int) -> int:
-    """The first free port from `port` on.
+    """Find the first free port from `port` on.
 
     Raises:
-        UserInputError: this machine has no such address, or all of a hundred ports are taken.
+        UserInputError: this machine does not have that address, or a hundred ports are taken.
     """
     for candidate in range(port, min(port + PORTS_TRIED, 65536)):
         try:
@@ -46,38 +46,38 @@ def free_port(host: str, port: int) -> int:
 
 
 class Page:
-    """A page that is served from the moment it is made; close it, or use it as a context manager.
+    """A web page, served until it is closed; also a context manager.
 
     Attributes:
-        server: viser's, for what stands on the page.
-        port: where it is served.
-        status: a line above each client's panel, Markdown.
+        server: viser's server.
+        port: the port that it is served on.
+        status: a line above each client's panel, in Markdown.
 
     Args:
         host: address to listen on.
-        port: where to listen; the next free one where it is taken.
+        port: port to listen on, or the next free one.
         label: title of the panel.
-        preview: what every client sees until `end_preview`; None leaves the page empty.
+        preview: image for every client until `end_preview`; None for an empty page.
 
     Raises:
-        UserInputError: as `free_port`.
-        LapgsError: as `guarded_server`.
+        UserInputError: see `free_port`.
+        LapgsError: see `guarded_server`.
     """
 
     def __init__(self, host: str, port: int, label: str, preview: Image.Image | None = None) -> None:
         found = free_port(host, port)
         with (
-            signals_held(),  # they are for the main thread alone
+            signals_held(),  # only the main thread handles signals
             guarded_server(Guard(host)),
-            contextlib.redirect_stdout(io.StringIO()),  # viser prints a table of its addresses; we say one line
+            contextlib.redirect_stdout(io.StringIO()),  # viser prints a table of addresses; we print one line
         ):
             self.server = viser.ViserServer(host=host, port=found, label=label, verbose=False)
         self.port = int(self.server.get_port())
         self._host = "localhost" if host in ("0.0.0.0", "127.0.0.1", "::") else f"[{host}]" if ":" in host else host
-        # The button would offer the run to the internet by way of somebody else's server.
+        # The button would share the run on the internet through another server.
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._status: Any = self.server.gui.add_markdown(
-            "Starting." if preview is None else "As it was when it was trained; loading."
+            "Starting." if preview is None else "Preview of the run; loading."
         )
         self._preview, self._preview_lock = preview, threading.Lock()
         self.server.on_client_connect(self._send_preview)
@@ -86,7 +86,7 @@ class Page:
 
     @property
     def address(self) -> str:
-        """For a browser on this machine, or at the other end of a tunnel."""
+        """URL for a browser on this machine, or at the other end of a tunnel."""
         return f"http://{self._host}:{self.port}"
 
     @property
@@ -99,7 +99,7 @@ class Page:
             self._status.content = text
 
     def end_preview(self) -> None:
-        """Rendered pictures come from now on: the preview is sent to nobody any more, nor after one of them."""
+        """Stop sending the preview, because pictures are rendered from now on."""
         with self._preview_lock:
             self._preview = None
 
@@ -107,13 +107,13 @@ class Page:
         with self._preview_lock:
             if self._preview is None:
                 return
-            # The browser stretches it to its window. As the client's own picture it is replaced by the next one.
-            image = fitted(self._preview, client.camera.image_width / max(client.camera.image_height, 1))
+            # The browser stretches it to its window, and the client's first picture replaces it.
+            image = crop_to_aspect(self._preview, client.camera.image_width / max(client.camera.image_height, 1))
             client.scene.set_background_image(np.asarray(image), format="jpeg", jpeg_quality=QUALITY)
             client.flush()
 
     def close(self) -> None:
-        """Disconnect everybody and free the port."""
+        """Disconnect all clients and free the port."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 

@@ -1,4 +1,4 @@
-"""The picture a client sees: which bands, how strong, at which level of detail, of one run or of two side by side."""
+"""Render the picture of a client: chosen bands, gains and detail, of one run or of two side by side."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_images
 from lapgs_plugin.hierarchy.cameras import level_camera
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.rig import Rig
 
 DIVIDER_PIXELS = 2
 
 
-class Stopwatch:
-    """A rasterizer that remembers how long each field took, in milliseconds, in the order of their rendering."""
+class TimedRasterizer:
+    """A rasterizer that records the milliseconds of each field, in the order of rendering."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._rasterizer = rasterizer
@@ -37,11 +37,11 @@ class Stopwatch:
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        """As `Rasterizer`, not timed."""
+        """Render without timing, see `Rasterizer`."""
         return self._rasterizer(field, camera, background=background, sh_degree=sh_degree)
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """As `ImageRasterizer`."""
+        """Render and record the time, see `ImageRasterizer`."""
         begin = time.perf_counter()
         images = render_images(self._rasterizer, field, cameras, background)
         if images.is_cuda:
@@ -52,14 +52,14 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class ShownRun:
-    """A run that is looked at.
+    """A run in the viewer.
 
     Attributes:
-        name: how it is called on the page.
-        renderer: of its finished levels.
-        pixels_per_angle: focal length in pixels of the trained images, at full resolution; None where their cameras are
-            not known.
-        distance: of the training cameras from what they look at, in world units.
+        name: its name on the page.
+        renderer: renders its finished levels.
+        pixels_per_angle: focal length of the training images in pixels, at full resolution; None when the cameras are
+            unknown.
+        distance: from the training cameras to their subject, in world units.
     """
 
     name: str
@@ -69,7 +69,7 @@ class ShownRun:
 
     @classmethod
     def of(cls, name: str, renderer: HierarchyRenderer, rig: Rig | None) -> ShownRun:
-        """A run trained on the cameras of `rig`, where they are known."""
+        """Make a run with the training cameras of `rig`, if they are known."""
         if rig is None:
             return cls(name, renderer, None, 1.0)
         return cls(name, renderer, sorted(camera.fy for camera in rig.cameras)[len(rig.cameras) // 2], rig.distance)
@@ -81,24 +81,24 @@ class ShownRun:
         return {level: len(fields[level]) for level in sorted(fields, reverse=True)}
 
     def fitting_level(self, camera: Camera, distance: float) -> int:
-        """The finest level that a picture shows: finer ones have more detail than its pixels.
+        """Return the finest level whose detail the picture's pixels can show.
 
         Args:
-            camera: of the picture.
-            distance: of the camera from what it looks at, in world units.
+            camera: camera of the picture.
+            distance: from the camera to its subject, in world units.
 
         Returns:
-            A finished level. A level's detail doubles with each step; what lies between two is shown by the finer.
+            A finished level. Detail doubles from level to level; between two levels the finer one is returned.
         """
         if self.pixels_per_angle is None:
             return self.renderer.finest
         trained = self.pixels_per_angle / self.distance  # pixels a world unit
         shown = camera.fy / max(distance, 1e-9)
         octaves = math.log2(trained / shown)
-        return self._finished(math.floor(octaves + 1e-6))  # a window of just half the size is not a rounding too large
+        return self._finished(math.floor(octaves + 1e-6))  # tolerates rounding for a window of exactly half the size
 
     def level_for(self, settings: PictureSettings, window: Camera, distance: float) -> int:
-        """The finest level to add: the one chosen by hand, or the one that fits the window; the nearest finished."""
+        """Return the finest level to add: the chosen one, or the one that fits the window; the nearest finished."""
         return self.fitting_level(window, distance) if settings.level is None else self._finished(settings.level)
 
     def _finished(self, level: int) -> int:
@@ -107,14 +107,14 @@ class ShownRun:
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """What a client chose.
+    """The choices of a client.
 
     Attributes:
-        gains: by level; 0 for a level that is switched off.
-        band: the level whose own render is shown, residuals around mid-grey; None for the composition.
-        level: finest level to add; None takes `ShownRun.fitting_level`.
-        divider: where the picture changes from one run to the other, as a share of its width from the left; None shows
-            the first run alone.
+        gains: by level; 0 switches a level off.
+        band: the only level to show, residuals around mid-grey; None for the composition.
+        level: finest level to add; None for `ShownRun.fitting_level`.
+        divider: where the picture changes from one run to the other, as a share of its width; None shows only the
+            first run.
     """
 
     gains: Mapping[int, float] = field(default_factory=dict)
@@ -125,12 +125,12 @@ class PictureSettings:
 
 @dataclass(frozen=True)
 class Picture:
-    """What was drawn.
+    """A rendered picture.
 
     Attributes:
         image: (3, h, w) in [0, 1].
         level: the finest level that was added.
-        milliseconds: what rendering each level's field took, by level; those that were not rendered are missing.
+        milliseconds: time of each rendered level.
     """
 
     image: Tensor
@@ -144,38 +144,38 @@ def draw(
     """Render a picture.
 
     Args:
-        run: what the settings are about.
-        other: what is shown to the right of the divider, as it was trained.
-        camera: of the picture, at its size.
-        settings: what to show.
-        distance: of the camera from what it looks at, in world units.
+        run: the run that the settings apply to.
+        other: the run on the right of the divider, shown as trained.
+        camera: camera of the picture, at its size.
+        settings: the client's choices.
+        distance: from the camera to its subject, in world units.
         zoom: size of the window as a multiple of the picture's.
 
     Raises:
-        UserInputError: a gain or the band of the settings is of a level that is not finished.
+        UserInputError: the settings name a level that is not finished.
     """
     window = camera.resized(round(camera.width * zoom), round(camera.height * zoom))
-    stopwatch = Stopwatch(run.renderer.rasterizer)
-    # One field after the other, or their times would not be theirs.
-    shown = replace(run, renderer=replace(run.renderer, rasterizer=stopwatch, concurrent=False))
+    timed = TimedRasterizer(run.renderer.rasterizer)
+    # One field after the other, so that each can be timed.
+    shown = replace(run, renderer=replace(run.renderer, rasterizer=timed, concurrent=False))
     image, level = _shown(shown, camera, settings, shown.level_for(settings, window, distance))
     if settings.divider is not None and other is not None:
         as_trained = PictureSettings(level=settings.level)
         right, _ = _shown(other, camera, as_trained, other.level_for(settings, window, distance))
         image = side_by_side(image, right.to(image), settings.divider)
-    # Rendered from the finest level on. Fields do not tell: one may come to a GPU as another object.
+    # Rendered from the finest level on. Fields are not compared, because an offloaded one comes as another object.
     if settings.band is None:
         rendered = run.renderer.fields_for(level, settings.gains)
     else:
         rendered = run.renderer.fields_for_band(level, settings.gains.get(level, 1.0))
-    return Picture(image, level, dict(zip(reversed(rendered), stopwatch.laps, strict=True)))
+    return Picture(image, level, dict(zip(reversed(rendered), timed.laps, strict=True)))
 
 
 def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:
-    """Two (3, h, w) images as one: `left` up to the divider, a white line, `right` after it.
+    """Join two (3, h, w) images at the divider, with a white line between them.
 
     Args:
-        divider: share of the width that is of `left`, in [0, 1].
+        divider: share of the width of `left`, in [0, 1].
     """
     width = left.shape[2]
     column = round(divider * width)
@@ -186,19 +186,19 @@ def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:
 
 
 def as_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """An image of (3, h, w) in [0, 1] as (h, w, 3) pixels of 8 bits."""
+    """Convert an image (3, h, w) in [0, 1] to (h, w, 3) pixels of 8 bits."""
     planes = image.mul(255.0).add_(0.5).to(torch.uint8)
-    # Stacked planes take half the time of a permuted image, whose copy goes from plane to plane for each byte.
+    # Stacking planes is faster than copying a permuted image, which jumps between planes for each byte.
     return np.asarray(torch.stack(planes.unbind(0), dim=-1).cpu().numpy())
 
 
 def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int) -> tuple[Tensor, int]:
-    """The image of one run, (3, h, w) in [0, 1] at the camera's size, and the finest level in it."""
+    """Render one run: (3, h, w) in [0, 1] at the camera's size, and the finest level in it."""
     renderer = run.renderer
     if settings.band is not None:
         level = settings.band
-    # By hand, the picture is of full resolution and a coarser level is magnified. Otherwise the picture is of the
-    # resolution of `level`, and full resolution is what it would be if the window were larger.
+    # With a chosen level the picture has full resolution, and a coarser level is magnified. Otherwise the picture has
+    # the resolution of `level`, and full resolution would be that of a larger window.
     top = level if settings.level is None else 0
     full = camera.resized(camera.width << top, camera.height << top)
     if settings.band is None:

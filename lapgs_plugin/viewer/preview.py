@@ -1,7 +1,7 @@
-"""The picture that `lapgs view` shows until it can render one: a run as it is seen from where clients begin.
+"""Save and read the preview that `lapgs view` shows until it can render: the run from the initial view.
 
-A small JPEG in the run folder, kept when a run is complete or was looked at. Its comment says of which state of the run
-it is. Reading it needs no torch, which takes longer to import than a page to load.
+It is a small JPEG in the run folder, saved when a run is complete or was viewed. Its comment identifies the run's
+state. Reading it does not import torch, which takes longer than loading a page.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ from lapgs_plugin.untrusted import read_json
 if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.viewer.pictures import ShownRun
-    from lapgs_plugin.viewer.start import Start
+    from lapgs_plugin.viewer.poses import InitialView
 
 logger = logging.getLogger(__name__)
 
 SIZE = (1200, 600)
-"""In pixels, with the vertical field of view of clients, whose windows may be up to twice as wide as they are high."""
+"""Width and height in pixels, with the clients' vertical field of view; windows are up to twice as wide as high."""
 
 QUALITY = 85
 
 
 def read_preview(run: Path) -> Image.Image | None:
-    """The picture in a run folder; None where there is none, it is damaged, or the run was trained on since."""
+    """Read the preview in a run folder; None when it is missing, damaged, or older than the last training."""
     try:
         manifest = read_json(run / MANIFEST, dict[str, Any])
         image = Image.open(io.BytesIO((run / PREVIEW).read_bytes()), formats=("JPEG",))
         if image.info.get("comment") != _state(manifest["created"], len(manifest["records"])):
             return None
         image.load()
-    except Exception:  # Pillow raises OSError, SyntaxError, ValueError, ... by damage
+    except Exception:  # Pillow raises OSError, SyntaxError, ValueError and others for damaged files
         return None
     return image
 
 
-def fitted(image: Image.Image, aspect: float) -> Image.Image:
-    """The middle of a picture at full height and another width / height; black where that is wider than the picture."""
+def crop_to_aspect(image: Image.Image, aspect: float) -> Image.Image:
+    """Crop the middle of a picture at full height to another width / height, with black where it is too narrow."""
     half = 0.5 * aspect * image.height
     left, right = round(0.5 * image.width - half), round(0.5 * image.width + half)
     return image.crop((left, 0, max(right, left + 1), image.height))
 
 
-def keep_preview(archive: RunArchive, shown: ShownRun, start: Start) -> None:
-    """Render a run from where clients begin, and keep the picture in its folder. Whatever fails is a line of the log.
+def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> None:
+    """Render a run from the initial view and save the picture in its folder; errors are logged.
 
     Args:
-        archive: of the run.
-        shown: all of its finished levels.
-        start: where clients begin.
+        archive: the run.
+        shown: the run with all its finished levels.
+        start: the initial view.
     """
     with _logged(archive.path()):
         from lapgs_plugin.viewer.pictures import PictureSettings, as_bytes, draw
@@ -70,37 +70,37 @@ def keep_preview(archive: RunArchive, shown: ShownRun, start: Start) -> None:
             )
 
 
-def keep_preview_of(run: Path, device: str = "auto") -> None:
-    """As `keep_preview`, for a run that was just trained where its scene is.
+def save_run_preview(run: Path, device: str = "auto") -> None:
+    """Save the preview of a run that was just trained, see `save_preview`.
 
     Args:
-        run: its folder.
-        device: where to render, as `rasterizer_for` takes it.
+        run: the run folder.
+        device: where to render, see `rasterizer_for`.
     """
     with _logged(run):
-        # In here: a backbone's environment may lack OpenImageIO, say, and has trained all the same.
+        # Imported here, because a backbone's environment may lack such packages as OpenImageIO.
         from lapgs_plugin.rendering.rig import Rig
         from lapgs_plugin.rendering.run import run_cameras, run_renderer
         from lapgs_plugin.runs.archive import RunArchive
         from lapgs_plugin.viewer.pictures import ShownRun
-        from lapgs_plugin.viewer.start import start_at
+        from lapgs_plugin.viewer.poses import InitialView
 
         archive = RunArchive.open(run)
         train, test = run_cameras(archive)
         rig = Rig.of(list(train.values()))
         shown = ShownRun.of(run.name, run_renderer(archive, device), rig)
-        keep_preview(archive, shown, start_at(next(iter({**test, **train}.values())), rig))
+        save_preview(archive, shown, InitialView.of_camera(next(iter({**test, **train}.values())), rig))
 
 
 @contextmanager
 def _logged(run: Path) -> Iterator[None]:
-    """Whatever fails in here is a line of the log: a run is whole without a picture."""
+    """Log any error of the block, because a run is complete without a preview."""
     try:
         yield
     except Exception as error:
-        logger.warning("no picture of %s is kept for the viewer to begin with: %s", run, error)
+        logger.warning("no preview of %s is saved for the viewer: %s", run, error)
 
 
 def _state(created: str, finished: int) -> bytes:
-    """What a picture of a run is of: which training, and how many of its levels."""
+    """Identify the state of a run: its training and the number of finished levels."""
     return f"{created}, {finished} levels".encode()

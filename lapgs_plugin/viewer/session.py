@@ -1,4 +1,4 @@
-"""One client: its camera, its panel, and the pictures it is sent."""
+"""Handle one client: its camera, its panel, and its pictures."""
 
 from __future__ import annotations
 
@@ -18,33 +18,32 @@ from numpy.typing import NDArray
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.viewer.controls import Controls
-from lapgs_plugin.viewer.navigation import Pose
 from lapgs_plugin.viewer.pacing import TARGET_SECONDS, Pacing
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw
-from lapgs_plugin.viewer.start import Start, turning_distance
+from lapgs_plugin.viewer.poses import InitialView, Pose, orbit_distance
 
 MAX_SIDE = 2048
-"""Longest side of a picture in pixels; the browser stretches it to larger windows."""
+"""Longest side of a picture in pixels; browsers stretch it to larger windows."""
 
 PATH_FILE = "path.json"
 
 HANDLE_DEPTH, HANDLE_HEIGHT, HANDLE_RADIUS = 10.0, 0.5, 0.03
-"""Of the ball on the divider: its depth in nearest visible depths, then shares of half the window's height."""
+"""Ball on the divider: depth in units of the near plane; height and radius in units of half the window's height."""
 
 JPEG_MOVING, JPEG_STILL = 75, 92
 REPORT_SECONDS = 0.3
-"""The figures change no oftener than this while the picture moves."""
+"""Least seconds between two updates of the figures during motion."""
 
 
 @dataclass(frozen=True)
-class Exhibit:
-    """What every client looks at.
+class ViewerContent:
+    """The content that all clients see.
 
     Attributes:
-        run: the hierarchy.
-        other: what it is compared with, None without.
-        cameras: of the scene by view name; empty where they are not known.
-        rig: of these cameras, None without.
+        run: the run.
+        other: the run to compare with, or None.
+        cameras: the scene's cameras by view name; empty when unknown.
+        rig: the rig of these cameras, or None.
     """
 
     run: ShownRun
@@ -54,13 +53,13 @@ class Exhibit:
 
 
 @dataclass(frozen=True)
-class Pace:
-    """What a picture may take, in seconds, and what may go on beside it.
+class PictureBudget:
+    """Limits of the time of pictures, in seconds.
 
     Attributes:
-        moving: while something moves.
-        still: when nothing does.
-        ahead: draw the next picture while the last one is made a JPEG of and sent.
+        moving: seconds of a picture during motion.
+        still: seconds of a picture at rest.
+        ahead: draw the next picture while the last one is encoded and sent.
     """
 
     moving: float = TARGET_SECONDS
@@ -69,26 +68,28 @@ class Pace:
 
 
 class Session:
-    """A connected client. Its callbacks come from viser's threads, its pictures are drawn by the viewer's.
+    """A connected client. viser's threads call its callbacks, the viewer's thread draws its pictures.
 
     Args:
         client: viser's handle.
-        pace: of its pictures.
-        sender: makes JPEGs and sends them.
-        wake: called when there may be something to draw.
+        budget: limits of its pictures.
+        sender: encodes and sends pictures.
+        wake: called when a picture may be needed.
     """
 
-    def __init__(self, client: viser.ClientHandle, pace: Pace, sender: Executor, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, client: viser.ClientHandle, budget: PictureBudget, sender: Executor, wake: Callable[[], None]
+    ) -> None:
         self._client = client
-        self._pace, self._sender = pace, sender
+        self._budget, self._sender = budget, sender
         self._wake = wake
-        self._pacing = Pacing(pace.moving, pace.still)
+        self._pacing = Pacing(budget.moving, budget.still)
         self._sending: Future[None] | None = None
         self._lock = threading.Lock()
-        self._exhibit: Exhibit | None = None
+        self._content: ViewerContent | None = None
         self._cameras: Mapping[str, Camera] = {}
         self._rig: Rig | None = None
-        self._coming: Exhibit | None = None  # what the next picture shows
+        self._coming: ViewerContent | None = None  # content of the next picture
         self._controls: Controls | None = None
         self._handle: viser.IcosphereHandle | None = None
         self._last_report = 0.0
@@ -98,19 +99,19 @@ class Session:
         client.camera.on_update(lambda _: self._change())
         self._change()
 
-    def show(self, exhibit: Exhibit) -> None:
-        """Look at this from the next picture on."""
+    def show(self, content: ViewerContent) -> None:
+        """Show this content from the next picture on."""
         with self._lock:
-            self._coming = exhibit
+            self._coming = content
             self._pacing.renew(time.perf_counter())
 
-    def forget(self) -> None:
-        """Let go of what was shown; the picture stays."""
+    def clear(self) -> None:
+        """Drop the content; the last picture stays."""
         with self._lock:
-            self._exhibit = self._coming = None
+            self._content = self._coming = None
 
-    def stand_at(self, start: Start) -> None:
-        """Begin there."""
+    def move_to(self, start: InitialView) -> None:
+        """Move the client's camera to a view."""
         camera = self._client.camera
         with self._client.atomic():
             camera.up_direction = start.up
@@ -119,12 +120,12 @@ class Session:
             camera.look_at = start.look_at
 
     def due(self) -> float | None:
-        """When its next picture is to be drawn, by time.perf_counter(); None for not before something changes."""
+        """Return the time of the next picture, by time.perf_counter(); None when none is needed."""
         with self._lock:
-            return None if self._exhibit is self._coming is None else self._pacing.due()
+            return None if self._content is self._coming is None else self._pacing.due()
 
-    def leave(self) -> None:
-        """The client has disconnected: nothing is sent any more, and what is being drawn is dropped."""
+    def disconnect(self) -> None:
+        """Stop sending, because the client has disconnected; a picture being drawn is dropped."""
         self._left = True
 
     def draw(self) -> None:
@@ -132,12 +133,12 @@ class Session:
         begin = time.perf_counter()
         with self._lock:
             scale = self._pacing.begin()
-            exhibit, self._coming = self._coming or self._exhibit, None
-            self._exhibit = exhibit
-        if exhibit is None:  # forgotten since somebody found it due
+            content, self._coming = self._coming or self._content, None
+            self._content = content
+        if content is None:  # cleared since the picture became due
             return
-        controls = self._adopt(exhibit)
-        picture = self._draw(exhibit, controls.settings, scale)
+        controls = self._update_panel(content)
+        picture = self._draw(content, controls.settings, scale)
         if self._left:
             return
         self._send(as_bytes(picture.image), JPEG_STILL if scale >= 1.0 else JPEG_MOVING)
@@ -149,15 +150,15 @@ class Session:
             self._last_report = now
             controls.report(picture, seconds)
 
-    def _adopt(self, exhibit: Exhibit) -> Controls:
-        """Make the panel that of the exhibit."""
-        self._cameras, self._rig = exhibit.cameras, exhibit.rig
-        if self._controls is None or not self._controls.fits(exhibit.run, exhibit.other):
+    def _update_panel(self, content: ViewerContent) -> Controls:
+        """Update the panel to the content."""
+        self._cameras, self._rig = content.cameras, content.rig
+        if self._controls is None or not self._controls.fits(content.run, content.other):
             self._controls = Controls(
                 self._client,
-                exhibit.run,
-                exhibit.other,
-                list(exhibit.cameras),
+                content.run,
+                content.other,
+                list(content.cameras),
                 before=self._controls,
                 changed=self._change,
                 go_to=self._go_to,
@@ -165,7 +166,7 @@ class Session:
                 keep=self._keep,
                 save=self._save,
             )
-            if exhibit.other is not None and self._handle is None:
+            if content.other is not None and self._handle is None:
                 self._handle = self._add_handle()
             self._place_handle()
         return self._controls
@@ -174,26 +175,26 @@ class Session:
         camera = self._client.camera
         return Pose(np.asarray(camera.wxyz), np.asarray(camera.position), float(camera.fov))
 
-    def _draw(self, exhibit: Exhibit, settings: PictureSettings, scale: float) -> Picture:
+    def _draw(self, content: ViewerContent, settings: PictureSettings, scale: float) -> Picture:
         camera, pose = self._client.camera, self._pose()
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         share = scale * min(1.0, MAX_SIDE / max(width, height))
         size = max(round(share * width), 1), max(round(share * height), 1)
         distance = float(np.linalg.norm(np.asarray(camera.look_at) - pose.position))
-        return draw(exhibit.run, exhibit.other, pose.camera(*size), settings, distance=distance, zoom=1.0 / share)
+        return draw(content.run, content.other, pose.camera(*size), settings, distance=distance, zoom=1.0 / share)
 
     def _send(self, pixels: NDArray[np.uint8], quality: int) -> None:
         if self._sending is not None:
-            self._sending.result()  # one picture ahead, no more: a later one shows where the camera is by then
+            self._sending.result()  # at most one picture ahead: a later one shows a newer camera
         self._sending = self._sender.submit(self._encode_and_send, pixels, quality)
-        if not self._pace.ahead:
+        if not self._budget.ahead:
             self._sending.result()
 
     def _encode_and_send(self, pixels: NDArray[np.uint8], quality: int) -> None:
         if self._left:
             return
         self._client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
-        self._client.flush()  # or viser collects messages for up to 1/60 s
+        self._client.flush()  # otherwise viser collects messages for up to 1/60 s
 
     def _change(self) -> None:
         with self._lock:
@@ -202,7 +203,7 @@ class Session:
         self._wake()
 
     def _add_handle(self) -> viser.IcosphereHandle:
-        """A ball on the divider, to drag it by: a drag that begins on a thing of the scene does not turn the camera."""
+        """Add a ball to drag the divider by; dragging an object of the scene does not turn the camera."""
         handle = self._client.scene.add_icosphere("/divider", color=(255, 255, 255), cast_shadow=False)
 
         @handle.on_drag("left")
@@ -213,7 +214,7 @@ class Session:
         return handle
 
     def _place_handle(self) -> None:
-        """Keep the ball on the divider, at the same size, wherever the camera goes."""
+        """Keep the ball on the divider, at constant size, for every camera."""
         if self._handle is None or self._controls is None:
             return
         split = self._controls.settings.divider
@@ -225,11 +226,11 @@ class Session:
         half_height = depth * math.tan(0.5 * pose.fov)
         half_width = half_height * camera.image_width / max(camera.image_height, 1)
         in_camera = np.array([(2.0 * split - 1.0) * half_width, HANDLE_HEIGHT * half_height, depth])
-        self._handle.position = pose.position + viser.transforms.SO3(pose.wxyz).as_matrix() @ in_camera
+        self._handle.position = pose.position + pose.rotation @ in_camera
         self._handle.scale = HANDLE_RADIUS * half_height
 
     def _go_to(self, index: int) -> None:
-        """Stand where a camera of the scene stands."""
+        """Move to a camera of the scene."""
         assert self._rig is not None, "there are cameras"
         pose = Pose.of(list(self._cameras.values())[index])
         camera = self._client.camera
@@ -237,21 +238,20 @@ class Session:
             camera.fov = pose.fov
             camera.position = pose.position
             camera.wxyz = pose.wxyz
-            ahead = viser.transforms.SO3(pose.wxyz).as_matrix()[:, 2]
-            camera.look_at = pose.position + turning_distance(pose.position, self._rig) * ahead
+            camera.look_at = pose.position + orbit_distance(pose.position, self._rig) * pose.rotation[:, 2]
 
     def _keep(self) -> int:
-        """Remember the view for a path."""
+        """Store the current view for a path."""
         camera = self._client.camera
         self._kept.append(self._pose().camera(camera.image_width, camera.image_height))
         return len(self._kept)
 
     def _save(self) -> None:
-        """Hand out the views that were kept as a file for `lapgs render --trajectory`."""
-        from lapgs_plugin.rendering.trajectory import trajectory_json, with_size  # brings scipy.interpolate
+        """Download the stored views as a file for `lapgs render --trajectory`."""
+        from lapgs_plugin.rendering.trajectory import trajectory_json, with_size  # imports scipy.interpolate
 
         if self._kept:
-            size = self._kept[0].width, self._kept[0].height  # windows change
+            size = self._kept[0].width, self._kept[0].height  # the window's size may have changed
             text = json.dumps(trajectory_json([with_size(camera, size) for camera in self._kept]), indent=1)
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 

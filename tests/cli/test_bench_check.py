@@ -1,4 +1,4 @@
-"""Experiments that cannot be run as they are: what can be known is refused before the first run, a line a mistake."""
+"""Test experiments that cannot run: all mistakes are refused before the first run, one line each."""
 
 from __future__ import annotations
 
@@ -53,6 +53,8 @@ SAMPLE = 'sample = { size = "64x48", views = 8, points = 100 }'
 PATH = 'path = "scene"'
 OURS = "densify_every = 50"
 THEIRS = "fused_adam = false"
+NESTED = 'hierarchy = "nested"'
+RESIDUAL = ("is about residuals", "add --hierarchy laplacian")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,7 @@ def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def lines_about(text: str, *words: str) -> list[str]:
-    """What `lapgs bench` says of an experiment that it refuses; nothing may be written."""
+    """Return the lines by which `lapgs bench` refuses an experiment, and check that nothing is written."""
     Path("tiny.toml").write_text(text)
     before = everything()
     paths = () if any(word.startswith("fastgs=") for word in words) else ("--path", f"fastgs={CHECKOUTS / 'fastgs'}")
@@ -100,7 +102,7 @@ def everything() -> set[str]:
 MISTAKES = [
     ("seeds = [0, 1]", "seeds = [0, -1]", ["seeds.1 = -1", "expected 0 to 4294967295"]),
     ("seeds = [0, 1]", "seeds = [4294967296]", ["seeds.0 = 4294967296", "expected 0 to 4294967295"]),
-    ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is there twice", "expected different seeds"]),
+    ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is listed twice", "expected different seeds"]),
     ("seeds = [0, 1]", 'seeds = ["one"]', ["seeds.0 = 'one'", "valid integer"]),
     ("levels = 2", "levels = 0", ["variants.1.options.levels = 0"]),
     ("levels = 2", "levels = -3", ["variants.1.options.levels = -3"]),
@@ -124,11 +126,15 @@ MISTAKES = [
     ("levels = 2", 'hierarchy = "laplacian", joint = 2.0', ["variants.1.options.joint = 2.0", "from 0 to 1"]),
     ("levels = 2", 'hierarchy = "laplacian", inherit = "xyz:7"', ['options.inherit = "xyz:7"', "expected a ratio"]),
     ("levels = 2", r'split = "a\nb\u001b[31m"', [r"\n", r"\x1b", "expected fractions"]),
+    ("sh_degree = 1", f"{NESTED}, joint = 0.25", ["backbones.cpu.options.joint = 0.25", *RESIDUAL]),
+    ("sh_degree = 1", f'{NESTED}, inherit = "geometry"', ['backbones.cpu.options.inherit = "geometry"', *RESIDUAL]),
+    ("sh_degree = 1", f'{NESTED}, supervision = "gt_laplacian"', ["backbones.cpu.options.supervision", *RESIDUAL]),
+    (THEIRS, f"{NESTED}, residual_color_rate = 1.0", ["variants.3.options.residual_color_rate = 1.0", *RESIDUAL]),
     (OURS, "densify_every = 0", ["variants.2.options.densify_every = 0", "expected at least 1"]),
     (OURS, "accumulate_views = -1", ["variants.2.options.accumulate_views = -1", "expected at least 1"]),
     (OURS, "sh_degree = 9", ["variants.2.options.sh_degree = 9", "expected 0, 1, 2 or 3"]),
     (OURS, "threads = 100000", ["variants.2.options.threads = 100000", "1024"]),
-    (OURS, 'strategy = "best"', ['variants.2.options.strategy = "best"', "expected default or mcmc"]),
+    (OURS, 'strategy = "best"', ['variants.2.options.strategy = "best"', "expected default, mcmc or multiview"]),
     (OURS, 'strategy = "mcmc"', ['variants.2.options.strategy = "mcmc"', "only gsplat on a CUDA device"]),
     (OURS, "packed = true", ["variants.2.options.packed = true", "only gsplat on a CUDA device"]),
     (OURS, 'packed = "yes"', ['variants.2.options.packed = "yes"', "expected true or false"]),
@@ -146,7 +152,7 @@ MISTAKES = [
     (THEIRS, "test_every = 0", ["variants.3.options.test_every = 0", "expected at least 1"]),
     ("sh_degree = 1", "sh_degree = -1", ["backbones.cpu.options.sh_degree = -1", "expected 0, 1, 2 or 3"]),
     ('rasterizer = "cpu"', 'rasterizer = "gpu"', ['backbones.cpu.rasterizer = "gpu"', "expected auto, gsplat, cpu"]),
-    ('checkout = "fastgs"', 'checkout = "fast"', ["backbones.fast.checkout", "nothing says where it is"]),
+    ('checkout = "fastgs"', 'checkout = "fast"', ["backbones.fast.checkout", "its folder is not given"]),
     ('"--dense"', '"-m", "elsewhere", "--dense"', ["variants.1", "arguments '-m'", "other options of the script"]),
     ('"--dense"', '"--source_path=x", "--dense"', ["arguments '--source_path=x'", "other options of the script"]),
     ('resolution = "full"', 'resolution = "big"', ['scenes.0.resolution = "big"', "expected 1k, 2k, 4k"]),
@@ -184,7 +190,7 @@ def test_a_mistake_is_one_line_that_names_file_key_value_and_what_was_expected(
     if "[table]" in new:
         text = GOOD + new.partition("\n")[2]
     lines = lines_about(text)
-    # Two commands may say it in words of their own, and of a scene it is said for each variant that cannot use it.
+    # Two commands may use their own words, and a scene is named for each variant that cannot use it.
     assert all(line.startswith("tiny.toml: ") and line.isprintable() for line in lines)
     (line, *_) = [each for each in lines if all(word in each for word in expected)] or [None]
     assert line is not None, lines
@@ -230,7 +236,7 @@ def test_mistakes_of_the_file_itself_are_all_said_at_once() -> None:
         (("--workers", "-1"), "--workers -1: expected at least 1"),
         (("--gpus", "0,,1"), "--gpus '0,,1': expected names separated by commas"),
         (("--launcher", "cloud"), "--launcher cloud: expected local, slurm, ray"),
-        (("--launcher", "slurm", "--gpus", "0"), "--gpus 0: slurm deals out GPUs itself"),
+        (("--launcher", "slurm", "--gpus", "0"), "--gpus 0: slurm assigns GPUs itself"),
         (("--launcher-option", "partition=gpu"), "--launcher-option partition: the local launcher has none"),
         (("--path", "fastgs=empty"), "backbones.fast.checkout: checkout fastgs: "),
         (("--path", "fastgs=file"), "file is not a folder"),
@@ -257,11 +263,19 @@ def test_mistakes_on_the_command_line_are_found_before_anything_is_written(
 def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launchers, "find_spec", lambda name: object())
     (line,) = lines_about(GOOD, "--launcher", "ray", "--launcher-option", f"{name}={value}")
-    assert line.startswith(f"--launcher-option {name}={value}: expected a number of a worker")
+    assert line.startswith(f"--launcher-option {name}={value}: expected a number for each worker")
 
 
-def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A login node has no GPU, and commands are printed anywhere."""
+def test_defaults_of_residual_options_are_accepted_for_nested_levels() -> None:
+    idle = f'{NESTED}, joint = 0.0, supervision = "reconstructed"'
+    Path("tiny.toml").write_text(GOOD.replace("sh_degree = 1", idle))
+    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
+
+
+def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Login nodes have no GPU, and commands are printed anywhere."""
     text = GOOD.replace('rasterizer = "cpu"', 'rasterizer = "gsplat"').replace(THEIRS, 'device = "cuda"')
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     refused = lines_about(text)
@@ -277,7 +291,7 @@ def test_what_another_machine_may_have_is_no_mistake(monkeypatch: pytest.MonkeyP
 
 
 def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is left out on the way, but where a run elsewhere renders."""
+    """Every run is rehearsed."""
     checked = []
     real = bench_check._rehearse
 
@@ -294,7 +308,7 @@ def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytes
 
 
 def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each with a scene in place of the data sets', large enough for its levels."""
+    """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
     monkeypatch.setattr(bench_check._SceneSizes, "__call__", lambda self, resolution: (1600, 1066))
     for path in sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml")):
@@ -313,7 +327,7 @@ def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypat
 
 
 def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(place: Path) -> None:
-    """A script has its own way to read scenes."""
+    """Scripts have their own way to read scenes."""
     model = place / "scene" / "sparse" / "0" / "points3D.bin"
     whole = model.read_bytes()
     model.write_bytes(whole[:50])

@@ -1,4 +1,4 @@
-"""`lapgs bench EXPERIMENT.toml` as a user runs it: to the end, again, with mistakes, and side by side."""
+"""Test `lapgs bench EXPERIMENT.toml` as users run it: to the end, again, with mistakes, and in parallel."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experime
     torn = experiment.parent / "torn"
     make_sample_scene(torn, width=48, height=32, views=8, points=100, progress=False)
     whole = (torn / "images" / "0003.png").read_bytes()
-    (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # its header is whole: found by the run alone
+    (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # with a whole header, so only the run fails
     head, rest = EXPERIMENT.split("[backbones.cpu]")
     text = f'{head}[[scenes]]\nname = "torn"\npath = "torn"\n[backbones.cpu]{rest}'
     experiment.write_text(
@@ -129,7 +129,7 @@ def invoke(*words: str | Path) -> BaseException | None:
         (("--launcher", "slurm"), "no sbatch on this machine"),
         (("--launcher-option", "partition"), "--launcher-option partition: expected NAME=VALUE"),
         (("--launcher-option", "partition=gpu"), "the local launcher has none"),
-        (("--launcher", "slurm", "--gpus", "0"), "slurm deals out GPUs itself"),
+        (("--launcher", "slurm", "--gpus", "0"), "slurm assigns GPUs itself"),
         (("--path", "mine"), "--path mine: expected NAME=VALUE"),
         (("--path", "mine=nowhere"), "scene mine: nowhere is not a folder"),
         (("--scene", "yours"), "--scene yours: not in the experiment; "),
@@ -152,7 +152,7 @@ def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path
     os.environ.pop("LAPGS_FASTGS", None)
     error = invoke(experiment, "--out", experiment.parent / "out")
     assert isinstance(error, UserInputError)
-    assert "checkout fastgs: nothing says where it is; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
+    assert "checkout fastgs: its folder is not given; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
     assert not (experiment.parent / "out").exists()
 
 
@@ -164,10 +164,17 @@ def test_results_of_another_version_are_named(experiment: Path) -> None:
     claim = store.claim([planned[0].spec.run_id])
     assert claim is not None
     store.record(claim, {"psnr": 20.0, "train_seconds": 1.0, "lapgs_version": "0.0.9"})
-    result = CliRunner().invoke(bench_app, [str(experiment), "--out", str(out), "--tables-only"])
+    words = [str(experiment), "--out", str(out), "--tables-only"]
+    result = CliRunner().invoke(bench_app, words)
     assert result.exit_code == 0
     assert "some results were made by lapgs_plugin 0.0.9" in result.stderr
     assert "lapgs_plugin 0.0.9" in (out / "tables.md").read_text()
+    assert "| one field |" in result.stdout, "a pipe gets the Markdown"
+    assert result.stdout.rstrip().endswith(f"lapgs report {out} writes a page with curves and images")
+    shown = CliRunner().invoke(bench_app, words, env={"FORCE_COLOR": "1", "COLUMNS": "150"}).stdout
+    assert "one field" in shown
+    assert "20.00" in shown
+    assert "|" not in shown, "a terminal gets tables, not their source"
 
 
 def test_tables_of_nothing(experiment: Path) -> None:

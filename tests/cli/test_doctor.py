@@ -1,4 +1,4 @@
-"""`lapgs doctor` on this machine, and on one where everything is broken."""
+"""Run `lapgs doctor` on this machine, and on one where everything is broken."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 
 from lapgs_plugin import environment
 from lapgs_plugin.cli.doctor import doctor, examine
-from lapgs_plugin.environment import Probe
+from lapgs_plugin.environment import findings, probes
+from lapgs_plugin.environment.probes import Probe
 from tests.contract.stub_runs import CHECKOUTS
 
-probed = lru_cache(environment.run_probe)
+probed = lru_cache(probes.run_probe)
 app = typer.Typer()
 app.command()(doctor)
 
@@ -34,7 +35,7 @@ def test_json_names_every_section_and_this_machine_can_train() -> None:
 
 
 def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "run_probe", lambda *arguments: Probe({}, "ImportError: [libfoo] is gone"))
+    monkeypatch.setattr(probes, "run_probe", lambda *arguments: Probe({}, "ImportError: [libfoo] is gone"))
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, [])
     assert result.exit_code == 0
     assert "!!" in result.stdout
@@ -70,10 +71,10 @@ def test_what_training_will_use(
 ) -> None:
     """As `choose_rasterizer` has it: a GPU that cannot be used stands in the way, unless it is hidden."""
     found = Probe({**TORCH, **facts})
-    monkeypatch.setattr(environment, "run_probe", lambda *given: found if given == ("torch",) else probed(*given))
+    monkeypatch.setattr(probes, "run_probe", lambda *given: found if given == ("torch",) else probed(*given))
     monkeypatch.setattr(environment, "driver_version", lambda: driver)
-    monkeypatch.setattr(environment, "gsplat_built", lambda: built)
-    monkeypatch.setattr(environment.shutil, "which", lambda name, path=None: None)
+    monkeypatch.setattr(findings, "gsplat_built", lambda: built)
+    monkeypatch.setattr(findings.shutil, "which", lambda name, path=None: None)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if hidden is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)

@@ -1,4 +1,4 @@
-"""`lapgs export`: files that a reader of other viewers' needs accepts, and what they say of residuals."""
+"""Read the files of `lapgs export` as other viewers do, and test how they mark residuals."""
 
 from __future__ import annotations
 

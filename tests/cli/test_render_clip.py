@@ -1,4 +1,4 @@
-"""`lapgs render --trajectory`: clips read back by OpenCV, and their frames against images rendered one by one."""
+"""Read clips of `lapgs render --trajectory` with OpenCV, and compare frames with images rendered one by one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def path_file(run: Path, tmp_path: Path) -> Path:
-    """A file with the first three training cameras."""
+    """Write a file with the first three training cameras."""
     train, _ = run_cameras(RunArchive.open(run))
     path = tmp_path / "path.json"
     path.write_text(json.dumps(trajectory_json(list(train.values())[:3])))
@@ -125,7 +125,7 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
             ("--trajectory", "orbit", "--size", "16384x16384"),
             "expected at most 128,000,000 pixels; ",
         ),
-        (("--trajectory", "helix"), "expected orbit, spline or a JSON file"),
+        (("--trajectory", "helix"), "give orbit, spline or a JSON file"),
         (("--trajectory", "orbit", "--level", 3), "level 3 cannot be rendered"),
     ],
 )

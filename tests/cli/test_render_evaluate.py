@@ -1,4 +1,4 @@
-"""`lapgs render` and `lapgs eval`: their files against each other and against NumPy."""
+"""Compare the files of `lapgs render` and `lapgs eval` with each other and with NumPy."""
 
 from __future__ import annotations
 

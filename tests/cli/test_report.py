@@ -1,4 +1,4 @@
-"""`lapgs report`: the page is whole and self-contained, and says what metrics.json says."""
+"""Test that the page of `lapgs report` is whole and self-contained, and shows the content of metrics.json."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ VOID = {"meta", "img", "input", "line", "polyline", "circle", "rect", "path"}
 
 
 class Page(HTMLParser):
-    """What is on the page: attributes by tag, text by row of a table, and whether every tag is closed."""
+    """The content of the page: attributes by tag, text by row of a table, and whether every tag is closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) ->
     cutout = next(image for image in cutouts if image["alt"] == "Photo of photos/08.png, enlarged 1")
     part = cv2.imdecode(np.frombuffer(base64.b64decode(cutout["src"].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
     assert part.shape == (16, 16, 3)
-    # Found again pixel by pixel, and nowhere else.
+    # The cut-out occurs there pixel by pixel, and nowhere else.
     distances = cv2.matchTemplate(original, part, cv2.TM_SQDIFF)
     assert distances.min() < 1.0
 
@@ -152,7 +152,7 @@ def test_charts_show_both_runs_over_time_and_iterations(run: Path, baseline: Pat
     assert page.text.count("level 1") >= 6
 
 
-def test_bars_show_what_training_took(run: Path, baseline: Path) -> None:
+def test_bars_show_the_time_of_training(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
     page = Page((run / "report.html").read_text())
     bars = Counter(bar["class"] for bar in page.all("rect") if bar.get("class", "").startswith("part-"))
@@ -181,11 +181,11 @@ def test_views_are_listed_worst_first_beside_the_baseline(run: Path, baseline: P
     assert re.findall(r"<th>([^<]*)</th>", table)[:5] == ["view", "PSNR (dB)", "SSIM", "baseline PSNR", "gain"]
 
 
-def test_what_is_noted_after_a_stage_lies_at_its_end(run: Path) -> None:
+def test_entries_without_a_time_lie_at_the_end_of_their_stage(run: Path) -> None:
     history = run / "history.jsonl"
     entries = [json.loads(line) for line in history.read_text().splitlines()]
     kept = [{key: value for key, value in entry.items() if key != "psnr"} for entry in entries]
-    # As `lapgs run` notes it: without a time.
+    # Entries of `lapgs run` have no time.
     kept.append({"level": 0, "iteration": 200, "psnr": 21.5})
     history.write_text("".join(json.dumps(entry) + "\n" for entry in kept))
     lapgs_report(run)
@@ -219,7 +219,7 @@ def test_a_single_field_without_held_out_views_or_history(scene: Path, tmp_path:
     assert len(page.all("img")) == 3 * (2 + 2 * 2 + 2)
 
 
-def test_runs_that_were_not_trained_alike_are_pointed_out(run: Path, scene: Path, tmp_path: Path) -> None:
+def test_differences_of_setup_are_reported(run: Path, scene: Path, tmp_path: Path) -> None:
     other = write_run(tmp_path / "other", scene, levels=1, hold_out=False)
     output = lapgs_report(run, "--baseline", other)
     assert "held-out views True against False" in output

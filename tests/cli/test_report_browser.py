@@ -1,4 +1,4 @@
-"""report.html as a person meets it: a real browser without a window and without a network, a mouse and a keyboard."""
+"""Test report.html in a headless browser without a network, with mouse and keyboard."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PHONE, DESKTOP = (390, 844), (1280, 900)
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of the page of a hierarchy beside a single field, whose pictures differ a lot."""
+    """Return the page of a hierarchy beside a single field, whose pictures differ a lot."""
     folder = tmp_path_factory.mktemp("report")
     scene = write_scene(folder / "scene")
     run, baseline = write_run(folder / "run", scene), write_run(folder / "baseline", scene, levels=1, seed=5)
@@ -40,7 +40,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of the page of an experiment."""
+    """Return the page of an experiment."""
     folder = write_experiment(tmp_path_factory.mktemp("experiment") / "trial")
     lapgs_report(folder)
     return (folder / "report.html").as_uri()
@@ -53,7 +53,7 @@ def size(request: pytest.FixtureRequest) -> Any:
 
 @contextmanager
 def opened(browser: Any, address: str, size: tuple[int, int]) -> Iterator[Any]:
-    """A page, which asked for nothing and reported no mistake by the end of the test."""
+    """Open a page, and check that it requests nothing and reports no error."""
     width, height = size
     troubles: list[str] = []
     page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=1)
@@ -72,7 +72,7 @@ def page(browser: Any, address: str, size: tuple[int, int]) -> Iterator[Any]:
         yield page
 
 
-def test_an_experiment_fits_and_shows_what_it_should(browser: Any, experiment: str, size: tuple[int, int]) -> None:
+def test_the_page_of_an_experiment_fits_and_is_complete(browser: Any, experiment: str, size: tuple[int, int]) -> None:
     with opened(browser, experiment, size) as page:
         widths = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
         assert widths[0] <= widths[1]
@@ -88,7 +88,7 @@ def test_an_experiment_fits_and_shows_what_it_should(browser: Any, experiment: s
 
 
 def pixels(element: Any) -> NDArray[np.float64]:
-    """(h, w, 3) what is seen of an element."""
+    """Capture an element, (h, w, 3)."""
     return cv2.imdecode(np.frombuffer(element.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(np.float64)
 
 
@@ -100,7 +100,7 @@ def choose(strip: Any, side: str, caption: str) -> None:
     strip.locator(f'select[data-side="{side}"]').select_option(label=caption)
 
 
-def test_the_page_fits_and_shows_what_it_should(page: Any) -> None:
+def test_the_page_fits_and_is_complete(page: Any) -> None:
     widths = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
     assert widths[0] <= widths[1]  # nothing has to be scrolled sideways but tables inside their own boxes
     for heading in ("Figures", "Training", "Time", "Views", "Settings"):

@@ -1,4 +1,4 @@
-"""`lapgs report` of what `lapgs bench` leaves: every variant, scene and backbone is there, and what is gone is said."""
+"""Test `lapgs report` of experiments: all variants, scenes and backbones are shown, missing ones are named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VARIANTS = {"bare": 1, "two levels": 2}
 
 
 def row(scene: str, backbone: str, variant: str, seed: int) -> dict[str, Any]:
-    """A line of results.csv whose figures say what it is of."""
+    """Make a line of results.csv whose figures identify it."""
     levels = VARIANTS[variant]
     size = 1000.0 * (1 + SCENES.index(scene)) * (1 + BACKBONES.index(backbone)) / levels
     return {
@@ -51,7 +51,7 @@ def row(scene: str, backbone: str, variant: str, seed: int) -> dict[str, Any]:
 
 
 def write_experiment(folder: Path) -> Path:
-    """What `lapgs bench` leaves of an experiment whose runs are all there; one of them without metrics."""
+    """Write the folder of an experiment with all its runs, one of them without metrics."""
     scene = write_scene(folder / "scenes" / "striped")
     rows = [row(s, b, v, seed) for seed in SEEDS for s in SCENES for b in BACKBONES for v in VARIANTS]
     for each in rows:
@@ -71,7 +71,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def experiment(finished: Path, tmp_path: Path) -> Path:
-    """A copy of it somewhere else: results lie where runs do not lie any more."""
+    """Copy it, so that the paths in its results are outdated."""
     return Path(shutil.copytree(finished, tmp_path / "trial"))
 
 
@@ -122,7 +122,7 @@ def test_bars_are_means_over_scenes_and_seeds(experiment: Path) -> None:
     ]
 
 
-def test_what_is_gone_is_said_and_the_rest_shown(experiment: Path) -> None:
+def test_missing_runs_are_named_and_the_rest_is_shown(experiment: Path) -> None:
     shutil.rmtree(experiment / "runs" / "0-cpu-2-0")
     (experiment / "tables.md").unlink()
     lapgs_report(experiment)
@@ -132,7 +132,7 @@ def test_what_is_gone_is_said_and_the_rest_shown(experiment: Path) -> None:
     assert page.text.count("worst of 2 by PSNR") == 4  # of the first pair bare alone
 
 
-def test_a_scene_that_is_gone_leaves_the_charts(experiment: Path) -> None:
+def test_a_missing_scene_leaves_the_charts(experiment: Path) -> None:
     for manifest in experiment.glob("runs/*/manifest.json"):
         values = json.loads(manifest.read_text())
         values["scene"]["path"] = str(experiment / "nowhere")

@@ -28,7 +28,7 @@ from tests.cli.run_folder import write_run, write_scene
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-PATIENCE = 120.0
+LOCK_TIMEOUT = 120.0
 
 READY = "installed"
 """What a process prints as soon as its handlers are there; before, the interpreter starts and Ctrl-C is its own."""
@@ -87,7 +87,7 @@ def signalled(words: Sequence[object], signals: Sequence[tuple[float, signal.Sig
             process.send_signal(which)
             begin = begin if number else time.monotonic()
     try:
-        text, _ = process.communicate(timeout=PATIENCE)
+        text, _ = process.communicate(timeout=LOCK_TIMEOUT)
     finally:
         process.kill()
     return Ended(process.returncode, text, time.monotonic() - begin)

@@ -1,4 +1,4 @@
-"""`lapgs eval --trajectory`: what it prints, writes and refuses."""
+"""Test output, files and refusals of `lapgs eval --trajectory`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_camera_that_stands_still_sees_no_flicker(scene: Path, tmp_path: Path)
     assert "stability.json holds these figures" in output
 
 
-def test_an_orbit_moves_what_is_not_fixed(scene: Path, tmp_path: Path) -> None:
+def test_an_orbit_shows_flicker(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
     lapgs_eval(run, "--trajectory", "orbit", "--frames", 90)
     figures = json.loads((run / "stability.json").read_text())
@@ -48,7 +48,7 @@ def test_an_orbit_moves_what_is_not_fixed(scene: Path, tmp_path: Path) -> None:
     assert figures["flicker"]["composition"]["mean"] > 1e-4
 
 
-def test_what_goes_together_and_what_does_not(scene: Path, tmp_path: Path) -> None:
+def test_contradicting_options_are_refused(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
     with pytest.raises(UserInputError, match="--baseline needs --trajectory"):
         lapgs_eval(run, "--baseline", run)

@@ -41,8 +41,8 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
     archive = RunArchive.open(tmp_path / "run")
     assert archive.manifest.complete
     assert archive.manifest.settings["views_per_step"] == "3"
-    assert archive.manifest.settings["hierarchy"] == "nested", "unless told otherwise"
-    assert [record.signed for record in archive.manifest.records] == [False, False]
+    assert archive.manifest.settings["hierarchy"] == "laplacian", "unless told otherwise"
+    assert [record.signed for record in archive.manifest.records] == [False, True]
     assert read_preview(tmp_path / "run") is not None
     before = archive.field_path(0).read_bytes()
     again = lapgs("train", scene, "-o", tmp_path / "run", *SHORT)
@@ -64,10 +64,11 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--hierarchy", "gaussian"), "--hierarchy gaussian: expected nested or laplacian"),
         *(
             ((*words, *option.split()), f"{option}: is about residuals, and nested levels have none; leave it out, or")
-            for words in ((), ("--hierarchy", "nested"))
+            for words in (("--hierarchy", "nested"),)
             for option in ("--joint 0.5", "--inherit xyz", "--inherit geometry", "--supervision gt_laplacian")
         ),
-        (("--joint", "0.5"), "add --hierarchy laplacian to train residuals"),
+        (("--hierarchy", "nested", "--joint", "0.5"), "add --hierarchy laplacian to train residuals"),
+        (("--protocol", "paper", "--joint", "0.5"), "--joint 0.5 with --protocol paper: the paper has 0.0"),
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),

@@ -1,4 +1,4 @@
-"""`lapgs view` up to the moment it serves: what it says, and what it refuses."""
+"""Test `lapgs view` until it serves: its messages and refusals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.viewer.pages import statuses
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
 from lapgs_plugin.viewer.page import free_port  # noqa: E402  # needs viser
-from lapgs_plugin.viewer.server import Viewer  # noqa: E402
+from lapgs_plugin.viewer.viewer import Viewer  # noqa: E402
 
 app = typer.Typer()
 app.command("view")(view)
@@ -31,7 +31,7 @@ lapgs_view = succeeding(app, columns=200)
 
 @pytest.fixture(autouse=True)
 def _ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The end as soon as the viewer serves."""
+    """Stop the viewer as soon as it serves."""
     monkeypatch.setattr(Viewer, "serve", lambda self, **_: None)
 
 
@@ -102,6 +102,6 @@ def test_a_folder_that_is_no_run_is_refused_before_anything_is_served(tmp_path: 
 
 
 def test_the_page_is_served_without_torch() -> None:
-    """A browser loads it while the process still imports what draws."""
+    """Browsers load the page while the process still imports the renderer."""
     code = "import sys; import lapgs_plugin.viewer.page, lapgs_plugin.cli.view; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

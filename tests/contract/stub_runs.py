@@ -43,7 +43,7 @@ WHITE = ("--white_background", "--densify_from_iter", 0)
 iterations as here they do not recover before FastGS prunes what is faint."""
 
 THIRDS: dict[str, Any] = {"split": "1/3,2/3"}
-"""Stages of 30 and 60 iterations: residuals have them anyway, nested levels halves."""
+"""Stages of 30 and 60 iterations, which these tests train residuals with unless they say otherwise."""
 KINDS = ("nested", "laplacian")
 """Of hierarchies."""
 
@@ -169,6 +169,9 @@ def drive(
     test_every: int | None = None,
     **options: Any,
 ) -> None:
+    options.setdefault("hierarchy", "nested")
+    if options["hierarchy"] == "laplacian" and options.get("levels", 2) == 2:
+        options = {**THIRDS, **options}
     driver = HierarchyDriver(
         adapter,
         RunSettings(**options),

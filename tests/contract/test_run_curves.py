@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.rendering.compose import to_full_size
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from tests.contract.stub_runs import NAMES, STUBS, THIRDS, run_hierarchy

@@ -19,8 +19,9 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.interrupt import stop_request
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick

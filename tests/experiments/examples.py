@@ -1,4 +1,4 @@
-"""Small experiments, and jobs whose training is the copy of a run folder."""
+"""Make small experiments, and jobs that copy a run folder instead of training."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COPY = (
     START + "stream = open(started, 'a'); stream.write(pathlib.Path(out).name + '\\n'); stream.close(); "
     "time.sleep(float(seconds)); shutil.copytree(source, out)"
 )
-"""Trains by copying: out, a file that gets a line for every start, the folder to copy, seconds that it takes."""
+"""Trains by copying. Arguments: out, a file that gets a line for every start, the folder to copy, seconds to take."""
 
 
 def run_spec(number: int = 0, **changes: Any) -> RunSpec:
@@ -47,7 +47,7 @@ def run_spec(number: int = 0, **changes: Any) -> RunSpec:
 
 
 def tiny_run(folder: Path, psnr: float = 20.0) -> Path:
-    """A complete, measured run folder of two levels with a few Gaussians."""
+    """Write a complete, evaluated run folder of two levels with a few Gaussians."""
     scene = SceneReference("/nowhere", "full", True, (0.0, 0.0, 0.0), "colmap")
     manifest = Manifest(scene, 2, "camera", "reconstructed", "geometry", 0, "cpu", 0, {})
     with RunArchive.create(folder, manifest) as archive:
@@ -82,7 +82,7 @@ def _field(count: int, signed: bool) -> GaussianField:
 
 
 def copying_jobs(folder: Path, count: int, seconds: float = 0.0, code: str = COPY) -> list[Job]:
-    """Jobs that copy a tiny run; `folder`/started has a line for every start of one."""
+    """Make jobs that copy a tiny run; `folder`/started gets a line for every start."""
     source = folder / "source"
     if not source.exists():
         tiny_run(source)

@@ -1,4 +1,4 @@
-"""Runs of an experiment: all of them, once, in an order that is fair; and the commands they become."""
+"""Test the expansion of experiments: all runs once, in a fair order, and their commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import commands
-from lapgs_plugin.experiments.commands import Places, run_steps
+from lapgs_plugin.experiments.commands import Locations, run_steps
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
 from lapgs_plugin.experiments.schema import Experiment
 from tests.experiments.examples import SMALL, run_spec
@@ -55,7 +55,7 @@ def test_every_combination_once_and_variants_in_turn(
     assert len(found) == len(wanted)
     assert set(found) == wanted
     assert len({run.spec.run_id for run in planned}) == len(wanted)
-    # Before anything is run a second time in the same place, everything else was run there once.
+    # No variant runs twice in the same position before every other one did.
     pairs = variants * backbones
     for start in range(0, len(found), pairs):
         block = found[start : start + pairs]
@@ -79,7 +79,7 @@ def test_variants_trained_alike_share_their_runs_and_a_new_name_repeats_none() -
 
 
 def test_a_run_says_which_hierarchy_it_trains() -> None:
-    """Results of residuals are not taken for those of what has become the default."""
+    """A changed default must not reuse the results of the old one."""
     variants = [
         {"name": "nested", "options": {"hierarchy": "nested"}},
         {"name": "default"},
@@ -89,16 +89,16 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
     for backbone in ("cpu", "fast"):
         specs = {run.variant: run.spec for run in planned if run.spec.backbone == backbone}
         found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
-        assert found == {"nested": "nested", "default": "nested", "residuals": "laplacian"}
-        assert specs["nested"].run_id == specs["default"].run_id != specs["residuals"].run_id
+        assert found == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
+        assert specs["residuals"].run_id == specs["default"].run_id != specs["nested"].run_id
 
 
-def test_what_is_selected_is_what_is_run() -> None:
+def test_only_selected_runs_are_planned() -> None:
     selection = Selection(scenes=["b"], backbones=["fast"], variants=["bare"], seeds=[7], iterations=9)
     (run,) = plan_runs(experiment(), selection)
     spec = run.spec
     assert (spec.scene, spec.backbone, spec.seed, spec.iterations) == ("b", "fast", 7, 9)
-    assert spec.options == {}, "options of `lapgs run` mean nothing to a script by itself"
+    assert spec.options == {}, "a script by itself takes no options of `lapgs run`"
     assert spec.arguments[:2] == ["--densification_interval", "100"]
     with pytest.raises(UserInputError, match="--scene c: not in the experiment"):
         plan_runs(experiment(), Selection(scenes=["c"]))
@@ -186,13 +186,13 @@ def test_resolutions_as_scripts_take_them(tmp_path: Path, resolution: str, width
     assert words_after(step.command, "-r") == [expected]
 
 
-def test_a_fraction_that_no_script_knows(tmp_path: Path) -> None:
+def test_a_fraction_that_scripts_cannot_read_is_refused(tmp_path: Path) -> None:
     spec = run_spec(checkout="fastgs", rasterizer=None, resolution="1/3")
     with pytest.raises(UserInputError, match="resolution '1/3'"):
         run_steps(spec, tmp_path, tmp_path, tmp_path / "r", None)
 
 
-def test_where_things_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_of_scenes_and_checkouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built = experiment(scenes=[{"dataset": "mipnerf360", "only": ["garden"]}])
     (garden,) = scenes_of(built, Selection())
     for name in ("GARDEN", "MIPNERF360", "FASTGS"):
@@ -200,14 +200,14 @@ def test_where_things_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(
         UserInputError, match=r"scene garden.*--path garden=FOLDER \(LAPGS_GARDEN\) or --path mipnerf360"
     ):
-        Places({}, tmp_path).scene(garden)
+        Locations({}, tmp_path).scene(garden)
     (tmp_path / "360" / "garden").mkdir(parents=True)
     monkeypatch.setenv("LAPGS_MIPNERF360", str(tmp_path / "360"))
     with pytest.raises(UserInputError, match="garden has no image folder images"):
-        Places({}, tmp_path).scene(garden)
+        Locations({}, tmp_path).scene(garden)
     (tmp_path / "360" / "garden" / "images").mkdir()
-    assert Places({}, tmp_path).scene(garden) == tmp_path / "360" / "garden"
+    assert Locations({}, tmp_path).scene(garden) == tmp_path / "360" / "garden"
     with pytest.raises(UserInputError, match="nowhere is not a folder"):
-        Places({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
+        Locations({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
     with pytest.raises(UserInputError, match=r"has no train\.py"):
-        Places({"fastgs": tmp_path}, tmp_path).checkout("fastgs")
+        Locations({"fastgs": tmp_path}, tmp_path).checkout("fastgs")

@@ -1,4 +1,4 @@
-"""Launchers: workers that are really started, by the engines behind them, and die now and then."""
+"""Test launchers with real workers, some of which are killed."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -
 
 
 def _worker_of_a_running_command(noted: Path) -> int:
-    """Process id of a worker: the parent of the leash whose id the command that it started last has noted."""
+    """Return the process id of a worker: the parent of the leash that the last started command recorded."""
     while True:
         try:
             status = Path(f"/proc/{int(noted.read_text())}/status").read_text()

@@ -1,4 +1,4 @@
-"""The paper's figures as data: copied right, which its own averages show."""
+"""Test the paper's figures against the paper's own averages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOT_ITS_OWN_MEAN = {
     ("main_1k", "mipnerf360", "Ours(FastGS)", "gaussians_millions"),  # 0.87 of the residual printed, 0.847
     ("main_2k", "mipnerf360", "Ours(Taming)", "fps"),  # 71 printed, 72.2
 }
-"""Where the paper's average is not that of the scenes it prints."""
+"""Averages in the paper that are not those of its printed scenes."""
 PRINTED_TO = {"minutes": 0.01, "psnr": 0.01, "ssim": 0.001, "lpips": 0.001, "gaussians_millions": 0.01, "fps": 1}
 
 
@@ -35,7 +35,7 @@ def test_scenes_average_to_what_is_printed_for_the_data_set(table: str, dataset:
     for level, printed in enumerate(whole.values):
         values = [figure.values[level] for figure in single if figure is not None and figure.exact]
         assert len(values) == len(scenes)
-        # Rounding of the average, and as much again of the scenes; worst seen: 0.67 steps.
+        # Rounding of the average and of the scenes; worst seen: 0.67 steps.
         close = abs(sum(values) / len(values) - printed) <= PRINTED_TO[column]
         differs = (table, dataset, method, column) in NOT_ITS_OWN_MEAN
         assert close or differs

@@ -1,4 +1,4 @@
-"""The store: no run lost and none doubled, whoever dies, and whatever wrote the file before."""
+"""Test that the store neither loses nor repeats runs when workers die, and that it refuses damaged files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments import store as store_module
-from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MOST_CLAIMS, PENDING, RUNNING, ResultStore
+from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDING, RUNNING, ResultStore
 from lapgs_plugin.experiments.worker import work
 from tests.experiments.examples import COPY, START, copying_jobs
 from tests.waiting import wait_for
@@ -29,13 +29,13 @@ def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
 
 
 def starts(folder: Path) -> Counter[str]:
-    """How often each run was started."""
+    """Count the starts of each run."""
     path = folder / "started"
     return Counter(without_attempt(name) for name in path.read_text().split()) if path.exists() else Counter()
 
 
 def without_attempt(name: str) -> str:
-    """A run's id from the name of the folder of one of its attempts."""
+    """Return a run's id from the folder name of an attempt."""
     return name.partition("-attempt")[0]
 
 
@@ -122,13 +122,13 @@ def test_a_run_that_kills_its_workers_fails_in_the_end(
 ) -> None:
     store, run_ids = planned
     now = time.time()
-    for death in range(MOST_CLAIMS):
+    for death in range(MAX_CLAIMS):
         monkeypatch.setattr(store_module.time, "time", lambda death=death: now + death * (LEASE + 1))
         assert store.claim(run_ids[:1]) is not None
-    monkeypatch.setattr(store_module.time, "time", lambda: now + MOST_CLAIMS * (LEASE + 1))
+    monkeypatch.setattr(store_module.time, "time", lambda: now + MAX_CLAIMS * (LEASE + 1))
     assert store.claim(run_ids[:1]) is None
     (outcome,) = store.outcomes(run_ids[:1])
-    assert (outcome.state, outcome.error) == (FAILED, f"the worker that ran it died {MOST_CLAIMS} times")
+    assert (outcome.state, outcome.error) == (FAILED, f"the worker that ran it died {MAX_CLAIMS} times")
 
 
 def test_what_is_done_stays_done_and_what_failed_gets_another_chance(
@@ -213,7 +213,7 @@ def test_a_store_without_its_tables_or_in_use(tmp_path: Path, monkeypatch: pytes
         ResultStore(path)
     path.unlink()
     store = ResultStore.create(path)
-    monkeypatch.setattr(store_module, "PATIENCE", 0.1)
+    monkeypatch.setattr(store_module, "LOCK_TIMEOUT", 0.1)
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
     with pytest.raises(RunFolderError, match="database is locked"):

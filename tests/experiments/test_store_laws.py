@@ -1,4 +1,4 @@
-"""Whatever workers do and in whatever order: one result a run, from the worker that last held it."""
+"""Test with random actions of workers: each run has one result, from the worker that last held it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
 from lapgs_plugin.experiments import store as store_module
-from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MOST_CLAIMS, RUNNING, Claim, Job, ResultStore
+from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, RUNNING, Claim, Job, ResultStore
 from tests.experiments.examples import run_spec
 
 RUNS = 3
 
 
 class Workers(RuleBasedStateMachine):
-    """Claims that are renewed, recorded, failed, given back, or forgotten until their lease is over."""
+    """Random claims that are renewed, recorded, failed, released, or expire."""
 
     claims = Bundle("claims")
 
@@ -56,7 +56,7 @@ class Workers(RuleBasedStateMachine):
         if run_id in self.holder:
             assert self.now > self.until[run_id], "what somebody holds is not given away"
         self.holder[run_id], self.until[run_id] = claim, self.now + LEASE
-        assert claim.number <= MOST_CLAIMS
+        assert claim.number <= MAX_CLAIMS
         return claim
 
     @rule(claim=claims)

@@ -1,4 +1,4 @@
-"""From rows to tables: means and spreads against arithmetic done by hand, and pages against what they should say."""
+"""Test means and deviations against arithmetic by hand, and written tables against expected text."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def paper_experiment(**changes: Any) -> Experiment:
 
 
 def record(run: PlannedRun) -> dict[str, Any]:
-    """Figures that differ for every run, and are easy to add up."""
+    """Make figures that differ for every run and are easy to add up."""
     spec = run.spec
     scene = SCENES.index(spec.scene) if spec.scene in SCENES else 0
     seconds = (300.0 if spec.method == "bare" else 240.0) + 60.0 * scene + 6.0 * spec.seed
@@ -83,7 +83,7 @@ def test_the_papers_figures_are_of_the_same_scenes() -> None:
     assert two.psnr_gain.paper == pytest.approx((32.43 + 29.43 - 33.08 - 29.60) / 2)
 
 
-def test_a_missing_run_leaves_no_unfair_mean() -> None:
+def test_means_use_the_scenes_that_every_row_has() -> None:
     experiment = paper_experiment()
     planned = plan_runs(experiment, Selection())
     lost = next(
@@ -99,10 +99,10 @@ def test_a_missing_run_leaves_no_unfair_mean() -> None:
     records = {run.spec.run_id: record(run) for i, run in enumerate(planned) if i not in both}
     (group,) = make_table(experiment, planned, records).groups
     assert group.rows[0].cells["minutes"].values == (pytest.approx(5.05),), "bonsai alone, in every row"
-    assert "Means over bonsai, the scenes that every row has." in group.notes
+    assert "Means over bonsai: the scenes that every row has." in group.notes
 
 
-def test_figures_of_a_whole_data_set_are_said_to_be_such() -> None:
+def test_the_papers_means_over_a_data_set_are_noted() -> None:
     experiment = paper_experiment(
         variants=[{"name": "1/3", "options": {"split": "1/3,2/3"}, "paper": "(10000, 20000)"}],
         table={"paper": "split", "columns": ["minutes"]},

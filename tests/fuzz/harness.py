@@ -319,7 +319,10 @@ def judged(answer: dict[str, Any], case: Case, folder: Path, templates: Path) ->
         return Problem(f"more than {MOST_BYTES / 1e9:g} GB", message or answer["printed"])
     if answer["code"] not in (0, 2, STOPPED):
         return Problem(f"exit code {answer['code']}", message or answer["printed"])
-    return _judged_line(message, case, folder, templates) if answer["code"] == 2 else None
+    if answer["code"] != 2:
+        return None
+    lines = message.split("\n") if case.kind.name == "experiment" else [message]  # all its mistakes are told
+    return next(filter(None, (_judged_line(line, case, folder, templates) for line in lines)), None)
 
 
 def _judged_line(message: str, case: Case, folder: Path, templates: Path) -> Problem | None:

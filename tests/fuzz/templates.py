@@ -27,8 +27,9 @@ from PIL import Image
 from plyfile import PlyData
 
 from lapgs_plugin import __version__
-from lapgs_plugin.experiments.commands import Places
+from lapgs_plugin.experiments.commands import Locations
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
 from lapgs_plugin.experiments.runner import Folder, prepare
 from lapgs_plugin.experiments.schema import load_experiment
@@ -153,7 +154,7 @@ def _write_colmap(folder: Path, binary: bool) -> None:
 def _write_runs(folder: Path, reader: Reader) -> None:
     scene = str(folder / "scene_json")
     options = ["--iterations", "6", "--levels", "2", "--rasterizer", "oracle", "--sh-degree", "1", "--split", "1/3,2/3"]
-    options += ["--resolution", "full"]
+    options += ["--resolution", "full", "--hierarchy", "nested"]
     part = folder / "run_part"
     _succeed(reader, folder, "train", scene, "-o", str(part), *options, "--checkpoint-every", "1")
     assert (part / "checkpoint.pt").exists(), "training was to be stopped before its end"
@@ -244,7 +245,10 @@ def _write_experiment(folder: Path, reader: Reader) -> None:
     file.write_text(as_toml(values))
     experiment = load_experiment(file, {"train": {"levels"}, "run": {"levels"}})
     planned, scenes = plan_runs(experiment, Selection()), scenes_of(experiment, Selection())
-    jobs = prepare(planned, scenes, Places({}, bench), Folder(bench), [])
+    jobs, _ = prepare(
+        planned, scenes, Locations({}, bench), Folder(bench), [], experiment, Selection(), mistakes := Mistakes(file)
+    )
+    mistakes.refuse()
     store = ResultStore.create(Folder(bench).store)
     store.plan(jobs)
     for job in jobs:

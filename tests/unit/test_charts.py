@@ -1,4 +1,4 @@
-"""Charts: axes of round numbers that hold the data, and lines where the axes say."""
+"""Test charts: axes have round numbers and hold the data, and lines lie where the axes say."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from lapgs_plugin.reports.charts import (
     INSET,
     INSET_AT,
     WHOLE,
+    Arrow,
     Bar,
     Frame,
     Mark,
-    Move,
     Series,
-    draw,
+    draw_arrows,
     draw_bars,
-    draw_moves,
+    draw_lines,
 )
 
 LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
@@ -32,7 +32,7 @@ values = st.floats(-1e7, 1e7, allow_nan=False).map(lambda value: round(value, 3)
 @given(low=values, span=st.floats(1e-3, 1e7))
 def test_ticks_are_round_few_and_enclose_the_data(low: float, span: float) -> None:
     high = low + span
-    chart = draw("t", "x", [Series("run", [(0, low), (1, high)])], from_zero=False, format_y=repr)
+    chart = draw_lines("t", "x", [Series("run", [(0, low), (1, high)])], from_zero=False, format_y=repr)
     ticks = [float(tick.label) for tick in chart.y_ticks]
     assert 2 <= len(ticks) <= 8
     slack = 1e-6 * max(abs(low), abs(high), span)
@@ -46,7 +46,7 @@ def test_ticks_are_round_few_and_enclose_the_data(low: float, span: float) -> No
 
 
 def test_points_lie_where_the_axes_say() -> None:
-    chart = draw("t", "x", [Series("run", [(0, 0), (5, 40), (10, 100)])], marks=[Mark(5, "half")])
+    chart = draw_lines("t", "x", [Series("run", [(0, 0), (5, 40), (10, 100)])], marks=[Mark(5, "half")])
     top = float(chart.y_ticks[-1].label)
     points = [tuple(map(float, pair.split(","))) for pair in chart.lines[0].points.split()]
     height = HEIGHT - TOP - BOTTOM
@@ -60,7 +60,7 @@ def test_points_lie_where_the_axes_say() -> None:
 
 def test_labels_of_close_marks_stand_below_each_other() -> None:
     line = Series("run", [(0.0, 1.0), (100.0, 1.0)])
-    chart = draw("t", "x", [line], marks=[Mark(0, "level 3"), Mark(50, "level 2"), Mark(55, "level 1")])
+    chart = draw_lines("t", "x", [line], marks=[Mark(0, "level 3"), Mark(50, "level 2"), Mark(55, "level 1")])
     first, second, third = chart.marks
     assert first.y == second.y < third.y
 
@@ -68,7 +68,7 @@ def test_labels_of_close_marks_stand_below_each_other() -> None:
 @pytest.mark.parametrize("points", [[(0.0, 0.0)], [(0.0, 3.0), (1.0, 3.0)], [(2.0, 0.0), (4.0, 0.0)]])
 @pytest.mark.parametrize("from_zero", [True, False])
 def test_flat_and_single_points_are_drawn(points: list[tuple[float, float]], from_zero: bool) -> None:
-    chart = draw("t", "x", [Series("run", points)], from_zero=from_zero)
+    chart = draw_lines("t", "x", [Series("run", points)], from_zero=from_zero)
     for pair in chart.lines[0].points.split():
         x, y = map(float, pair.split(","))
         assert LEFT <= x <= WIDTH - RIGHT
@@ -80,7 +80,7 @@ def plotted(points: str) -> list[tuple[float, float]]:
 
 
 def in_data(point: tuple[float, float], right: float, bottom: float, top: float, frame: Frame) -> tuple[float, float]:
-    """From chart units back to data units."""
+    """Convert chart units back to data units."""
     x, y = point
     return (
         right * (x - frame.left) / (frame.width - frame.left - frame.right),
@@ -90,7 +90,7 @@ def in_data(point: tuple[float, float], right: float, bottom: float, top: float,
 
 def test_an_inset_holds_the_start_and_nothing_else() -> None:
     rising = [(float(x), 30.0 - 20.0 / (1 + x)) for x in range(0, 101, 2)]
-    chart = draw("t", "x", [Series("run", rising), Series("late", [(50, 10), (90, 20)])], inset_until=10.0)
+    chart = draw_lines("t", "x", [Series("run", rising), Series("late", [(50, 10), (90, 20)])], inset_until=10.0)
     assert len(chart.lines) == 2
     assert chart.inset is not None
     (line,) = chart.inset.lines
@@ -98,7 +98,7 @@ def test_an_inset_holds_the_start_and_nothing_else() -> None:
     found = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in plotted(line.points)]
     assert found == [pytest.approx(point, abs=0.1) for point in rising[:6]]
     assert chart.inset.inset is None
-    assert draw("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
+    assert draw_lines("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
 
 
 curves = st.lists(
@@ -111,7 +111,7 @@ curves = st.lists(
 def test_nothing_runs_behind_an_inset(curves: list[list[tuple[float, float]]]) -> None:
     longest = max(x for curve in curves for x, _ in curve)
     series = [Series("run", sorted(curve)) for curve in curves]
-    chart = draw("t", "x", series, from_zero=False, inset_until=0.3 * longest)
+    chart = draw_lines("t", "x", series, from_zero=False, inset_until=0.3 * longest)
     if chart.inset is None:
         return
     for line in chart.lines:
@@ -130,7 +130,7 @@ coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 def test_arrows_begin_and_point_where_the_axes_say(
     ends: list[tuple[tuple[float, float], tuple[float, float]]],
 ) -> None:
-    chart = draw_moves("t", "x", [Move("run", "m", *each) for each in ends], format_x=repr, format_y=repr, head=4.0)
+    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr, head=4.0)
     right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
     top = float(chart.y_ticks[-1].label)
     for arrow, (start, end) in zip(chart.arrows, ends, strict=True):

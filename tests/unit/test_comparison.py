@@ -1,4 +1,4 @@
-"""The table of a run and its baseline."""
+"""Test the table of a run and its baseline."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.evaluation.training_figures import training_figures
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
-from lapgs_plugin.reports.comparison import Cell, comparison_rows, unlike
+from lapgs_plugin.reports.comparison import Cell, comparison_rows, setup_differences
 from lapgs_plugin.runs.archive import LevelRecord, Manifest, SceneReference
+from lapgs_plugin.runs.training_figures import training_figures
 from tests.training_scene import blob_field
 
 
@@ -78,7 +78,7 @@ def test_rows_of_a_run_and_its_baseline() -> None:
     assert rows["psnr"].label == "PSNR, held-out views (dB)"
 
 
-def test_what_only_one_of_two_runs_has_is_said_and_not_compared() -> None:
+def test_figures_of_only_one_run_are_shown_and_not_compared() -> None:
     ours = metrics(lpips_alex=0.2, peak_memory_bytes=3_500_000_000, lpips_missing={"vgg_3dgs": "no weights"})
     rows = {row.key: row for row in comparison_rows([ours, BASELINE])}
     assert rows["lpips_alex"].label == "LPIPS (AlexNet), held-out views"
@@ -98,9 +98,9 @@ def test_a_run_alone_has_one_cell_and_no_change() -> None:
     assert "training views" in comparison_rows([metrics(split="train")])[0].label
 
 
-def test_unlike_runs_are_told_apart() -> None:
+def test_differences_of_setup_are_listed() -> None:
     scene = SceneReference("/data/fox", "1/4", True, (0.0, 0.0, 0.0), "colmap")
     run = Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, {"iterations": 3000})
-    assert unlike(run, replace(run, levels=1, seed=3)) == []
+    assert setup_differences(run, replace(run, levels=1, seed=3)) == []
     other = replace(run, scene=replace(scene, resolution="1/8"), settings={"iterations": 1000})
-    assert unlike(run, other) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]
+    assert setup_differences(run, other) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]

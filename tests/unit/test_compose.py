@@ -1,4 +1,4 @@
-"""Composition against the formula written out, and against constant images whose sum is known."""
+"""Compare compositions with the formula written out, and with constant images of known sum."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.composition import compose, to_full_size
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer, to_full_size
-from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldOffload, FieldRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
 BACKGROUND = (0.2, 0.5, 0.9)
 CAMERA = Camera(45, 30, fx=40.0, fy=41.0, cx=21.0, cy=16.0, world_to_camera=torch.eye(4))
@@ -40,7 +41,7 @@ def blobs(seed: int, signed: bool) -> GaussianField:
 
 
 class Constant:
-    """Renders the first SH value of a field's first Gaussian everywhere, and remembers what it was asked."""
+    """Render the first SH value of a field's first Gaussian everywhere, and record the calls."""
 
     name = "constant"
 
@@ -78,6 +79,28 @@ def test_three_levels_by_the_formula() -> None:
     torch.testing.assert_close(composition.composed, {2: base, 1: composed_1, 0: composed_0}, rtol=0, atol=1e-6)
     assert residual_0.abs().max() > 0.05  # the scene shows something
     assert residual_0.min() < 0
+
+
+def test_gradients_reach_every_composed_level() -> None:
+    generator = torch.Generator().manual_seed(3)
+    sides = {2: (8, 12), 1: (15, 23), 0: (30, 45)}
+    renders = {
+        level: torch.randn((3, *side), generator=generator, dtype=torch.float64, requires_grad=True)
+        for level, side in sides.items()
+    }
+    weights = torch.randn((3, *sides[0]), generator=generator, dtype=torch.float64)
+    pyramid = Pyramid("camera")
+    (compose(pyramid, renders.items(), gains={1: 0.5}).image * weights).sum().backward()
+    # The image is linear in each render, so the gradient times the render is that render's part of the weighted sum.
+    parts = {
+        0: renders[0],
+        1: 0.5 * pyramid.up(renders[1], sides[0]),
+        2: pyramid.up(pyramid.up(renders[2], sides[1]), sides[0]),
+    }
+    for level, render in renders.items():
+        assert render.grad is not None
+        expected = float((parts[level] * weights).sum().detach())
+        assert float((render.grad * render.detach()).sum()) == pytest.approx(expected, rel=1e-9)
 
 
 def test_one_level_is_the_plain_render() -> None:
@@ -266,11 +289,11 @@ def test_fields_come_to_the_device_when_they_are_rendered(monkeypatch: pytest.Mo
             return super().__call__(fields[int(not field.signed)], camera, background=torch.zeros(3))
 
     there = torch.device("meta")
-    monkeypatch.setattr(HierarchyRenderer, "behind", lambda renderer, level: torch.zeros(3))
+    monkeypatch.setattr(FieldRenderer, "background_of", lambda renderer, level: torch.zeros(3))
     for keep in (True, False):
         asked.clear()
-        residence = FieldOffload(there, keep)
-        renderer = HierarchyRenderer(fields, 2, Pyramid(), Elsewhere(), residence=residence)
+        offload = FieldOffload(there, keep)
+        renderer = HierarchyRenderer(fields, 2, Pyramid(), Elsewhere(), offload=offload)
         assert renderer.device == there
         renderer.render(CAMERA, level=1)
         assert [field.signed for field in asked] == [False], "the other one has not been needed"
@@ -311,14 +334,14 @@ def test_the_level_of_detail_is_the_coarsest_that_is_not_smaller(size: tuple[int
 
 
 class ConstantImages(Constant):
-    """The same of a rasterizer that works in the current stream."""
+    """The same as an `ImageRasterizer`, which works in the current stream."""
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         return torch.stack([self(field, camera, background=background).image for camera in cameras])
 
 
 class Streams:
-    """What `torch.cuda` offers for streams, writing down who waits for whom and who uses what."""
+    """Replace the streams of `torch.cuda`, and record which stream waits for which."""
 
     def __init__(self) -> None:
         self.log: list[tuple[str, ...]] = []
@@ -350,8 +373,8 @@ def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pyte
     rasterizer, streams = ConstantImages(), Streams()
     renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
     expected = renderer.render(CAMERA)
-    monkeypatch.setattr(HierarchyRenderer, "device", torch.device("cuda"))
-    monkeypatch.setattr(HierarchyRenderer, "_colored", torch.tensor(BACKGROUND))
+    monkeypatch.setattr(FieldRenderer, "device", torch.device("cuda"))
+    monkeypatch.setattr(FieldRenderer, "_colored", torch.tensor(BACKGROUND))
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: streams.log.append(("synchronize",)))
     monkeypatch.setattr(torch.cuda, "Stream", streams.make)
     monkeypatch.setattr(torch.cuda, "stream", streams.inside)

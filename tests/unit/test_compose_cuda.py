@@ -1,5 +1,4 @@
-"""Composition on a GPU with gsplat: streams, batches, streamed fields and all fields at once give the same images, and
-nothing waits."""
+"""Compose on a GPU with gsplat: streams, batches, offloaded and stacked fields give the same images without waiting."""
 
 from __future__ import annotations
 
@@ -15,10 +14,11 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer, missing
+from lapgs_plugin.ops.composition import Composition
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer, missing
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
-from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from tests.training_scene import blob_field, ring_camera
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(bool(missing()), reason=f"needs gsplat on a GPU: {missing()}")]
@@ -38,7 +38,7 @@ def renderer() -> HierarchyRenderer:
 
 @pytest.fixture
 def waits() -> Iterator[list[warnings.WarningMessage]]:
-    """What PyTorch says of waits for the GPU."""
+    """Collect PyTorch's warnings about waits for the GPU."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield caught
@@ -50,7 +50,7 @@ def images(renderer: HierarchyRenderer, cameras: list[Camera]) -> list[torch.Ten
 
 
 def assert_alike(found: torch.Tensor, expected: torch.Tensor) -> None:
-    """The same but for rounding, by which a Gaussian of 1/255 is left out in a pixel, or blending stops one earlier."""
+    """Compare up to rounding, by which a Gaussian of alpha 1/255 may be skipped or blending may stop one earlier."""
     apart = (found - expected).abs()
     assert float((apart > 2e-5).float().mean()) < 1e-4, float(apart.max())  # worst seen: 3 of 246,402
     assert float(apart.max()) < 1e-2  # worst seen 1.7e-3
@@ -87,7 +87,7 @@ def test_fields_come_when_they_are_needed(renderer: HierarchyRenderer, keep: boo
         Pyramid(),
         GsplatRasterizer(),
         renderer.background,
-        residence=FieldOffload(torch.device("cuda"), keep),
+        offload=FieldOffload(torch.device("cuda"), keep),
     )
     gc.collect()
     before = torch.cuda.memory_allocated()
@@ -117,9 +117,9 @@ def test_a_frame_waits_once_a_field_inside_of_gsplat(
 
 
 def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
-    """The same, of fields that are finished and may be copied to be rendered together, whatever the size."""
-    together = replace(renderer, residence=FieldOffload(torch.device("cuda")), at_once=10**9)
-    assert together.can_be_at_once
+    """Return the renderer with a stack of its fields, for images of any size."""
+    together = replace(renderer, offload=FieldOffload(torch.device("cuda")), stack_pixels=10**9)
+    assert together.by_field.can_stack
     return together
 
 
@@ -170,7 +170,7 @@ def test_a_frame_of_all_at_once_waits_once(renderer: HierarchyRenderer, waits: l
 def test_all_at_once_takes_the_place_of_the_fields(renderer: HierarchyRenderer) -> None:
     waiting = {level: replace(blob_field(200_000), signed=level < 1) for level in (0, 1)}
     size = sum(value.nbytes for field in waiting.values() for value in field.parameters.values())
-    far = HierarchyRenderer(waiting, 2, Pyramid(), GsplatRasterizer(), residence=FieldOffload(torch.device("cuda")))
+    far = HierarchyRenderer(waiting, 2, Pyramid(), GsplatRasterizer(), offload=FieldOffload(torch.device("cuda")))
     small = ring_camera(0.0, 64, 48)
     before = torch.cuda.memory_allocated()
     far.render(small)

@@ -1,4 +1,4 @@
-"""The conformance suite passes what is right and fails what is wrong in any one way."""
+"""Test that the conformance suite passes correct rasterizers and fails each kind of error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ORACLE = OracleRasterizer()
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_torch_thread() -> Iterator[None]:
-    """The tensors are small: a second OpenMP thread only spins."""
+    """Use one OpenMP thread, because the tensors are small."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -46,7 +46,7 @@ def ordinary(signed: bool = False) -> Case:
 
 
 class Mutant:
-    """The oracle, spoiled: `before` changes what it gets, `after` what it gives."""
+    """An oracle with an error: `before` changes its input, `after` its output."""
 
     name = "mutant"
 
@@ -75,7 +75,7 @@ def image_of(change: Callable[[Tensor], Tensor]) -> Callable[[RenderResult], Ren
 
 
 def scaled_gradient(factor: float | Tensor) -> Callable[[Tensor], Tensor]:
-    """The same values with another derivative."""
+    """Return the same values with another derivative."""
     return lambda value: factor * value + ((1 - factor) * value).detach()
 
 
@@ -87,7 +87,7 @@ def first_tile_without_gradient(image: Tensor) -> Tensor:
 
 def with_wrong_mean2d_gradient(result: RenderResult) -> RenderResult:
     means2d = result.means2d.detach().requires_grad_()
-    # The gradient by normalised device coordinates, not taken to pixels.
+    # The gradient by normalised device coordinates, not converted to pixels.
     result.means2d.register_hook(lambda gradient: setattr(means2d, "grad", 22.5 * gradient))
     return replace(result, means2d=means2d)
 
@@ -134,7 +134,7 @@ MUTANTS: dict[str, tuple[Mutant, bool, str]] = {
         for name in conformance.GRADIENTS[1:] for factor in (-1.0, 1.001)
     },
 }  # fmt: skip
-"""Name: rasterizer, colour map of the case that shows it, and what must be said."""
+"""By name: rasterizer, whether colour is signed, and the expected words."""
 
 
 def _kept(means2d: Tensor, result: RenderResult) -> Tensor:
@@ -152,7 +152,7 @@ def test_every_mutant_is_caught_and_named(name: str) -> None:
 
 @pytest.mark.parametrize("signed", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_unspoiled_one_passes(signed: bool, dtype: torch.dtype) -> None:
+def test_the_oracle_passes(signed: bool, dtype: torch.dtype) -> None:
     outcome = check_case(Subject("oracle", Mutant(), dtype), ordinary(signed))
     assert outcome.problems == ()
     assert set(conformance.GRADIENTS) | {"image", "transmittance", "radii", "centres", "absgrad2d"} == set(
@@ -177,8 +177,8 @@ def test_the_cases_are_those_the_docs_promise() -> None:
     assert any((case.camera.width, case.camera.height) == (1, 1) for case in found)
 
 
-def test_what_is_in_the_band_is_bounded_too() -> None:
-    """Near the culling depth a third of the pixels may go either way, but none may be brighter than every Gaussian."""
+def test_the_band_is_bounded() -> None:
+    """Near the culling depth a third of the pixels may go either way, but none may be brighter than all Gaussians."""
     case = by_name()["near_plane"]
     mask = conformance.threshold_mask(case.to(torch.float32).field, case.camera)
     assert mask.pixels.any()
@@ -189,11 +189,11 @@ def test_what_is_in_the_band_is_bounded_too() -> None:
     outcome = check_case(Subject("mutant", Mutant(after=image_of(spoil))), case)
     assert outcome.errors["image"] < 1e-5
     assert outcome.band_pixels >= int(mask.pixels.sum())
-    assert any("beyond all colours" in problem for problem in outcome.problems)
+    assert any("outside the range" in problem for problem in outcome.problems)
 
 
 def test_a_rasterizer_without_the_three_sigma_cut_is_held_to_its_own_image() -> None:
-    """Opaque Gaussians reach 0.33 sigma further: an error for one rasterizer, a demand on the other."""
+    """Opaque Gaussians reach 0.33 sigma further: an error for one rasterizer, required of the other."""
     case = by_name()["saturated"]
     uncut = OracleRasterizer(three_sigma_cut=False)
     honest = Subject("uncut", uncut, semantics=Semantics(three_sigma_cut=False))
@@ -202,7 +202,7 @@ def test_a_rasterizer_without_the_three_sigma_cut_is_held_to_its_own_image() -> 
 
 
 class _ExpandedConic(torch.autograd.Function):
-    """Entries of a 2D covariance -> its inverse's, with the backward pass -C G C multiplied out over det^2."""
+    """Invert a 2D covariance, with the backward pass -C G C multiplied out over det^2."""
 
     @staticmethod
     def forward(ctx: Any, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ class _ExpandedConic(torch.autograd.Function):
 
 @pytest.mark.parametrize("name", ["needles", "pancakes", "giants", "degree_2_coloured"])
 def test_needles_alone_suffer_from_a_multiplied_out_conic_gradient(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is granted to such code is what its formula costs in float32, and granted nowhere else."""
+    """The wider bounds are what the formula costs in float32, and hold for no other case."""
 
     def expanded(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor) -> Tensor:
         if xx.dtype == torch.float32:
@@ -242,7 +242,7 @@ def test_needles_alone_suffer_from_a_multiplied_out_conic_gradient(name: str, mo
 
 
 def with_rebuilt_transmittance(result: RenderResult) -> RenderResult:
-    """With gradients that are, by way of each pixel, as much too long as a transmittance that was 1 - (1 - T)."""
+    """Give gradients through each pixel the relative error of a transmittance 1 - (1 - T)."""
     assert result.transmittance is not None
     left = result.transmittance.detach()  # (h, w), float32
     factors = torch.where(left > 0, (1 - (1 - left)) / left, 1)  # (h, w)
@@ -251,7 +251,7 @@ def with_rebuilt_transmittance(result: RenderResult) -> RenderResult:
 
 @pytest.mark.parametrize("name", ["opaque_crowd", "crowd", "degree_2_coloured"])
 def test_opaque_pixels_alone_suffer_from_a_rebuilt_transmittance(name: str) -> None:
-    """What is granted to code that keeps opacities is what that costs in float32, and granted nowhere else."""
+    """The wider bounds are what keeping opacities costs, and hold for no other case."""
     rebuilding = Mutant(after=with_rebuilt_transmittance)
     known = Semantics(rebuilt_transmittance=True)
     for signed in (False, True):
@@ -263,7 +263,7 @@ def test_opaque_pixels_alone_suffer_from_a_rebuilt_transmittance(name: str) -> N
         )
 
 
-def test_without_the_cut_what_is_blended_nowhere_may_have_no_radius() -> None:
+def test_without_the_cut_invisible_gaussians_may_have_no_radius() -> None:
     case = by_name()["invisible"]
     subject = Subject("cut", ORACLE, semantics=Semantics(three_sigma_cut=False))
     assert check_case(subject, case).problems == ()
@@ -271,7 +271,7 @@ def test_without_the_cut_what_is_blended_nowhere_may_have_no_radius() -> None:
     assert check_case(replace(subject, rasterizer=culled), ordinary()).problems != ()
 
 
-def test_a_case_that_a_rasterizer_departs_for_by_design_is_not_compared_but_stays_plausible() -> None:
+def test_departures_by_design_are_bounded_but_not_compared() -> None:
     case = by_name()["saturated"]
     departing = Semantics(departures={"saturated": "the cap is another"})
     dimmer = Mutant(before=lambda f: changed(f, "opacity_logits", lambda logits: logits - 3))
@@ -281,7 +281,7 @@ def test_a_case_that_a_rasterizer_departs_for_by_design_is_not_compared_but_stay
     assert outcome.band_share == 1
     assert check_case(Subject("dimmer", dimmer, semantics=departing), ordinary()).problems != ()
     for spoiled, said in (
-        (Mutant(after=image_of(lambda image: image + 10)), "beyond all colours"),
+        (Mutant(after=image_of(lambda image: image + 10)), "outside the range"),
         (Mutant(after=image_of(lambda image: image / 0)), "not finite"),
         (Mutant(before=lambda f: changed(f, "means", Tensor.detach)), "gradient of means is missing"),
     ):

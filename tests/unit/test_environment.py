@@ -1,4 +1,4 @@
-"""What the doctor concludes from what its probes find; the probes themselves against broken modules."""
+"""Test the findings of `lapgs doctor` for given probes, and the probes with broken modules."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin import environment
 from lapgs_plugin.adapters.registry import recognise_checkout
-from lapgs_plugin.environment import Finding, Probe, Requirement
+from lapgs_plugin.environment import findings, probes
+from lapgs_plugin.environment.findings import Finding, Requirement
+from lapgs_plugin.environment.probes import Probe
 
 GPU = "NVIDIA H100, 80 GiB, compute capability 9.0"
 
@@ -18,16 +19,16 @@ def torch_probe(cuda: str | None = None, gpus: tuple[str, ...] = (), complaint: 
     return Probe({"version": "2.6.0", "cuda": cuda, "gpus": list(gpus), "complaint": complaint})
 
 
-def status(findings: list[Finding]) -> dict[str, str]:
-    return {finding.name: finding.status for finding in findings}
+def status(found: list[Finding]) -> dict[str, str]:
+    return {finding.name: finding.status for finding in found}
 
 
 def test_no_gpu_is_no_problem() -> None:
-    assert status(environment.torch_findings(torch_probe(), driver="")) == {"PyTorch": "ok", "GPU": "absent"}
+    assert status(findings.torch_findings(torch_probe(), driver="")) == {"PyTorch": "ok", "GPU": "absent"}
 
 
 def test_a_usable_gpu_is_named_with_its_driver() -> None:
-    found = environment.torch_findings(torch_probe("12.4", (GPU, GPU)), driver="550.54")
+    found = findings.torch_findings(torch_probe("12.4", (GPU, GPU)), driver="550.54")
     assert [finding.detail for finding in found] == ["2.6.0, built for CUDA 12.4", *[f"{GPU}, driver 550.54"] * 2]
 
 
@@ -39,7 +40,7 @@ def test_a_usable_gpu_is_named_with_its_driver() -> None:
     ],
 )
 def test_a_gpu_that_pytorch_cannot_use_is_a_problem_with_advice(probe: Probe, advice: str) -> None:
-    gpu = environment.torch_findings(probe, driver="470.1")[1]
+    gpu = findings.torch_findings(probe, driver="470.1")[1]
     assert gpu.status == "problem"
     assert "470.1" in gpu.detail
     assert probe.facts["complaint"] in gpu.detail
@@ -47,7 +48,7 @@ def test_a_gpu_that_pytorch_cannot_use_is_a_problem_with_advice(probe: Probe, ad
 
 
 def test_broken_pytorch_is_reported_with_its_error() -> None:
-    (found,) = environment.torch_findings(Probe({}, "ImportError: libtorch.so"), driver="")
+    (found,) = findings.torch_findings(Probe({}, "ImportError: libtorch.so"), driver="")
     assert (found.status, found.detail) == ("problem", "ImportError: libtorch.so")
 
 
@@ -56,27 +57,27 @@ def test_a_toolkit_of_another_cuda_major_version_is_a_problem(monkeypatch: pytes
     nvcc.write_text("#!/bin/sh\necho 'Cuda compilation tools, release 13.0, V13.0.88'\n")
     nvcc.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    assert environment.compiler_findings("12.4")[0].status == "problem"
-    assert environment.compiler_findings("13.1")[0] == Finding("CUDA toolkit", "ok", f"13.0 ({nvcc})")
-    assert environment.compiler_findings(None)[0].status == "ok"
+    assert findings.compiler_findings("12.4")[0].status == "problem"
+    assert findings.compiler_findings("13.1")[0] == Finding("CUDA toolkit", "ok", f"13.0 ({nvcc})")
+    assert findings.compiler_findings(None)[0].status == "ok"
     nvcc.unlink()
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CUDA_HOME", raising=False)
     monkeypatch.delenv("CXX", raising=False)
-    assert status(environment.compiler_findings("12.4")) == {"CUDA toolkit": "absent", "C++ compiler": "absent"}
+    assert status(findings.compiler_findings("12.4")) == {"CUDA toolkit": "absent", "C++ compiler": "absent"}
 
 
 def test_kernel_cache_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
     facts = {"numba": "0.60", "threads": 4, "cache": str(tmp_path)}
-    assert "empty" in environment.numba_findings(Probe(facts))[1].detail
+    assert "empty" in findings.numba_findings(Probe(facts))[1].detail
     (tmp_path / "loss.kernel-1.py311.nbi").touch()
-    assert "1 compiled kernels" in environment.numba_findings(Probe(facts))[1].detail
-    unwritable = environment.numba_findings(Probe({**facts, "cache": None}))[1]
+    assert "1 compiled kernels" in findings.numba_findings(Probe(facts))[1].detail
+    unwritable = findings.numba_findings(Probe({**facts, "cache": None}))[1]
     assert unwritable.status == "problem"
     assert "NUMBA_CACHE_DIR" in unwritable.advice
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    assert environment.numba_findings(Probe(facts))[0].status == "problem"
+    assert findings.numba_findings(Probe(facts))[0].status == "problem"
 
 
 def test_packages_missing_old_and_broken() -> None:
@@ -87,7 +88,7 @@ def test_packages_missing_old_and_broken() -> None:
         Requirement("rich", "rich", "", ""),
         Requirement("pytest", "pytest>=8", "8", "dev"),
     ]
-    found = environment.package_findings(wanted, {"rich": Probe({}, "ImportError: boom")})
+    found = findings.package_findings(wanted, {"rich": Probe({}, "ImportError: boom")})
     assert status(found) == {"torch": "ok", "numpy": "problem", "no-such-package": "problem", "rich": "problem"}
     assert found[2].advice == "python -m pip install 'no-such-package>=1'"
     assert "boom" in found[3].detail
@@ -100,22 +101,22 @@ def test_extras_are_whole_or_absent() -> None:
         Requirement("numpy", "numpy", "", "lpips"),
         Requirement("pytest", "pytest", "", "dev"),
     ]
-    lpips, viewer = environment.extra_findings(wanted)
+    lpips, viewer = findings.extra_findings(wanted)
     assert (lpips.name, lpips.status, lpips.detail) == ("[lpips]", "absent", "lacks no-such-package")
     assert lpips.advice == "python -m pip install 'lapgs_plugin[lpips]'"
     assert (viewer.name, viewer.status) == ("[viewer]", "ok")
 
 
 def test_own_requirements_are_read_with_their_bounds() -> None:
-    by_name = {each.name: each for each in environment.own_requirements()}
+    by_name = {each.name: each for each in findings.own_requirements()}
     assert by_name["torch"] == Requirement("torch", "torch>=2.4", "2.4", "")
     assert by_name["pytest"].extra == "dev"
 
 
 def test_gsplat_needs_a_gpu_for_its_cuda_part() -> None:
-    assert environment.gsplat_finding(torch_probe(), nvcc=True).status == "absent"
+    assert findings.gsplat_finding(torch_probe(), nvcc=True).status == "absent"
     with_gpu = torch_probe("12.4", (GPU,))
-    assert environment.gsplat_finding(with_gpu, nvcc=True).status == "ok"
+    assert findings.gsplat_finding(with_gpu, nvcc=True).status == "ok"
 
 
 @pytest.fixture
@@ -139,12 +140,12 @@ def broken_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_probe_survives_whatever_an_import_does(module: str, error: str) -> None:
-    assert environment.run_probe("import", module) == Probe({}, error)
+    assert probes.run_probe("import", module) == Probe({}, error)
 
 
 def test_an_extension_that_is_not_installed_is_absent_and_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "run_probe", None)
-    found = environment.extension_finding("lapgs_not_there._C", "rasterizer of a test")
+    monkeypatch.setattr(findings, "run_probe", None)
+    found = findings.extension_finding("lapgs_not_there._C", "rasterizer of a test")
     assert found == Finding("lapgs_not_there._C", "absent", "not installed (rasterizer of a test)")
 
 

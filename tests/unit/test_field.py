@@ -1,4 +1,4 @@
-"""GaussianField and its PLY file, against hand-written bytes and plyfile's raw reading."""
+"""Compare GaussianField's PLY files with hand-written bytes and plyfile's raw reading."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def assert_same_bits(one: GaussianField, other: GaussianField) -> None:
 
 
 def standard_names(degree: int) -> list[str]:
-    """The columns of 3DGS's file, written down independently of the implementation."""
+    """Return the columns of 3DGS's file, independent of the implementation."""
     rest = [f"f_rest_{i}" for i in range(REST_COUNT[degree])]
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -52,7 +52,7 @@ def standard_names(degree: int) -> list[str]:
 
 
 def standard_table(field: GaussianField) -> np.ndarray:
-    """The numbers of that file, (n, columns), with f_rest channel by channel."""
+    """Return the numbers of that file, (n, columns), with f_rest channel by channel."""
     n = len(field)
     return np.concatenate(
         [

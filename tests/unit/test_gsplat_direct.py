@@ -1,4 +1,4 @@
-"""gsplat's kernels called directly, against `gsplat.rasterization`; on a GPU alone."""
+"""Compare direct calls of gsplat's kernels with `gsplat.rasterization`, on a GPU."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.rasterizers import gsplat_direct
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
 from lapgs_plugin.training.backend import training_rasterizer
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -47,13 +47,13 @@ def moved(by: float) -> Camera:
 
 
 def test_it_is_used() -> None:
-    assert gsplat_direct.works()
+    assert direct_works()
 
 
 def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
-    gsplat_direct.works.cache_clear()
+    direct_works.cache_clear()
     with torch.inference_mode():
-        assert gsplat_direct.works()
+        assert direct_works()
 
 
 @pytest.mark.parametrize("own_radii", [False, True])
@@ -98,10 +98,10 @@ def test_a_training_view_is_sent_once_and_forgotten_with_its_camera() -> None:
     with torch.no_grad():
         for _ in range(3):
             rasterizer.render_image(field, camera, background=black)
-    assert len(rasterizer._shots._sent) == 1
+    assert len(rasterizer._cameras._copied) == 1
     del camera
     gc.collect()
-    assert not rasterizer._shots._sent
+    assert not rasterizer._cameras._copied
 
 
 def test_nothing_is_kept_of_renders_that_nobody_differentiates() -> None:
@@ -135,7 +135,7 @@ def test_several_views_are_those_of_single_calls(views: int, degree: int, active
     each = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
     torch.stack([(one.image * weight).sum() for one, weight in zip(each, weights, strict=True)]).sum().backward()
     pairs = {
-        "image": (batch.image, torch.stack([one.image for one in each])),
+        "image": (batch.image.detach(), torch.stack([one.image.detach() for one in each])),
         "radii": (batch.radii.float(), torch.stack([one.radii for one in each]).float()),
         "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in each])),
         "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in each])),

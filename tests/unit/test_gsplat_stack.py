@@ -1,4 +1,4 @@
-"""All fields of a view in one set of launches: the images are the oracle's, field by field and composed."""
+"""Compare stacked fields, rendered in one set of launches, with the oracle: field by field and composed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, StackingRasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat_stack import GsplatStack
+from lapgs_plugin.ops.composition import Composition
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.rendering.compose import Composition, HierarchyRenderer
-from lapgs_plugin.rendering.field_offload import FieldOffload
+from lapgs_plugin.rendering.field_renderer import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.gsplat_on_cpu import gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
@@ -40,7 +41,7 @@ def kernels() -> Iterator[None]:
 
 
 class OnCpu(GsplatRasterizer):
-    """gsplat behind our interface on the CPU, where it can render fields at once and nothing else."""
+    """gsplat behind our interface on the CPU, where it can only render stacks."""
 
     def __init__(self) -> None:
         super().__init__(CPU)
@@ -62,7 +63,7 @@ class OnCpu(GsplatRasterizer):
 
 
 def field(count: int, signed: bool, degree: int = 1, seed: int = 0) -> GaussianField:
-    """Some of them outside of the view and near, where projection and culling depend on the size of the image."""
+    """Make Gaussians, some outside the view and near, where projection and culling depend on the image size."""
     generator = torch.Generator().manual_seed(seed)
     blobs = blob_field(count, seed)
     means = blobs.means * torch.tensor([3.0, 2.0, 3.0])
@@ -72,20 +73,20 @@ def field(count: int, signed: bool, degree: int = 1, seed: int = 0) -> GaussianF
 
 
 def hierarchy(counts: Sequence[int], degrees: Sequence[int] = (1, 1, 1, 1)) -> dict[int, GaussianField]:
-    """Of fields with `counts`, finest first."""
+    """Make fields with `counts` Gaussians, finest first."""
     top = len(counts) - 1
     return {level: field(counts[level], level < top, degrees[level], seed=level) for level in range(top, -1, -1)}
 
 
 def at_once(fields: Mapping[int, GaussianField], rasterizer: OnCpu | None = None) -> HierarchyRenderer:
     return HierarchyRenderer(
-        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, residence=FieldOffload(CPU)
+        fields, len(fields), Pyramid(), rasterizer or OnCpu(), BACKGROUND, offload=FieldOffload(CPU)
     )
 
 
 def by_the_oracle(renderer: HierarchyRenderer) -> HierarchyRenderer:
-    """One field after the other."""
-    return replace(renderer, rasterizer=OracleRasterizer(three_sigma_cut=False), residence=None)
+    """Return the renderer with the oracle, one field after the other."""
+    return replace(renderer, rasterizer=OracleRasterizer(three_sigma_cut=False), offload=None)
 
 
 def assert_same(found: Composition, expected: Composition) -> None:
@@ -114,7 +115,7 @@ def test_degrees_of_colour_may_differ() -> None:
 
 
 def test_a_coarse_field_is_culled_and_linearized_for_its_own_size() -> None:
-    """Rendered as an image of the finest size it would have more Gaussians in it, and others at its border."""
+    """Projected at the finest size, it would have more Gaussians, and others at its border."""
     fields = hierarchy((50, 400))
     asked: list[tuple[int, int]] = []
     projection = gsplat.fully_fused_projection
@@ -164,10 +165,10 @@ def test_what_stays_field_by_field() -> None:
     expected = by_the_oracle(renderer)
     for other in (
         replace(renderer, concurrent=False),
-        replace(renderer, at_once=0),
-        replace(renderer, at_once=53 * 37 - 1),
-        replace(renderer, residence=None),
-        replace(renderer, residence=FieldOffload(CPU, keep=False)),
+        replace(renderer, stack_pixels=0),
+        replace(renderer, stack_pixels=53 * 37 - 1),
+        replace(renderer, offload=None),
+        replace(renderer, offload=FieldOffload(CPU, keep=False)),
     ):
         asked.clear()
         assert_same(other.render(CAMERA), expected.render(CAMERA))
@@ -177,7 +178,7 @@ def test_what_stays_field_by_field() -> None:
     renderer.render(CAMERA, gains={0: 0.0})
     assert asked == [2, 2, 1]
     assert rasterizer.stacked == []
-    assert_same(replace(renderer, at_once=53 * 37).render(CAMERA), expected.render(CAMERA))
+    assert_same(replace(renderer, stack_pixels=53 * 37).render(CAMERA), expected.render(CAMERA))
     assert rasterizer.stacked == [2]
 
 
@@ -204,7 +205,7 @@ def test_from_1_6_0_on_it_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_antialiasing_dims_by_the_area_that_was_added() -> None:
-    """One Gaussian in the centre of a pixel: its opacity times the root of the quotient of the determinants."""
+    """A Gaussian in a pixel centre is dimmed by the root of the quotient of the determinants."""
     camera = Camera(17, 17, 20.0, 20.0, 8.5, 8.5, torch.eye(4))
     deviation, opacity = 0.04, 0.9
     small = GaussianField(
@@ -248,7 +249,7 @@ def test_it_is_measured() -> None:
         patch.setattr(
             OnCpu, "render_images", lambda self, field, cameras, *, background: torch.zeros(1, 3, *_size(cameras))
         )
-        found = measure_speed(replace(at_once(hierarchy((30, 20))), at_once=0), [CAMERA], 0, rounds=1)
+        found = measure_speed(replace(at_once(hierarchy((30, 20))), stack_pixels=0), [CAMERA], 0, rounds=1)
         one = measure_speed(at_once(hierarchy((30,))), [CAMERA], 0, rounds=1)
     assert [(each.what, each.gaussians) for each in found[:2]] == [
         ("levels 1 to 0, one after the other", 50),

@@ -1,4 +1,4 @@
-"""Where fields begin: fresh from points, inherited from the level before."""
+"""Test initial fields, from points and from the coarser level's field."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def base_field(n: int = 50, degree: int = 2, signed: bool = False) -> GaussianFi
 
 
 def spacing_by_brute_force(points: np.ndarray) -> np.ndarray:
-    """Root of the mean squared distance to the three nearest others, pair by pair in float64."""
+    """Return the root mean squared distance to the three nearest others, pair by pair in float64."""
     points = points.astype(np.float64)
     result = []
     for i, point in enumerate(points):

@@ -30,7 +30,7 @@ def test_an_import_upwards_fails(tmp_path: Path) -> None:
         elif (room / "__init__.py").exists():
             (package / room.name).mkdir(parents=True)
             (package / room.name / "__init__.py").write_text("")
-    (package / "hierarchy" / "hierarchy/plan.py").write_text("from lapgs_plugin import training")
+    (package / "hierarchy" / "plan.py").write_text("from lapgs_plugin import training")
     result = _lint(tmp_path)
     assert result.returncode == 1
     assert "lapgs_plugin.hierarchy is not allowed to import lapgs_plugin.training" in result.stdout

@@ -1,4 +1,4 @@
-"""Limits: what is above them is refused with a line that says how to raise them, before memory is taken."""
+"""Sizes above a limit are refused before memory is allocated, with a line that says how to raise the limit."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_todays_photos_and_clips_are_within_the_limits() -> None:
 
 
 def tiny_exr(path: Path, full: tuple[int, int]) -> None:
-    """An EXR of 4x3 stored pixels in a display window of any size."""
+    """Write an EXR of 4x3 stored pixels with a display window of any size."""
     spec = oiio.ImageSpec(4, 3, 3, oiio.FLOAT)
     spec.full_width, spec.full_height = full
     target = oiio.ImageOutput.create(str(path))
@@ -94,7 +94,7 @@ def test_sizes_that_are_asked_for(tmp_path: Path) -> None:
     for text in ("9" * 5000 + "x720", "\u0661\u0662x720"):
         with pytest.raises(UserInputError, match="expected WIDTHxHEIGHT"):
             parse_size(text)
-    with pytest.raises(UserInputError, match="LAPGS_MAX_VIEW_PIXELS"):
+    with pytest.raises(UserInputError, match="expected at most 8192x8192"):
         make_sample_scene(tmp_path / "new", width=99999, height=99999)
     with pytest.raises(UserInputError, match="--points"):
         make_sample_scene(tmp_path / "new", points=10**9)
@@ -112,7 +112,7 @@ def test_photos_are_prepared_at_a_size_that_fits(tmp_path: Path, monkeypatch: py
 
 
 def added_memory(work: Callable[[], object]) -> float:
-    """How much more memory this process has at most while it works, in MB."""
+    """Return the process's peak of additional memory during some work in MB."""
     Path("/proc/self/clear_refs").write_text("5")  # the peak becomes what there is now
 
     def status(name: str) -> float:
@@ -126,7 +126,7 @@ def added_memory(work: Callable[[], object]) -> float:
 
 @pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="the peak can be reset on Linux only")
 def test_a_large_photo_takes_the_memory_of_its_small_copy(tmp_path: Path) -> None:
-    """20 megapixels are 240 MB as float32, which is not needed to make 64x48 of them."""
+    """20 megapixels take 240 MB as float32, which resizing to 64x48 does not need."""
     path = tmp_path / "a.png"
     Image.new("RGB", (5000, 4000)).save(path, compress_level=1)
     # Seen 170, and 466 when the image was decoded to float32 at once.

@@ -1,4 +1,4 @@
-"""LPIPS against torchmetrics' arithmetic in float64 over networks built here, and files that are no weights."""
+"""Test LPIPS against torchmetrics in float64 on networks built here, and the refusal of unusable files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 
 
 class Fire(nn.Module):
-    """As the paper of SqueezeNet draws it."""
+    """SqueezeNet's fire module, written from its paper."""
 
     def __init__(self, channels: int, squeeze: int, expand: int) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Fire(nn.Module):
 
 
 def from_text(text: str) -> nn.Sequential:
-    """A network from a line a layer: "conv 3 64 11 4 2", "relu", "pool 3 2", "fire 64 16 64"."""
+    """Build a network from layers such as "conv 3 64 11 4 2", "relu", "pool 3 2", "fire 64 16 64"."""
     layers: list[nn.Module] = []
     for line in text.split(","):
         kind, *numbers = line.split()
@@ -72,10 +72,10 @@ NAMES = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}
 
 
 def random_weights(name: str, learned: bool = True) -> dict[str, Tensor]:
-    """In torchvision's layout, classifier included; learned layers are positive, as those of LPIPS."""
+    """Make weights in torchvision's layout with a classifier; learned layers are positive, as those of LPIPS."""
     with torch.device("meta"):
         shapes = {key: value.shape for key, value in from_text(TEXTS[NAMES[name]]).state_dict().items()}
-    # Layers that neither explode nor die out: He's initialisation without its slow start.
+    # He's initialisation, so that outputs neither explode nor vanish.
     weights = {f"features.{k}": torch.randn(s) * math.sqrt(2 / max(1, math.prod(s[1:]))) for k, s in shapes.items()}
     weights["classifier.1.weight"] = torch.zeros(2, 2)
     if learned:
@@ -86,7 +86,7 @@ def random_weights(name: str, learned: bool = True) -> dict[str, Tensor]:
 
 @pytest.fixture
 def reference(monkeypatch: pytest.MonkeyPatch) -> Callable[..., float]:
-    """The distance as torchmetrics computes it, in float64, over this file's networks instead of torchvision's."""
+    """Compute the distance with torchmetrics, in float64, on this file's networks instead of torchvision's."""
     theirs = pytest.importorskip("torchmetrics.functional.image.lpips")
 
     def distance(name: str, weights: dict[str, Tensor], image: Tensor, target: Tensor, rescaled: bool = True) -> float:
@@ -153,7 +153,7 @@ def test_published_weights_of_alexnet(shared_data: Path, reference: Callable[...
     assert distance == pytest.approx(reference("alex", without, image, target), rel=1e-5)
 
 
-def test_without_weights_it_is_said_and_nothing_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_are_reported_and_not_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     metrics = lpips_metrics(LpipsRequest(), 44, CPU)
     assert set(metrics.missing) == {"vgg", AS_3DGS}
@@ -173,7 +173,7 @@ def test_without_weights_it_is_said_and_nothing_is_downloaded(tmp_path: Path, mo
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_the_smallest_image_is_measured_and_a_smaller_one_said(name: str, tmp_path: Path) -> None:
+def test_the_smallest_image_is_measured_and_a_smaller_one_reported(name: str, tmp_path: Path) -> None:
     torch.save(random_weights(name), tmp_path / "weights.pth")
     smallest, request = NETWORKS[name].smallest, LpipsRequest((name,), (tmp_path / "weights.pth",))
     metrics = lpips_metrics(request, smallest, CPU)
@@ -182,16 +182,16 @@ def test_the_smallest_image_is_measured_and_a_smaller_one_said(name: str, tmp_pa
 
 
 def damaged(folder: Path) -> dict[str, Path]:
-    """Files that are no weights, by what is said of them."""
-    files = {name: folder / f"{index}.pth" for index, name in enumerate(("layers of none", "cannot be read", "a list"))}
-    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["layers of none"])
+    """Make unusable files, by the words of their messages."""
+    files = {name: folder / f"{index}.pth" for index, name in enumerate(("fits none", "cannot be read", "a list"))}
+    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["fits none"])
     files["cannot be read"].write_bytes(b"PK\x03\x04 cut short")
     torch.save([1, 2], files["a list"])
     return {**files, "No such file": folder / "nowhere.safetensors"}
 
 
-@pytest.mark.parametrize("said", ["layers of none", "cannot be read", "a list", "No such file"])
-def test_files_that_are_no_weights(said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("said", ["fits none", "cannot be read", "a list", "No such file"])
+def test_unusable_files_are_refused(said: str, tmp_path: Path) -> None:
     path = damaged(tmp_path)[said]
     with pytest.raises(UserInputError, match=said) as raised:
         lpips_metrics(LpipsRequest(files=(path,)), 44, CPU)

@@ -1,4 +1,4 @@
-"""PSNR in closed form, SSIM against one written with OpenCV's filters."""
+"""Test PSNR against closed forms, and SSIM against an implementation with OpenCV's filters."""
 
 from __future__ import annotations
 

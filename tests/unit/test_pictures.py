@@ -1,4 +1,4 @@
-"""Pictures of views: cut-outs lie where edges are, whole pictures lie on each other."""
+"""Test pictures of views: cut-outs lie on edges, and whole pictures are aligned."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.reports.pictures import edge_squares, make_strip
 from lapgs_plugin.scenes.scene import View
 from tests.training_scene import blob_field, ring_camera

@@ -1,4 +1,4 @@
-"""Plans: every split covers the iterations exactly, every mistake is named."""
+"""Every split covers the iterations exactly, and every mistake is named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY headers that promise what the file does not hold: one line, before memory is taken for it."""
+"""PLY headers that promise more than the file holds are refused in one line, before memory is allocated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is hardly seen, by images of one Gaussian at a time, and what of it goes."""
+"""Compare visibility with images of one Gaussian at a time, and test which Gaussians are pruned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a loop of one's own takes from the package: the names, the matrices, the dictionaries."""
+"""Test the names, matrices and dictionaries for custom training loops."""
 
 from __future__ import annotations
 

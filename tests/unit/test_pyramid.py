@@ -1,4 +1,4 @@
-"""Down and Up against OpenCV, SciPy and geometry; pyramids against their laws."""
+"""Compare Down and Up with OpenCV, SciPy and geometry, and pyramids with their laws."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ grids = st.sampled_from(GRIDS)
 
 
 def picture(*shape: int, dtype: torch.dtype = torch.float32, seed: int = 0) -> Tensor:
-    """Any values: between levels images are not confined to [0, 1]."""
+    """Make an image of any values: between levels images are not limited to [0, 1]."""
     return (torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 3 - 1).to(dtype)
 
 
@@ -43,7 +43,7 @@ def scipy_resample(image: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> 
 
 
 def centres(grid: str, fine: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coarse centres in fine pixels and fine centres in coarse pixels, from the definition of each grid."""
+    """Return coarse centres in fine pixels and fine centres in coarse pixels, by the definition of each grid."""
     coarse = -(-fine // 2)
     if grid == "even":
         return 2.0 * np.arange(coarse), np.arange(fine) / 2.0
@@ -127,7 +127,7 @@ def test_rows_and_columns_are_treated_alike(grid: str, height: int, width: int) 
 @settings(deadline=None, max_examples=40)
 @given(grid=grids, fine=st.integers(1, 40))
 def test_a_mirrored_image_has_a_mirrored_pyramid_on_the_camera_grid(grid: str, fine: int) -> None:
-    """A camera has no preferred side. The even grid has one unless the side is odd."""
+    """The camera grid is symmetric; the even grid is so only for odd sides."""
     pyramid, image = Pyramid(grid), picture(1, 1, fine, dtype=torch.float64)
     mirrored = torch.allclose(pyramid.down(image.flip(-1)), pyramid.down(image).flip(-1), atol=1e-12)
     assert mirrored or (grid == "even" and fine % 2 == 0)
@@ -136,7 +136,7 @@ def test_a_mirrored_image_has_a_mirrored_pyramid_on_the_camera_grid(grid: str, f
 @pytest.mark.parametrize("fine", [64, 63])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_a_ramp_keeps_its_place(grid: str, fine: int) -> None:
-    """Both filters leave straight lines alone, so a ramp tells where each coarse pixel really lies."""
+    """Both filters preserve straight lines, so a ramp shows the position of each coarse pixel."""
     coarse, back = centres(grid, fine)
     ramp = torch.arange(fine, dtype=torch.float64).expand(1, 20, fine)
     pyramid, inside = Pyramid(grid), slice(3, -3)
@@ -146,7 +146,7 @@ def test_a_ramp_keeps_its_place(grid: str, fine: int) -> None:
 
 
 def blob_centre(image: Tensor) -> tuple[float, float]:
-    """Centre of mass in pixels of a blob over zero, x then y, with the centre of pixel 0 at 0.5 as `Camera` has it."""
+    """Return the centre of mass of a blob in pixels, x then y, with the centre of pixel 0 at 0.5 as in `Camera`."""
     weights = image.double().sum(0)
     x = (weights.sum(0) * (torch.arange(weights.shape[1]) + 0.5)).sum() / weights.sum()
     y = (weights.sum(1) * (torch.arange(weights.shape[0]) + 0.5)).sum() / weights.sum()
@@ -156,7 +156,7 @@ def blob_centre(image: Tensor) -> tuple[float, float]:
 @pytest.mark.parametrize("size", [(64, 80), (63, 81)])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_down_against_a_camera_of_the_coarse_size(grid: str, size: tuple[int, int]) -> None:
-    """The same Gaussian rendered at both sizes: on the camera grid Down of the fine image lies where the coarse camera
+    """The same Gaussian rendered at both sizes: on the camera grid Down of the fine image is where the coarse camera
     sees it. On the even grid it is half a fine pixel too far right and down for even sides; for odd sides that shift
     falls linearly to minus a half at the far end.
     """
@@ -264,7 +264,7 @@ def test_real_photos_leave_a_small_residual(shared_data: Path) -> None:
 
 
 def test_what_is_kept_from_inference_mode_serves_training() -> None:
-    """Sizes no other test has: what is cached by size is made here first."""
+    """Use sizes of no other test, so that caches by size are filled here first."""
     fine, coarse = torch.randn(3, 137, 241), torch.randn(3, 69, 121)
     with torch.inference_mode():
         Pyramid().down(fine.clone())

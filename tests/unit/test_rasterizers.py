@@ -1,4 +1,4 @@
-"""Which rasterizer renders a run, what it is told of the training, and that rendering pays for nothing else."""
+"""Test the choice of rasterizer, the settings it gets from the training, and gsplat behind our interface."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
 from lapgs_plugin.fields.rasterizer import render_transmittance
-from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rasterizers.extensions import CudaExtension
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.reference_raster.standins import install, stand_ins
@@ -44,7 +44,7 @@ def scene(signed: bool = False) -> Case:
 
 @pytest.fixture
 def line(caplog: pytest.LogCaptureFixture) -> Iterator[Any]:
-    """The one line that was logged."""
+    """Return the only logged line."""
     caplog.set_level(logging.INFO, LOGGER)
 
     def only() -> str:
@@ -61,7 +61,7 @@ def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine that says it has a GPU; nothing is rendered on it."""
+    """Pretend to have a GPU; nothing is rendered on it."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "A GPU")
 
@@ -77,7 +77,7 @@ def chosen(placed: PlacedRasterizer) -> tuple[str, str]:
 def test_without_cuda_the_fast_one_renders_and_says_what_it_cannot_honour(line: Any) -> None:
     placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == ("cpu", "cpu")
-    assert placed.lost == {"mult": 0.5}
+    assert placed.unsupported == {"mult": 0.5}
     assert line() == (
         f"rendering with cpu on the CPU: the fastest without a CUDA device; the run was trained with {FASTGS}, images "
         "may differ slightly; cpu cannot honour mult = 0.5 of the training "
@@ -94,8 +94,8 @@ def test_a_run_of_ours_is_rendered_as_it_was_trained(trained: str, line: Any) ->
 
 @pytest.mark.usefixtures("no_cuda")
 def test_settings_that_change_nothing_are_not_worth_a_word() -> None:
-    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=False)).lost == {}
-    assert rasterizer_for(manifest(FASTGS, mult=1.0)).lost == {}
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=False)).unsupported == {}
+    assert rasterizer_for(manifest(FASTGS, mult=1.0)).unsupported == {}
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -104,7 +104,7 @@ def test_settings_that_change_nothing_are_not_worth_a_word() -> None:
 def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: dict[str, Any], signed: bool) -> None:
     placed = rasterizer_for(manifest(name, **setting), device="cpu", rasterizer=name)
     assert chosen(placed) == (name, "cpu")
-    assert placed.lost == {}
+    assert placed.unsupported == {}
     case = scene(signed)
     with torch.no_grad():
         honoured, plain = case.render(placed.rasterizer).image, case.render(OracleRasterizer()).image
@@ -139,7 +139,7 @@ def test_with_cuda_the_rasterizer_of_the_training_renders_with_its_settings(line
     with install("fastgs"):
         placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == (FASTGS, "cuda")
-    assert placed.lost == {}
+    assert placed.unsupported == {}
     assert line() == f"rendering with {FASTGS} on A GPU: the one it was trained with"
 
 
@@ -148,7 +148,7 @@ def test_a_build_that_lacks_a_setting_says_so(line: Any) -> None:
     with install("taming"):
         placed = rasterizer_for(manifest(GRAPHDECO, antialiasing=True))
     assert chosen(placed) == (GRAPHDECO, "cuda")
-    assert placed.lost == {"antialiasing": True}
+    assert placed.unsupported == {"antialiasing": True}
     assert "cannot honour antialiasing = True" in line()
 
 
@@ -157,9 +157,9 @@ def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: 
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
     placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == ("gsplat", "cuda")
-    assert placed.lost == {"mult": 0.5}
+    assert placed.unsupported == {"mult": 0.5}
     assert f"rendering with gsplat on A GPU: {FASTGS} cannot be imported" in line()
-    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).lost == {}
+    assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).unsupported == {}
 
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "gsplat is not installed")
     assert chosen(rasterizer_for(manifest(FASTGS))) == ("cpu", "cpu")
@@ -223,7 +223,7 @@ def test_settings_that_an_extension_does_not_have_are_refused() -> None:
 
 
 class WithoutCuda:
-    """`gsplat.rasterization` and `spherical_harmonics` by gsplat's own PyTorch code, and what is asked of them."""
+    """Compute `gsplat.rasterization` and `spherical_harmonics` by gsplat's PyTorch code, and record the arguments."""
 
     def __init__(self) -> None:
         self.asked: dict[str, Any] = {}
@@ -278,7 +278,7 @@ class WithoutCuda:
         return image, alpha, {**found, "gaussian_ids": None}
 
     def _packed(self, found: dict[str, Any], absgrad: bool) -> dict[str, Any]:
-        """What was found of the visible Gaussians alone; their centres have the gradients, as gsplat's have."""
+        """Return the results of visible Gaussians alone; gradients go to their centres, as in gsplat."""
         ids = (found["radii"][0] > 0).all(-1).nonzero()[:, 0]
         packed: Any = found["means2d"][0, ids]
         whole = found["means2d"]
@@ -305,7 +305,7 @@ def without_cuda(monkeypatch: pytest.MonkeyPatch) -> WithoutCuda:
 
 
 def faint(signed: bool) -> Case:
-    """Opacities whose alpha sinks under 1/255 well inside three sigma: no footprint is cut and no alpha capped."""
+    """Make Gaussians whose alpha is below 1/255 well inside three sigma: no footprint is cut and no alpha capped."""
     case = random_case(300, 70, 50, seed=3, background=(0.0, 0.0, 0.0)).to(torch.float32)
     opacities = 0.01 + 0.19 * torch.rand(300, generator=torch.Generator().manual_seed(4))
     field = case.field.with_parameters({"opacity_logits": torch.logit(opacities)})
@@ -386,7 +386,7 @@ def test_gsplat_without_gaussians_shows_the_background(without_cuda: WithoutCuda
 
 
 def test_what_a_backward_pass_needed_is_let_go_at_once(without_cuda: WithoutCuda) -> None:
-    """Not when Python next looks for circles of references: it sees small objects, not gigabytes behind them."""
+    """Memory is freed without the cycle collector, which sees small objects and not the gigabytes behind them."""
     case = faint(False).with_leaves()
     gc.collect()
     gc.disable()

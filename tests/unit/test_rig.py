@@ -1,4 +1,4 @@
-"""The common point and upward direction of cameras whose arrangement is known."""
+"""Test focus and up direction for cameras of known arrangement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.training_scene import ring_camera
 
 
 def ring(count: int, angle: float = 2 * math.pi) -> list[Camera]:
-    """Cameras of `ring_camera`, which stand 4 from the y axis at y = -1 and look at the origin; y points down."""
+    """Return cameras of `ring_camera`: 4 from the y axis at y = -1, looking at the origin; y points down."""
     return [ring_camera(angle * i / count) for i in range(count)]
 
 

@@ -1,4 +1,4 @@
-"""Signed colour is found by trying, replaced where it is missing, and wrapped extensions render as the oracle does."""
+"""Test the probe for signed colour, its fallback, and wrapped extensions against the oracle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
 from lapgs_plugin.rasterizers import signed_color
-from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _Screen, installed_extensions
+from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
     SignedColorRasterizer,
@@ -43,7 +43,7 @@ CONSTANT = 0.28209479177387814  # the first basis function
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_torch_thread() -> Iterator[None]:
-    """The tensors are small: a second OpenMP thread only spins."""
+    """Use one thread: the tensors are small, and a second OpenMP thread would only spin."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -51,7 +51,7 @@ def _one_torch_thread() -> Iterator[None]:
 
 
 class Unpatched:
-    """An extension as its authors ship it: a negative degree is one below 1, and colours are clamped."""
+    """An unpatched extension: it takes a negative degree for one below 1, and clamps colours."""
 
     name = "some_extension"
     device = torch.device("cpu")
@@ -80,7 +80,7 @@ class Patched(Unpatched):
 
 
 class PatchedForward(Patched):
-    """Renders signed colour, and still leaves out of the gradient what a clamp would have caught."""
+    """An extension that renders signed colour, but leaves clamped channels out of the gradient."""
 
     def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
         right = super().with_sh(field, camera, background, sh_degree)
@@ -89,7 +89,7 @@ class PatchedForward(Patched):
 
 
 class AlwaysSigned(Unpatched):
-    """Signed colour of another kind: the degree is taken for 0."""
+    """An extension that takes the degree for 0."""
 
     def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
         return ORACLE(replace(field, signed=True), camera, background=background, sh_degree=0)
@@ -164,7 +164,7 @@ def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: P
 
 @pytest.fixture
 def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
-    """A rasterizer's sources in a checkout, with a patch of one edit."""
+    """Make a checkout with a rasterizer's sources, and a patch of one edit."""
     folder = tmp_path / "submodules" / "raster"
     (folder / "some_extension").mkdir(parents=True)
     (folder / "shade.cu").write_text("float shade() { return 0.5f; }\n")
@@ -213,7 +213,7 @@ def test_precomputed_colours_of_an_ordinary_field_are_clamped() -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> None:
-    """Matrices, units of the screen gradient, DC apart or not, degree 0, no Gaussians, none in view: seen from outside.
+    """Compare matrices, units of the screen gradient, separate DC, degree 0, no Gaussians and none in view.
 
     The stand-ins take what the CUDA modules take.
     """
@@ -232,7 +232,7 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
 
 def test_screen_gradients_come_back_in_pixels() -> None:
     means2d, absolute = torch.zeros(3, 2, requires_grad=True), torch.zeros(3, 2)
-    points = _Screen.apply(means2d, 40, 20, 4, absolute)
+    points = _ScreenPoints.apply(means2d, 40, 20, 4, absolute)
     assert points.shape == (3, 4)
     points.backward(torch.tensor([[20.0, 10.0, 40.0, 30.0]]).expand(3, 4))
     assert means2d.grad is not None
@@ -244,7 +244,7 @@ def test_screen_gradients_come_back_in_pixels() -> None:
 
 
 def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
-    """Whether a Gaussian has alpha >= 1/255 anywhere between the first and last pixels of a tile, by dense sampling."""
+    """Return whether a Gaussian has alpha >= 1/255 between the first and last pixels of a tile, by dense sampling."""
     hom = torch.cat([inputs["means3D"], torch.ones(len(inputs["means3D"]), 1)], 1) @ view.projmatrix
     size = torch.tensor([view.image_width, view.image_height])
     centres = ((hom[:, :2] / hom[:, 3:] + 1) * size - 1) / 2  # (n, 2)
@@ -260,7 +260,7 @@ def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
 
 @contextmanager
 def brittle(variant: str) -> Iterator[CudaExtension]:
-    """A stand-in that takes no call in which no tile has a Gaussian, as the CUDA rasterizers that blend in buckets."""
+    """A stand-in that refuses calls in which no tile has a Gaussian, like CUDA rasterizers that blend in buckets."""
     with install(variant) as modules:
         module = modules[VARIANTS[variant][0]]
 
@@ -275,7 +275,7 @@ def brittle(variant: str) -> Iterator[CudaExtension]:
 
 
 def sparse_case(places: list[tuple[float, float, float]], opacities: list[float], camera: Camera) -> Case:
-    """Small spheres at (x, y) pixels and depths."""
+    """Make small spheres at (x, y) pixels and depths."""
     x, y, depth = torch.tensor(places, dtype=torch.float64).reshape(-1, 3).unbind(1)
     points = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], 1)
     means = (points * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]

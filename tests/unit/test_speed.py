@@ -1,4 +1,4 @@
-"""Which speeds are measured, of what, and from when to when."""
+"""Test which speeds are measured, of which fields, and for how long."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering import speed
-from lapgs_plugin.rendering.compose import HierarchyRenderer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.speed import measure_speed
 from tests.training_scene import blob_field, ring_camera
 

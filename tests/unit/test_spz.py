@@ -1,4 +1,4 @@
-"""SPZ files read by a reader of the test's own: Gaussian by Gaussian, as the format's description says it."""
+"""Read SPZ files with a reader of this test, Gaussian by Gaussian, by the format's description."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HALF_TURN = Rotation.from_euler("x", 180, degrees=True)  # between y down, z ahe
 
 
 def read_spz(path: Path) -> tuple[GaussianField, int]:
-    """The field in the file's own axes (y up, z back), and its fractional bits."""
+    """Return the field in the file's axes (y up, z back), and its fractional bits."""
     data = gzip.decompress(path.read_bytes())
     magic, version, count, degree, fractional_bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
     assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
@@ -60,7 +60,7 @@ def read_spz(path: Path) -> tuple[GaussianField, int]:
 
 
 def read_rotation(packed: int) -> list[float]:
-    """A quaternion wxyz of the smallest three of its components: ten bits each, the last one lowest."""
+    """Decode a quaternion wxyz from its three smallest components of ten bits, the last one lowest."""
     largest = packed >> 30
     xyzw = [0.0] * 4
     for component in reversed([each for each in range(4) if each != largest]):
@@ -72,7 +72,7 @@ def read_rotation(packed: int) -> list[float]:
 
 
 def in_our_axes(field: GaussianField) -> GaussianField:
-    """Half a turn about x, of everything but the coefficients, which the tests look at by their colours."""
+    """Turn a field by 180 degrees about x, except SH, which the tests compare by colour."""
     w, x, y, z = field.quaternions.double().numpy().T
     turned = HALF_TURN * Rotation.from_quat(np.stack([x, y, z, w], axis=1)) * HALF_TURN.inv()
     x, y, z, w = turned.as_quat().T

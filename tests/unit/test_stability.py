@@ -1,4 +1,4 @@
-"""Flicker against scenes whose every pixel is known: textured planes seen by a moving camera, traced ray by ray."""
+"""Test flicker on scenes with known pixels: textured planes seen by a moving camera, traced ray by ray."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer
 from lapgs_plugin.rendering.depth import DepthImage, render_depth
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from tests.training_scene import blob_field, ring_camera
 
 SIZE = (96, 72)
 
 
 def camera_at(frame: int) -> Camera:
-    """Moves to the right, turns and rolls a little with each frame."""
+    """Return a camera that moves to the right, turns and rolls a little with each frame."""
     turn, roll = 0.01 * frame, 0.004 * frame
     cos, sin = math.cos(turn), math.sin(turn)
     about_y = torch.tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
@@ -36,21 +36,21 @@ def camera_at(frame: int) -> Camera:
 
 
 def rays(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Origin (3,) and directions (h, w, 3) in the world, each of depth 1 in the camera."""
+    """Return the origin (3,) and directions (h, w, 3) of rays in world units, each of depth 1 in the camera."""
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     along = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=-1)
     return camera.position.double(), along.double() @ camera.world_to_camera[:3, :3].double()
 
 
 def texture(point: Tensor) -> Tensor:
-    """(h, w, 3) places -> (3, h, w) colours, smooth beside the pixels."""
+    """Colour (h, w, 3) points smoothly: (3, h, w)."""
     x, y = point[..., 0], point[..., 1]
     waves = [torch.sin(2 * x + 3 * y), torch.cos(3 * x - y), torch.sin(4 * y)]
     return torch.stack([0.5 + 0.2 * wave for wave in waves])
 
 
 def plane(camera: Camera, slope: float = 0.3) -> tuple[Tensor, Tensor]:
-    """The plane z = 4 + slope x: its colours (3, h, w) and depth (h, w)."""
+    """Trace the plane z = 4 + slope x: its colours (3, h, w) and depth (h, w)."""
     origin, along = rays(camera)
     depth = (4 + slope * origin[0] - origin[2]) / (along[..., 2] - slope * along[..., 0])
     return texture(origin + depth[..., None] * along).float(), depth.float()
@@ -69,8 +69,8 @@ def test_a_plane_that_stands_still_does_not_flicker() -> None:
     assert 0.9 < compared < 1.0  # what has come into view has no past
 
 
-def test_depth_that_is_wrong_is_seen() -> None:
-    """The same images followed by a depth that ignores the slope: what a wrong correspondence would give."""
+def test_a_wrong_depth_shows_as_flicker() -> None:
+    """Following the same images with a depth that ignores the slope gives the flicker of a wrong correspondence."""
     frames = [frame(number) for number in range(6)]
     flat = [
         replace(each, depth=DepthImage(torch.full_like(each.depth.depth, 4.0), each.depth.cover)) for each in frames
@@ -87,8 +87,8 @@ def test_brightness_that_changes_by_a_known_amount_is_measured() -> None:
     assert flicker["image"].psnr == pytest.approx(-10 * math.log10(mse), abs=0.05)
 
 
-def test_what_was_hidden_is_not_compared() -> None:
-    """A bar of another colour in front of the plane, and still: without the test of depths its edges would count."""
+def test_occluded_pixels_are_not_compared() -> None:
+    """Without the test of depths, the edges of a bar in front of a plane would count as flicker."""
 
     def with_bar(number: int) -> Frame:
         camera = camera_at(number)
@@ -101,12 +101,12 @@ def test_what_was_hidden_is_not_compared() -> None:
         return Frame(camera, DepthImage(torch.where(bar, near, depth), torch.ones_like(depth)), {"image": colors})
 
     flicker, compared = measure_flicker(with_bar(number) for number in range(6))
-    # Bicubic sampling looks two pixels around, so that one or two columns at the bar's edges see both colours.
+    # Bicubic sampling reads two pixels around, so that one or two columns at the bar's edges see both colours.
     assert flicker["image"].mean < 3e-3  # 1.1e-3 seen; a column that was hidden differs by 0.4
     assert 0.85 < compared < 0.98  # 0.973 seen
 
 
-def test_nothing_in_common_is_said_by_the_share() -> None:
+def test_frames_with_nothing_in_common_have_a_share_of_zero() -> None:
     away = replace(frame(0), camera=camera_at(400))
     flicker, compared = measure_flicker([frame(0), away])
     assert compared == 0.0
@@ -121,8 +121,8 @@ def test_flicker_adds_up_over_frames() -> None:
     assert flicker.psnr == pytest.approx(-10 * math.log10((0.01 + 0.09 + 0.04) / 3))
 
 
-def test_depth_is_the_weighted_mean_of_what_covers_a_pixel() -> None:
-    """Two Gaussians one behind the other, by the blending formula."""
+def test_depth_is_the_weighted_mean_of_the_gaussians_over_a_pixel() -> None:
+    """Compare two Gaussians, one behind the other, with the blending formula."""
     camera = Camera(32, 32, 40.0, 40.0, 16.5, 16.5, torch.eye(4))
     field = GaussianField(
         means=torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 6.0]]),

@@ -18,8 +18,8 @@ from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDi
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.rasterizers import gsplat as gsplat_adapter
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
 from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
@@ -108,14 +108,12 @@ def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(sc
     since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy", "base_sh_degree")
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
-    for name in ("sh_rest_factor", "sh_rest_decay"):
-        older["learning_rates"].pop(name)
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
     density = replace(SETTINGS.densification, grow_grad2d=2e-4)  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
-    assert (found.hierarchy, TrainSettings().hierarchy) == ("laplacian", "nested"), (
-        "which is no default of what is read"
-    )
+    unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
+    found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
+    assert (found.hierarchy, found.views_per_step, found.sh_rate_factor) == ("laplacian", "1", 1.0)
 
 
 # --------------------------------------------------------------------------------------- gsplat's functions on a CPU
@@ -244,8 +242,7 @@ def test_a_factor_scales_the_steps_of_higher_harmonics_alone(signed: bool) -> No
 
 
 def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -> None:
-    rates = LearningRates(sh_rest_factor=4.0, sh_rest_decay=True)
-    settings = replace(SETTINGS, sh_degree=2, base_sh_degree=1, joint=0.5, learning_rates=rates)
+    settings = replace(SETTINGS, sh_degree=2, base_sh_degree=1, joint=0.5, sh_rate_factor=4.0)
     archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
     assert [archive.field(level).sh_degree for level in (1, 0)] == [1, 2]
     assert all(bool((archive.field(level).sh[:, 1:] != 0).any()) for level in (1, 0))

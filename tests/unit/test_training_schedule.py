@@ -158,8 +158,10 @@ def test_how_many_views_a_step_takes() -> None:
 
     assert views(1) == [1, 1]
     assert views(3) == [3, 3]
-    assert views(None) == [8, 2]  # 133k and 533k pixels of a million
-    assert views(None, training=5) == [5, 2]
+    assert views(None) == [8, 8]  # 133k and 533k pixels of four million
+    assert views(None, training=5) == [5, 5]
+    short = StagePlan.create((978, 545), 3600, 2)
+    assert [views_per_step(TrainSettings(), stage, 219, batches=True) for stage in short] == [2, 2]
     assert views(None, batches=False) == [1, 1]
     (large,) = StagePlan.create((3429, 3390), 30_000, 1)
     assert views_per_step(TrainSettings(views_per_step="auto"), large, 45, batches=True) == 1
@@ -187,19 +189,46 @@ def test_a_residual_resets_no_opacities_unless_told_otherwise(given: int | None,
     assert [i for i in range(1, 5000) if i % base.reset_every == 0] == ([] if given == 0 else [given or 3000])
 
 
-def test_the_rate_of_higher_harmonics_may_decay_to_what_it_is_otherwise() -> None:
-    plain, kept, fading = (
-        schedules(learning_rates=rates)[1]
-        for rates in (
-            LearningRates(),
-            LearningRates(sh_rest_factor=8.0),
-            LearningRates(sh_rest_factor=8.0, sh_rest_decay=True),
-        )
-    )
-    assert {plain.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
-    assert {kept.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {8.0}
-    assert fading.sh_rest_factor_at(7500) == pytest.approx(8**0.5)  # half way: the geometric mean
-    assert (fading.sh_rest_factor_at(0), fading.sh_rest_factor_at(15_000)) == (8.0, 1.0)
+@pytest.mark.parametrize(
+    ("given", "views", "first"), [(None, 8, 1.0), (None, 128, 4.0), (None, 900, 8.0), (3.0, 9, 3.0)]
+)
+def test_the_rate_of_higher_harmonics_follows_the_views_and_falls(
+    given: float | None, views: int, first: float
+) -> None:
+    settings = TrainSettings(hierarchy="laplacian", sh_rate_factor=given)
+    plan = StagePlan.create((1600, 1066), 30_000, 2, settings.shares, settings.kind)
+    base, residual = (StageSchedule.create(settings, stage, training_views=views) for stage in plan)
+    assert (base.sh_rest_factor_at(0), base.sh_rest_factor_at(15_000)) == (first, 1.0)
+    assert base.sh_rest_factor_at(7500) == pytest.approx(first**0.5)  # half way: the geometric mean
+    assert {residual.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
+
+
+PAPER = {
+    **{"hierarchy": "laplacian", "split": "1/3,2/3", "inherit": "xyz", "supervision": "reconstructed", "joint": 0.0},
+    **{"residual_color_rate": 1.0, "residual_resets": True, "residual_threshold": 1.0, "coarse_threshold": 1.0},
+    **{"prune": 0.0, "gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0},
+}
+
+
+def test_the_papers_protocol_is_the_papers_settings_and_nothing_else() -> None:
+    paper = TrainSettings(protocol="paper")
+    assert {name: getattr(paper, name) for name in PAPER} == PAPER
+    assert [stage.iterations for stage in StagePlan.create((800, 533), 30_000, 2, paper.shares, paper.kind)] == [
+        10_000,
+        20_000,
+    ]
+    assert TrainSettings(protocol="paper", levels=3).shares == TrainSettings(levels=3).shares
+    assert TrainSettings(protocol="paper", inherit="xyz", iterations=99).iterations == 99
+    others: dict[str, Any] = {
+        **{"hierarchy": "nested", "split": "1/2,1/2", "inherit": "geometry", "supervision": "gt_laplacian"},
+        **{"joint": 0.5, "residual_color_rate": 4.0, "residual_threshold": 2.0, "coarse_threshold": 2.0, "prune": 0.1},
+        **{"gather": 4, "views_per_step": "8", "sh_rate_factor": 8.0},
+    }
+    for name, value in others.items():
+        with pytest.raises(UserInputError, match=f"--{name.replace('_', '-')} {value} with --protocol paper"):
+            TrainSettings(protocol="paper", **{name: value})
+    with pytest.raises(UserInputError, match="--protocol papers: expected default or paper"):
+        TrainSettings(protocol="papers")
 
 
 def test_a_base_may_densify_longer() -> None:
@@ -271,8 +300,8 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"densification": Densification(grow_grad2d=-1.0)}, "--densify-threshold -1.0: expected a positive gradient"),
         ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
         ({"densification": Densification(base_share=0.5), "levels": 1}, "one level has no base"),
-        ({"learning_rates": LearningRates(sh_rest_factor=math.inf)}, "--sh-rate-factor inf"),
-        ({"learning_rates": LearningRates(sh_rest_decay=True)}, "--sh-rate-decay: there is nothing to decay from"),
+        ({"sh_rate_factor": math.inf}, "--sh-rate-factor inf"),
+        ({"learning_rates": LearningRates(scales=0.0)}, "scales 0.0: expected a positive learning rate"),
         ({"hierarchy": "laplacian", "base_sh_degree": 4}, "--base-sh-degree 4: expected 0 to --sh-degree, 3"),
         ({"hierarchy": "laplacian", "base_sh_degree": 1, "inherit": "full"}, "with --inherit full"),
         ({"hierarchy": "laplacian", "base_sh_degree": 1, "levels": 1}, "one level has no base"),

@@ -1,4 +1,4 @@
-"""Camera paths against circles and cameras that are known, and files against what is wrong with them."""
+"""Compare camera paths with known circles and cameras, and refuse files with mistakes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def ring(count: int, angle: float = 2 * math.pi) -> list[Camera]:
 
 
 def turns(cameras: list[Camera]) -> NDArray[np.float64]:
-    """Angle between each camera and the next, in radians."""
+    """Return the angle between each camera and the next in radians."""
     rotations = Rotation.from_matrix([camera.world_to_camera[:3, :3].double().numpy() for camera in cameras])
     return np.asarray((rotations[1:] * rotations[:-1].inv()).magnitude())
 

@@ -12,7 +12,7 @@ import torch
 
 CHECKS = """
 import torch
-from lapgs_plugin.rasterizers.gsplat_triton import activated, colors_of_shown, finish_gradients, place_seen
+from lapgs_plugin.rasterizers.gsplat.kernels import activate, finish_gradients, visible_colors, write_to_stack
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
 from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
@@ -32,21 +32,21 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     centre = centres_of_three[:cameras]
     radii, pixels = torch.randint(0, 3, (cameras, n, 2), dtype=torch.int32), torch.randn(cameras, n, 2)
     shown = (radii > 0).all(-1)
-    scales, opacities = activated(log_scales.detach(), logits.detach())
+    scales, opacities = activate(log_scales.detach(), logits.detach())
     close(scales, log_scales.exp())
     close(opacities, logits.sigmoid())
     given = means.detach(), centre, sh.detach(), active, signed, radii
-    colors, largest, centres = colors_of_shown(*given, pixels)
+    colors, largest, centres = visible_colors(*given, pixels)
     directions = [torch.nn.functional.normalize(means - each, dim=-1) for each in centre]
     seen = torch.stack([sh_to_color(sh, each, active, signed=signed) for each in directions])
     close(colors[shown], seen[shown])
     assert (largest == torch.where(shown, radii.amax(-1), 0)).all()
     close(centres, torch.where(shown[..., None], pixels - 0.5, 0.0))
-    assert colors_of_shown(*given, None)[1].numel() == 0
+    assert visible_colors(*given, None)[1].numel() == 0
     if active == degree and cameras == 1:
         found = radii[0], pixels[0], torch.randn(n), torch.randn(n, 3)
         placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors[0])]
-        place_seen(means.detach(), centre, sh.detach(), signed, found, placed, 30)
+        write_to_stack(means.detach(), centre, sh.detach(), signed, found, placed, 30)
         for part, whole in zip((*found, colors[0]), placed, strict=True):
             assert (whole[30 : 30 + n] == part).all()
             assert (whole[:30] == -7).all()

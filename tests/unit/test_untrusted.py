@@ -1,4 +1,4 @@
-"""JSON and TOML of unknown origin: bounded, checked, and one line for whatever is wrong."""
+"""JSON and TOML of unknown origin are limited and validated; every error is one line."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ UNREADABLE_TOML = [
 
 
 def refused(read: Any, path: Path, message: str, advice: str = "do this") -> None:
-    """Reading is refused in one line that names the file, in little memory."""
+    """Check that reading is refused in one line that names the file, in little memory."""
     tracemalloc.start()
     try:
         with pytest.raises(UserInputError, match=message) as caught:

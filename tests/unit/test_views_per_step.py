@@ -22,7 +22,7 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.ops.adam import ADAM_EPS, StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
-from lapgs_plugin.rasterizers.gsplat import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference

@@ -1,4 +1,4 @@
-"""The scene and run of the commands' tests."""
+"""Share the scene and run of the commands' tests."""
 
 from tests.cli.conftest import run, scene
 

@@ -1,4 +1,4 @@
-"""What a page answers to browsers that other pages sent."""
+"""Request a page as browsers do that come from other pages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import urllib.request
 
 
 def statuses(address: str) -> list[int]:
-    """Status for a browser that opened the page, for a foreign page, and for a foreign name that leads here."""
+    """Return the status for a browser that opened the page, for a foreign page, and for a foreign name."""
     requests: list[dict[str, str]] = [{}, {"Origin": "http://evil.example"}, {"Host": "evil.example"}]
     return [_status(urllib.request.Request(address, headers=headers)) for headers in requests]
 

@@ -1,6 +1,6 @@
-"""The viewer as a person meets it: the real command, a real browser without a window, a mouse and a keyboard.
+"""Test the viewer with the real command and a headless browser, mouse and keyboard.
 
-Needs playwright and a Chromium that is installed anyway (LAPGS_CHROMIUM names another one); skipped by name without.
+Needs playwright and an installed Chromium (or LAPGS_CHROMIUM); otherwise the tests are skipped.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ pytestmark = [
 
 WIDTH, HEIGHT = 800, 600
 PATIENCE = 90.0
-"""Seconds to wait for what takes two; the browser renders in software, beside whatever else the machine does."""
+"""Seconds to wait for steps that take two; the browser renders in software on a busy machine."""
 
-# Whoever runs the tests may have Ctrl-C ignored in what they start.
+# The tests' parent process may ignore Ctrl-C, and its children would inherit that.
 COMMAND = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -50,7 +50,7 @@ main()
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where `lapgs view` of two runs of one scene can be reached; ends like by Ctrl-C."""
+    """Start `lapgs view` of two runs of one scene and return its address; ends it by Ctrl-C."""
     folder = tmp_path_factory.mktemp("view")
     scene = write_scene(folder / "scene")
     run, baseline = write_run(folder / "run", scene), write_run(folder / "baseline", scene, levels=1, seed=5)
@@ -78,7 +78,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def sharpen_residual(run: Path) -> None:
-    """Make a run's residual what residuals are: small and strong."""
+    """Make a run's residual small and strong, as trained residuals are."""
     archive = RunArchive.open(run)
     field = archive.field(0)
     small = replace(field, log_scales=field.log_scales - 1.2, opacity_logits=field.opacity_logits + 3, sh=3 * field.sh)
@@ -93,7 +93,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Any]:
-    """The viewer's page, its first picture drawn at the window's size."""
+    """Open the viewer's page and wait for its first picture at the window's size."""
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.goto(address)
     page.get_by_text(f"{WIDTH} x {HEIGHT} in").wait_for(timeout=1e3 * PATIENCE)
@@ -102,13 +102,13 @@ def page(browser: Any, address: str) -> Iterator[Any]:
 
 
 def picture(page: Any) -> NDArray[np.float64]:
-    """What is left of the panel and below the browser's messages, (h, w, 3) in 0 to 255."""
+    """Capture the area left of the panel and below the browser's messages, (h, w, 3) in 0 to 255."""
     pixels = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
     return pixels[180:, :460].astype(np.float64)
 
 
 def wait_for(page: Any, condition: Callable[[NDArray[np.float64]], bool]) -> NDArray[np.float64]:
-    """The picture, once it satisfies the condition and has come to rest."""
+    """Wait until the picture satisfies the condition and no longer changes."""
     deadline = time.monotonic() + PATIENCE
     before = picture(page)
     while time.monotonic() < deadline:
@@ -123,7 +123,7 @@ def wait_for(page: Any, condition: Callable[[NDArray[np.float64]], bool]) -> NDA
 
 
 def sharpness(pixels: NDArray[np.float64]) -> float:
-    """Mean second derivative of what is larger than the noise of JPEG; 0.19, 0.07 and 0.40 at gains 1, 0 and 3."""
+    """Mean second derivative above the noise of JPEG; 0.19, 0.07 and 0.40 at gains 1, 0 and 3."""
     return float(np.abs(cv2.Laplacian(cv2.GaussianBlur(pixels, (0, 0), 3.0), cv2.CV_64F)).mean())
 
 
@@ -132,7 +132,7 @@ def difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def put_slider(page: Any, label: str, key: str) -> None:
-    """Move a slider to its end by keyboard: "Home" for the least, "End" for the most."""
+    """Move a slider to its end by keyboard: "Home" for the minimum, "End" for the maximum."""
     name = page.get_by_text(label, exact=True).get_attribute("for")
     page.locator(f'[id="{name}"] [role=slider]').press(key)
 

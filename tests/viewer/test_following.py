@@ -1,4 +1,4 @@
-"""A run that is looked at while it is written: what is read again, what is not, and what is said of damage."""
+"""Test runs that are viewed while they are written: what is read again, and how damage is reported."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.cli.run_folder import write_run, write_scene
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
 from lapgs_plugin.viewer import following
-from lapgs_plugin.viewer.following import FollowedRun, Following
+from lapgs_plugin.viewer.following import FollowedRun, RunFollower
 from tests.waiting import wait_for
 
 
@@ -31,7 +31,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def finish(run: Path, of: Path) -> None:
-    """Give a run the next level of a complete one."""
+    """Add the next level of a complete run to a run."""
     complete = RunArchive.open(of)
     with RunArchive.open(run, resume=True) as archive:
         level = archive.manifest.next_level
@@ -43,7 +43,7 @@ def levels(run: FollowedRun) -> list[int]:
     return [] if run.shown is None else list(run.shown.counts)
 
 
-def test_what_is_rendered_to_load_a_rasterizer_is_a_hierarchy_and_fails_in_silence() -> None:
+def test_loading_a_rasterizer_renders_a_hierarchy_and_ignores_errors() -> None:
     class Recording(CpuRasterizer):
         def render_images(self, field: GaussianField, *args: Any, **kwargs: Any) -> torch.Tensor:
             rendered.append(field.signed)
@@ -83,7 +83,7 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     assert len(read) == before
 
 
-def test_a_level_that_is_mended_is_shown_again(scene: Path, tmp_path: Path) -> None:
+def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", scene)
     ply = folder / "level_0" / "point_cloud.ply"
     whole = ply.read_bytes()
@@ -122,17 +122,17 @@ def test_another_run_in_the_same_folder_is_another_field(scene: Path, tmp_path: 
 
 
 class FakeViewer:
-    """Notes what it is told to show."""
+    """Records the content that it should show."""
 
     def __init__(self) -> None:
         self.shown: list[Any] = []
         self.starts = 0
 
-    def begin_at(self, start: Any) -> None:
+    def set_initial_view(self, start: Any) -> None:
         self.starts += 1
 
-    def show(self, exhibit: Any) -> None:
-        self.shown.append(exhibit)
+    def show(self, content: Any) -> None:
+        self.shown.append(content)
 
 
 class FakePage:
@@ -142,11 +142,11 @@ class FakePage:
 def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_folder(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(following, "LOOK_SECONDS", 0.02)
+    monkeypatch.setattr(following, "POLL_SECONDS", 0.02)
     complete = write_run(tmp_path / "complete", scene)
     folder = write_run(tmp_path / "run", scene, finished=1)
     viewer, page, said = FakeViewer(), FakePage(), list[str]()
-    follow = Following(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
+    follow = RunFollower(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
     follow.begin()
     stop = threading.Event()
     thread = threading.Thread(target=follow.watch, args=(stop,))
@@ -160,7 +160,7 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
     finally:
         stop.set()
         thread.join()
-    assert [list(exhibit.run.counts) for exhibit in viewer.shown[:2]] == [[1], [1, 0]]
+    assert [list(content.run.counts) for content in viewer.shown[:2]] == [[1], [1, 0]]
     assert len(viewer.shown[0].cameras) == 10
     assert viewer.starts == 1
     assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]

@@ -1,4 +1,4 @@
-"""Who may look at a page: a real browser's requests, foreign ones, and bytes that are no request at all."""
+"""Test which requests a page accepts: those of its own browsers, not foreign ones or garbage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
 from websockets.exceptions import InvalidStatus  # noqa: E402  # needs viser
 from websockets.sync.client import connect  # noqa: E402
 
-from lapgs_plugin.viewer.guard import MOST_LINES, Guard, guarded_server  # noqa: E402
+from lapgs_plugin.viewer.guard import MAX_LOGGED, Guard, guarded_server  # noqa: E402
 from lapgs_plugin.viewer.page import Page  # noqa: E402
 from tests.viewer.wire import wire_client  # noqa: E402
 from tests.waiting import wait_for  # noqa: E402
@@ -33,13 +33,13 @@ def page() -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def open_page() -> Iterator[Page]:
-    """Whoever can reach this machine may look."""
+    """Serve a page on all addresses."""
     with Page("0.0.0.0", 8770, "run") as page:
         yield page
 
 
 def get(page: Page, path: str = "/", **headers: str) -> tuple[int, str]:
-    """Status and text of a plain request; Host is the page's own unless given."""
+    """Return status and text of a plain request; Host is the page's own by default."""
     with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
         connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
         for name, value in {"Host": f"localhost:{page.port}", **headers}.items():
@@ -50,7 +50,7 @@ def get(page: Page, path: str = "/", **headers: str) -> tuple[int, str]:
 
 
 def shake_hands(page: Page, host: str, origin: str | None) -> int:
-    """Status of a web socket's handshake by the client of websockets."""
+    """Return the status of a web socket's handshake."""
     with socket.create_connection(("127.0.0.1", page.port)) as stream:
         try:
             protocol = f"viser-v{viser.__version__}"
@@ -61,7 +61,7 @@ def shake_hands(page: Page, host: str, origin: str | None) -> int:
             return refused.response.status_code
 
 
-# What a browser sends: the Host that it was told, and for its web sockets an Origin of the same name.
+# A browser sends the Host of the address it opened, and for web sockets an Origin of the same name.
 GOOD_HOSTS = ["localhost:PORT", "127.0.0.1:PORT", "[::1]:PORT", "LOCALHOST:PORT", "localhost:9123", "127.0.0.1:9123"]
 FOREIGN_HOSTS = [
     "evil.example:PORT",
@@ -88,7 +88,7 @@ def test_a_browser_of_this_machine_or_of_a_tunnel_is_answered(page: Page, host: 
 
 
 @pytest.mark.parametrize("host", FOREIGN_HOSTS)
-def test_a_page_whose_name_was_made_to_lead_here_is_refused(page: Page, host: str) -> None:
+def test_dns_rebinding_is_refused(page: Page, host: str) -> None:
     host = host.replace("PORT", str(page.port))
     status, text = get(page, Host=host)
     assert status == 403
@@ -105,7 +105,7 @@ def test_a_foreign_page_is_refused(page: Page, origin: str) -> None:
     assert shake_hands(page, f"localhost:{page.port}", origin) == 403
 
 
-def test_on_all_addresses_any_address_is_a_name_and_no_foreign_name_is(open_page: Page) -> None:
+def test_on_all_addresses_any_address_is_accepted_but_no_foreign_name(open_page: Page) -> None:
     for host in (f"192.0.2.7:{open_page.port}", f"[2001:db8::7]:{open_page.port}", f"{OWN_NAME}:{open_page.port}"):
         assert get(open_page, Host=host)[0] == 200, host
         assert shake_hands(open_page, host, f"http://{host}") == 101
@@ -113,7 +113,7 @@ def test_on_all_addresses_any_address_is_a_name_and_no_foreign_name_is(open_page
     assert get(open_page, Host=f"evil.example:{open_page.port}")[0] == 403
 
 
-def test_a_name_that_was_asked_for_is_known_with_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_given_host_is_accepted_with_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: found)
     monkeypatch.setattr(socket, "getfqdn", lambda: "gpu.lab.example")
@@ -135,13 +135,13 @@ def test_a_name_that_was_asked_for_is_known_with_its_addresses(monkeypatch: pyte
         ("/nothing", 404),
     ],
 )
-def test_paths_that_lead_nowhere(page: Page, path: str, expected: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_paths_are_refused(page: Page, path: str, expected: int, caplog: pytest.LogCaptureFixture) -> None:
     assert get(page, path)[0] == expected
     assert not caplog.records
 
 
 @pytest.mark.parametrize("host", ["", "localhost:PORT, evil", "a@localhost:PORT", "localhost:PORT/x", "[localhost]"])
-def test_a_host_that_is_none_is_a_mistake(page: Page, host: str) -> None:
+def test_an_invalid_host_is_refused(page: Page, host: str) -> None:
     assert get(page, Host=host.replace("PORT", str(page.port)))[0] in (400, 403)
 
 
@@ -163,7 +163,7 @@ GARBAGE = [
 
 
 @pytest.mark.parametrize("reset", [False, True])
-def test_bytes_that_are_no_request_leave_the_page_up_and_no_traceback(
+def test_garbage_leaves_the_page_up_and_no_traceback(
     page: Page, reset: bool, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for garbage in GARBAGE:
@@ -195,12 +195,12 @@ def test_a_client_that_sends_no_messages_is_one_line(page: Page, caplog: pytest.
     assert get(page)[0] == 200
 
 
-def test_what_is_refused_is_a_line_each_and_not_without_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_refusals_are_logged_once_each_and_limited(caplog: pytest.LogCaptureFixture) -> None:
     with Page("127.0.0.1", 8790, "run") as page:
         for name in ("\x9bevil", "evil", "evil", *(f"evil{number}" for number in range(20))):
             assert get(page, Origin=f"http://{name}.example")[0] == 403
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == len(set(lines)) == MOST_LINES
+    assert len(lines) == len(set(lines)) == MAX_LOGGED
     assert lines[1].startswith("the viewer refused a browser: a page of 'http://evil.example' may not")
     assert re.fullmatch(r"[\x20-\x7e]*", "".join(lines))
 
@@ -210,13 +210,13 @@ def test_a_server_that_was_not_guarded_is_an_error() -> None:
         pass
 
 
-def test_pages_that_would_show_ours_inside_are_told_not_to(page: Page) -> None:
+def test_other_pages_cannot_embed_ours(page: Page) -> None:
     with closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)) as connection:
         connection.request("GET", "/")
         assert connection.getresponse().headers["Content-Security-Policy"] == "frame-ancestors 'self'"
 
 
-def test_the_address_of_ipv6_is_one_that_can_be_opened() -> None:
+def test_an_ipv6_address_can_be_opened() -> None:
     try:
         with socket.create_server(("::1", 0), family=socket.AF_INET6):
             pass

@@ -1,4 +1,4 @@
-"""Watching a run while it is trained: pictures come, the result has the same bits, and nothing that fails ends it."""
+"""Test the live view: pictures arrive, the result keeps its bits, and no error of the view ends training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytest.importorskip("viser", reason="needs the extra 'viewer'")
 from lapgs_plugin.viewer import live
 from lapgs_plugin.viewer.live import LiveView
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.server import Viewer
+from lapgs_plugin.viewer.viewer import Viewer
 from tests.viewer.wire import WireClient, wire_client
 from tests.waiting import wait_for as wait_so_long
 
@@ -50,7 +50,7 @@ def train(folder: Path, watcher: Watcher, iterations: int, hierarchy: str = "lap
 
 
 class Watched(LiveView):
-    """Trains no further than to the second iteration of a stage before `go` is set."""
+    """Trains only to the second iteration of a stage before `go` is set."""
 
     def __init__(self, page: Page) -> None:
         super().__init__(page)
@@ -74,7 +74,7 @@ def watched_run(
     iterations: int = 150,
     **options: str,
 ) -> RunArchive:
-    """Train in a thread while a client looks on."""
+    """Train in a thread while a client is connected."""
     result: list[RunArchive] = []
     thread = threading.Thread(target=lambda: result.append(train(folder, watcher, iterations, **options)))
     thread.start()
@@ -136,7 +136,7 @@ def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, 
         assert client.listen(PATIENCE, pictures=1) == 1
         status = page.status
         assert "iteration 1 of" in status
-        client.look_from(0.5, 0.0, -4.0)  # pictures come without training going on
+        client.look_from(0.5, 0.0, -4.0)  # pictures arrive while training is paused
         assert client.listen(PATIENCE, pictures=1) == 1
         assert page.status == status
         watcher._pause.value = False
@@ -146,7 +146,7 @@ def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, 
     watched_run(tmp_path / "run", page, watcher, look)  # it ends although it is paused: the client has left
 
 
-def test_a_stop_is_heard_while_training_is_paused(page: Page) -> None:
+def test_training_can_be_stopped_while_paused(page: Page) -> None:
     watcher = LiveView(page)
     watcher._pause.value = True
     asked: list[bool] = []
@@ -162,7 +162,7 @@ def ring_stage() -> Stage:
     return Stage(level=0, image_size=(56, 40), iterations=10, signed=False)
 
 
-@pytest.mark.parametrize("broken", ["draw_next", "show", "begin_at"])
+@pytest.mark.parametrize("broken", ["draw_next", "show", "set_initial_view"])
 def test_a_viewer_that_fails_ends_watching_not_training(
     page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
 ) -> None:
@@ -175,12 +175,12 @@ def test_a_viewer_that_fails_ends_watching_not_training(
     assert archive.manifest.complete
     assert watcher.looks <= 1
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert warnings == ["nobody can watch any more, training goes on: no more memory for pictures"]
+    assert warnings == ["the view has ended, training continues: no more memory for pictures"]
 
 
 @pytest.mark.parametrize("percent", [2.0, 10.0, 50.0])
 def test_pictures_take_no_more_than_their_share(page: Page, monkeypatch: pytest.MonkeyPatch, percent: float) -> None:
-    """On a clock of the test's own: iterations of 3 ms, pictures of 1 to 40 ms."""
+    """Simulate a clock: iterations of 3 ms, pictures of 1 to 40 ms."""
     clock = Clock()
     monkeypatch.setattr(live.time, "perf_counter", clock)
     watcher = LiveView(page)
@@ -198,12 +198,12 @@ def test_pictures_take_no_more_than_their_share(page: Page, monkeypatch: pytest.
             watcher.look(ring_stage(), iteration, dict, lambda: False)
             looking += clock() - before
     share = percent / 100.0
-    last = 0.04  # its time has not come
+    last = 0.04  # the last picture's time is not compensated yet
     assert looking <= share * (training + looking) + last
     assert looking >= 0.9 * share * training
 
 
-def test_no_share_is_no_picture(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_share_of_zero_draws_nothing(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     watcher = LiveView(page)
     monkeypatch.setattr(Viewer, "watched", True)
     assert watcher.wants_look()

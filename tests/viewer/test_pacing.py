@@ -1,4 +1,4 @@
-"""When pictures are drawn and how small, on a clock of the test's own."""
+"""Test when pictures are drawn and at which size, on a simulated clock."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from lapgs_plugin.viewer.pacing import SETTLE_SECONDS, SMALLEST, TARGET_SECONDS,
 
 
 def move(pacing: Pacing, seconds_at_full_size: float, pictures: int) -> float:
-    """Draw that many pictures of a moving camera on a machine of that speed; the last one's scale."""
+    """Draw pictures of a moving camera on a machine of that speed and return the last one's scale."""
     scale = 0.0
     for frame in range(pictures):
         pacing.change(float(frame))
@@ -54,7 +54,7 @@ def test_a_change_while_drawing_is_not_lost() -> None:
 
 
 def test_slow_first_pictures_are_forgotten_soon() -> None:
-    """What is compiled or loaded with them says nothing about those that follow."""
+    """The first pictures compile and load code, so their times predict nothing."""
     pacing = Pacing()
     for frame in range(3):
         pacing.change(float(frame))

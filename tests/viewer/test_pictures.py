@@ -1,4 +1,4 @@
-"""Pictures against the composition written out, and levels of detail against geometry done by hand."""
+"""Test pictures against composition written out, and levels of detail against geometry by hand."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.compose import HierarchyRenderer
-from lapgs_plugin.rendering.field_offload import FieldOffload
-from lapgs_plugin.viewer.navigation import Pose
+from lapgs_plugin.rendering.field_renderer import FieldOffload
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw, side_by_side
+from lapgs_plugin.viewer.poses import Pose
 from tests.training_scene import blob_field, ring_camera
 
 CAMERA = ring_camera(0.4, 64, 48)
@@ -63,7 +63,7 @@ def test_gains_and_switched_off_levels(run: ShownRun) -> None:
 
 @dataclass
 class Elsewhere(FieldOffload):
-    """Fields that come as other objects each time."""
+    """Offload that returns new objects each time."""
 
     def bring(self, level: int, wanted: GaussianField) -> GaussianField:
         return wanted.with_parameters({name: value.clone() for name, value in wanted.parameters.items()})
@@ -75,7 +75,7 @@ def test_each_band_has_its_own_time_wherever_its_field_waits(run: ShownRun) -> N
             time.sleep(0.05 if field.signed else 0.0)
             return super().render_images(field, *args, **kwargs)
 
-    away = replace(run.renderer, rasterizer=SlowDetail(), residence=Elsewhere(torch.device("cpu")))
+    away = replace(run.renderer, rasterizer=SlowDetail(), offload=Elsewhere(torch.device("cpu")))
     times = picture(replace(run, renderer=away), PictureSettings()).milliseconds
     assert times.keys() == {1, 0}
     assert times[0] >= 50.0
@@ -148,7 +148,7 @@ def test_split_view_takes_each_side_from_its_run(run: ShownRun) -> None:
     settings = PictureSettings({0: 0.0}, divider=0.25)
     split = draw(run, other, CAMERA, settings, distance=4.0, zoom=1.0).image
     left = picture(run, PictureSettings({0: 0.0})).image
-    right = picture(other, PictureSettings()).image  # gains are for the run, not for what it is compared with
+    right = picture(other, PictureSettings()).image  # gains apply to the run, not to the one beside it
     torch.testing.assert_close(split[:, :, :15], left[:, :, :15])
     torch.testing.assert_close(split[:, :, 17:], right[:, :, 17:])
     assert (split[:, :, 15:17] == 1).all()

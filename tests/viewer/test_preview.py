@@ -1,4 +1,4 @@
-"""The picture that stands on the page before anything can be rendered: whose it is, who gets it, and until when."""
+"""Test the preview: its content, who receives it, and when it ends."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from PIL import Image
 from lapgs_plugin.files import PREVIEW
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.viewer.preview import SIZE, fitted, keep_preview_of, read_preview
+from lapgs_plugin.viewer.preview import SIZE, crop_to_aspect, read_preview, save_run_preview
 from tests.cli.run_folder import write_run
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
-from lapgs_plugin.viewer.following import FollowedRun, Following
+from lapgs_plugin.viewer.following import FollowedRun, RunFollower
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.server import Viewer
+from lapgs_plugin.viewer.viewer import Viewer
 from tests.viewer.wire import WireClient, wire_client
 from tests.waiting import wait_for as wait_so_long
 
@@ -35,15 +35,15 @@ PATIENCE = 20.0
 wait_for = partial(wait_so_long, seconds=PATIENCE)
 WINDOW = (320, 240)
 
-# Torch cannot be imported before a file is there.
+# Blocks the import of torch until a file exists.
 COMMAND = """
 import builtins, sys, time
 from pathlib import Path
 gate, plain = Path(sys.argv.pop()), builtins.__import__
-def gated(name, *rest):
+def gated(name, *rest, **named):
     while name.split(".")[0] == "torch" and not gate.exists():
         time.sleep(0.01)
-    return plain(name, *rest)
+    return plain(name, *rest, **named)
 builtins.__import__ = gated
 from lapgs_plugin.cli import main
 main()
@@ -54,32 +54,32 @@ def decoded(jpeg: bytes) -> NDArray[np.float64]:
     return np.asarray(Image.open(io.BytesIO(jpeg)), np.float64)
 
 
-def test_it_is_what_the_first_camera_of_the_scene_sees(scene: Path, tmp_path: Path) -> None:
+def test_the_preview_shows_the_first_camera_of_the_scene(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene, hold_out=False)  # all around, so that up is up in every image
-    keep_preview_of(run, "cpu")
+    save_run_preview(run, "cpu")
     archive = RunArchive.open(run)
     preview = read_preview(run)
     assert preview is not None
     camera = run_cameras(archive)[0]["photos/00.png"]
     width, height = round(SIZE[1] * camera.width / camera.height), SIZE[1]
     seen = run_renderer(archive, "cpu").images([camera.resized(width, height)])[0].clamp(0, 1)
-    shown = np.asarray(fitted(preview, width / height), np.float64)
+    shown = np.asarray(crop_to_aspect(preview, width / height), np.float64)
     # Mean over the picture, 8 bits, for a JPEG; worst seen 0.74.
     assert np.abs(255 * seen.permute(1, 2, 0).numpy() - shown).mean() < 1.5
 
 
-def test_windows_get_its_middle_at_full_height() -> None:
+def test_the_preview_is_cropped_to_the_window() -> None:
     columns = np.tile(np.arange(200, dtype=np.uint8)[None, :, None], (100, 1, 3))
     image = Image.fromarray(columns)
-    np.testing.assert_array_equal(np.asarray(fitted(image, 1.5)), columns[:, 25:175])
-    wider = np.asarray(fitted(image, 3.0))
+    np.testing.assert_array_equal(np.asarray(crop_to_aspect(image, 1.5)), columns[:, 25:175])
+    wider = np.asarray(crop_to_aspect(image, 3.0))
     np.testing.assert_array_equal(wider[:, 50:250], columns)
     assert wider.shape == (100, 300, 3)
     assert not wider[:, :50].any()
 
 
-def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -> None:
-    keep_preview_of(run, "cpu")
+def test_an_outdated_or_damaged_preview_is_not_read(run: Path, scene: Path, tmp_path: Path) -> None:
+    save_run_preview(run, "cpu")
     kept, manifest = (run / PREVIEW).read_bytes(), json.loads((run / "manifest.json").read_text())
     assert read_preview(run) is not None
     (run / "manifest.json").write_text(json.dumps({**manifest, "created": "2001-01-01T00:00:00+00:00"}))
@@ -96,28 +96,28 @@ def test_it_is_of_the_run_as_it_is_now(run: Path, scene: Path, tmp_path: Path) -
     assert read_preview(tmp_path / "nowhere") is None
 
 
-def test_what_cannot_be_kept_is_a_line_of_the_log(
+def test_a_preview_that_cannot_be_saved_is_logged(
     run: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (run / PREVIEW).mkdir()
-    keep_preview_of(run, "cpu")
-    assert [record.levelname for record in caplog.records if "no picture of" in record.message] == ["WARNING"]
+    save_run_preview(run, "cpu")
+    assert [record.levelname for record in caplog.records if "no preview of" in record.message] == ["WARNING"]
     assert not list(run.glob("*.tmp")) + list(run.glob(".*.tmp"))
     (run / "level_0" / "point_cloud.ply").unlink()
-    keep_preview_of(run, "cpu")
+    save_run_preview(run, "cpu")
     assert "level 0 of" in caplog.messages[-1]
     monkeypatch.setitem(sys.modules, "lapgs_plugin.rendering.run", None)  # importing it fails
-    keep_preview_of(run, "cpu")
+    save_run_preview(run, "cpu")
     assert "rendering.run" in caplog.messages[-1]
 
 
-def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
+def test_a_viewer_saves_a_preview_after_drawing(run: Path) -> None:
     stop = threading.Event()
     with Page("127.0.0.1", 8960, "run") as page:
         viewer = Viewer(page)
-        following = Following(viewer, page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following = RunFollower(viewer, page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
         following.begin()
-        serving = threading.Thread(target=viewer.serve, args=(stop, following.keep_preview))
+        serving = threading.Thread(target=viewer.serve, args=(stop, following.save_preview))
         serving.start()
         try:
             time.sleep(0.6)  # twice the patience of the thread that draws
@@ -129,26 +129,26 @@ def test_a_viewer_keeps_one_when_it_has_drawn(run: Path) -> None:
             stop.set()
             serving.join()
     kept = (run / PREVIEW).read_bytes()
-    keep_preview_of(run, "cpu")
+    save_run_preview(run, "cpu")
     assert (run / PREVIEW).read_bytes() == kept
 
 
-def test_a_damaged_run_leaves_none(run: Path) -> None:
+def test_a_damaged_run_has_no_preview(run: Path) -> None:
     ply = run / "level_0" / "point_cloud.ply"
     ply.write_bytes(ply.read_bytes()[:-1000])
     with Page("127.0.0.1", 8965, "run") as page:
-        following = Following(Viewer(page), page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following = RunFollower(Viewer(page), page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
         following.begin()
-        following.keep_preview()
+        following.save_preview()
     assert not (run / PREVIEW).exists()
 
 
 @pytest.fixture
 def gated(run: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
-    """The address of `lapgs view` in a process that cannot import torch yet, and the file that lets it."""
+    """Start `lapgs view` without torch; return its address and the file that lets torch be imported."""
     gate = tmp_path / "gate"
     command = [sys.executable, "-c", COMMAND, "view", str(run), "--device", "cpu", "--port", "8970", str(gate)]
-    keep_preview_of(run, "cpu")
+    save_run_preview(run, "cpu")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         assert process.stdout is not None
@@ -158,7 +158,7 @@ def gated(run: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
         process.communicate()
 
 
-def test_it_comes_before_torch_and_goes_with_the_first_picture(run: Path, gated: tuple[str, Path]) -> None:
+def test_the_preview_precedes_torch_and_ends_with_the_first_picture(run: Path, gated: tuple[str, Path]) -> None:
     address, gate = gated
     with Image.open(run / PREVIEW) as stored:
         middle = np.asarray(stored, np.float64)[:, 200:1000]  # 4:3 of 1200x600
@@ -167,7 +167,7 @@ def test_it_comes_before_torch_and_goes_with_the_first_picture(run: Path, gated:
         assert client.listen(PATIENCE, pictures=1) == 1
         # Mean over the picture, 8 bits, for a JPEG of a JPEG; worst seen 0.51.
         assert np.abs(decoded(client.pictures[0][1]) - middle).mean() < 1.0
-        assert "As it was when it was trained; loading." in client.words
+        assert "Preview of the run; loading." in client.words
 
     with wire_client(address, WINDOW) as first, wire_client(address, WINDOW) as second:
         gets_it(first)

@@ -1,7 +1,7 @@
-"""A client of viser's web socket without a browser: it says where its camera is, and gets pictures.
+"""A client of viser's web socket without a browser: it sends its camera and receives pictures.
 
-What goes over the wire: to the server, one message, MessagePack; from it, two sizes (little endian, 8 bytes each), then
-MessagePack that is compressed with Zstandard, a list of messages in it.
+To the server go single messages in MessagePack. From it come two sizes (little endian, 8 bytes each) and a list of
+messages in MessagePack, compressed with Zstandard.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class WireClient:
 
     Attributes:
         size: (width, height) of its window.
-        pictures: JPEG files that came, in their order, with the time they came at by time.perf_counter().
-        words: Markdown texts and labels that came.
+        pictures: received JPEG files in order, each with its time by time.perf_counter().
+        words: received Markdown texts and labels.
     """
 
     connection: ClientConnection
@@ -34,7 +34,7 @@ class WireClient:
     words: list[str] = field(default_factory=list)
 
     def look_from(self, x: float, y: float, z: float) -> None:
-        """Stand there, looking along +z with y down."""
+        """Move the camera there, looking along +z with y down."""
         width, height = self.size
         message = {
             **{"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (x, y, z), "fov": 0.9, "near": 0.01, "far": 1000.0},
@@ -48,7 +48,7 @@ class WireClient:
         self.connection.send(msgspec.msgpack.encode({**message, "type": "ViewerCameraMessage"}))
 
     def listen(self, seconds: float, pictures: int | None = None) -> int:
-        """Take what comes for so long, or until so many pictures have come; how many did."""
+        """Receive for so many seconds, or until so many pictures have arrived; return the number of pictures."""
         deadline, before = time.perf_counter() + seconds, len(self.pictures)
         while (left := deadline - time.perf_counter()) > 0:
             try:
@@ -79,7 +79,7 @@ def _messages(raw: bytes | str) -> list[dict[str, Any]]:
 
 @contextmanager
 def wire_client(address: str, size: tuple[int, int] = (320, 240)) -> Iterator[WireClient]:
-    """Connect as the page would, until the block ends."""
+    """Connect as the page does, until the block ends."""
     with connect(
         address.replace("http:", "ws:"),
         subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]  # a NewType of str

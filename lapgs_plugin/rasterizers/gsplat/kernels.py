@@ -1,7 +1,7 @@
-"""What is done for each Gaussian before and after gsplat's own kernels, in Triton.
+"""Compute activations, colours and their gradients around gsplat's kernels, in Triton.
 
-As PyTorch operations the activations, colours and gradients of one render are some forty launches, and at 800x533 a
-processor launches for longer than a GPU computes.
+As PyTorch operations they would be dozens of launches per render, and for small images launching takes longer than
+computing.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-GAUSSIANS = 128
-"""In a block. A row of 4 threads takes one: its 3 channels and, which is what Triton's powers of 2 cost, nothing."""
+BLOCK = 128
+"""Gaussians in a block. Each takes 4 threads, of which 3 have a channel: Triton's sizes are powers of 2."""
 
-# Compiled anew, for half a second each, is what differs in the number of coefficients alone: the degree in use grows
-# while a stage is trained, and bases and residuals come by turns.
-OF_ANY_VALUE = ("n", "cameras", "active", "signed")
+# Kernels are only compiled anew for another number of coefficients: the active degree grows during a stage, and bases
+# and residuals alternate.
+NOT_SPECIALIZED = ("n", "cameras", "active", "signed")
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911, PLR0912  # a return for each k, of which Triton compiles one
-    """The k-th real spherical harmonic of a unit direction, in the order and with the signs of 3DGS."""
+    """Return the k-th real spherical harmonic of a unit direction, in the order and with the signs of 3DGS."""
     xx, yy, zz = x * x, y * y, z * z
     if k == 0:
         return 0.28209479177387814 + 0.0 * x
@@ -61,7 +61,7 @@ def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tens
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _basis_x(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """The derivative of `_basis` by x."""
+    """Return the derivative of `_basis` by x."""
     xx, yy, zz = x * x, y * y, z * z
     if k == 3:
         return -0.4886025119029199 + 0.0 * x
@@ -92,7 +92,7 @@ def _basis_x(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _basis_y(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """The derivative of `_basis` by y."""
+    """Return the derivative of `_basis` by y."""
     xx, yy, zz = x * x, y * y, z * z
     if k == 1:
         return -0.4886025119029199 + 0.0 * x
@@ -123,7 +123,7 @@ def _basis_y(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """The derivative of `_basis` by z."""
+    """Return the derivative of `_basis` by z."""
     xx, yy, zz = x * x, y * y, z * z
     if k == 2:
         return 0.4886025119029199 + 0.0 * x
@@ -147,8 +147,8 @@ def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _towards(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.tensor) -> tl.tensor:
-    """Unit directions x, y, z from the camera's centre, and one over the distances."""
+def _view_directions(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.tensor) -> tl.tensor:
+    """Return unit directions x, y, z from the camera's centre, and one over the distances."""
     x = tl.load(means + 3 * rows, there, 1.0) - tl.load(centre)
     y = tl.load(means + 3 * rows + 1, there, 1.0) - tl.load(centre + 1)
     z = tl.load(means + 3 * rows + 2, there, 1.0) - tl.load(centre + 2)
@@ -157,15 +157,15 @@ def _towards(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.ten
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _colored(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, rows: tl.tensor, channel: tl.tensor, shown: tl.tensor,
+def _block_colors(
+    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, rows: tl.tensor, channel: tl.tensor, visible: tl.tensor,
     active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
-    """Colours (g, 4) of a block, the last channel of no meaning."""
-    x, y, z, _ = _towards(means, centre, rows, shown)
+    """Return colours (g, 4) of a block; the last channel is meaningless."""
+    x, y, z, _ = _view_directions(means, centre, rows, visible)
     color = tl.zeros((block, 4), tl.float32)
     for k in tl.static_range(coefficients):
-        wanted = shown & (channel < 3) & (k < active)
+        wanted = visible & (channel < 3) & (k < active)
         color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
     return tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
 
@@ -182,32 +182,32 @@ def _activate_kernel(
         tl.store(scales + places, tl.exp(tl.load(log_scales + places, places < 3 * n, 0.0)), places < 3 * n)
 
 
-@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _color_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, pixels: tl.tensor,
-    colors: tl.tensor, shown_radii: tl.tensor, shown_pixels: tl.tensor,
+    colors: tl.tensor, visible_radii: tl.tensor, visible_pixels: tl.tensor,
     n: int, cameras: int, active: int, signed: int,
     coefficients: tl.constexpr, describes: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    # Cameras of one block follow each other, so that its coefficients are still in the cache.
+    # Cameras of one block are consecutive, so that its coefficients are still in the cache.
     camera = tl.program_id(0) % cameras
     rows = tl.program_id(0) // cameras * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
     here = rows < n
-    seen = rows + camera.to(tl.int64) * n  # in what there is of every camera
+    seen = rows + camera.to(tl.int64) * n  # in tensors with a row for every camera
     across, down = tl.load(radii + 2 * seen, here, 0), tl.load(radii + 2 * seen + 1, here, 0)
-    shown = (across > 0) & (down > 0)
-    color = _colored(means, centre + 3 * camera, sh, rows, channel, shown, active, signed, coefficients, block)
+    visible = (across > 0) & (down > 0)
+    color = _block_colors(means, centre + 3 * camera, sh, rows, channel, visible, active, signed, coefficients, block)
     tl.store(colors + seen * 3 + channel, color, here & (channel < 3))
     if describes:
-        tl.store(shown_radii + seen, tl.where(shown, tl.maximum(across, down), 0), here)
+        tl.store(visible_radii + seen, tl.where(visible, tl.maximum(across, down), 0), here)
         for side in tl.static_range(2):
-            centred = tl.load(pixels + 2 * seen + side, shown, 0.5) - 0.5
-            tl.store(shown_pixels + 2 * seen + side, centred, here)
+            centred = tl.load(pixels + 2 * seen + side, visible, 0.5) - 0.5
+            tl.store(visible_pixels + 2 * seen + side, centred, here)
 
 
-@triton.jit(do_not_specialize=(*OF_ANY_VALUE, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
-def _place_kernel(
+@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _stack_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor,
     radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, conics: tl.tensor,
     all_radii: tl.tensor, all_pixels: tl.tensor, all_depths: tl.tensor, all_conics: tl.tensor, all_colors: tl.tensor,
@@ -218,8 +218,8 @@ def _place_kernel(
     here, pair, triple = rows < n, (rows < n) & (channel < 2), (rows < n) & (channel < 3)
     placed = rows + start
     across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
-    shown = (across > 0) & (down > 0)
-    color = _colored(means, centre, sh, rows, channel, shown, active, signed, coefficients, block)
+    visible = (across > 0) & (down > 0)
+    color = _block_colors(means, centre, sh, rows, channel, visible, active, signed, coefficients, block)
     tl.store(all_colors + 3 * placed + channel, color, triple)
     tl.store(all_radii + 2 * placed + channel, tl.load(radii + 2 * rows + channel, pair, 0), pair)
     tl.store(all_pixels + 2 * placed + channel, tl.load(pixels + 2 * rows + channel, pair, 0.0), pair)
@@ -227,7 +227,7 @@ def _place_kernel(
     tl.store(all_depths + placed, tl.load(depths + rows, here, 0.0), here)
 
 
-@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _gradient_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
     scales: tl.tensor, opacities: tl.tensor,
@@ -239,103 +239,103 @@ def _gradient_kernel(
     here, in_channel = rows < n, (rows < n) & (channel < 3)
     of_opacity = tl.zeros((block, 1), tl.float32)
     for camera in range(cameras):
-        seen = rows + camera * n.to(tl.int64)  # in what there is of every camera
-        shown = (tl.load(radii + 2 * seen, here, 0) > 0) & (tl.load(radii + 2 * seen + 1, here, 0) > 0)
-        x, y, z, inverse = _towards(means, centre + 3 * camera, rows, shown)
-        flow = tl.load(by_color + 3 * seen + channel, shown & (channel < 3), 0.0)  # (g, 4)
-        color = tl.load(colors + 3 * seen + channel, shown & (channel < 3), 0.0)
+        seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
+        visible = (tl.load(radii + 2 * seen, here, 0) > 0) & (tl.load(radii + 2 * seen + 1, here, 0) > 0)
+        x, y, z, inverse = _view_directions(means, centre + 3 * camera, rows, visible)
+        flow = tl.load(by_color + 3 * seen + channel, visible & (channel < 3), 0.0)  # (g, 4)
+        color = tl.load(colors + 3 * seen + channel, visible & (channel < 3), 0.0)
         flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
         along_x, along_y, along_z = tl.zeros_like(flow), tl.zeros_like(flow), tl.zeros_like(flow)
         first = camera == 0
         for k in tl.static_range(coefficients):
             there = (rows * coefficients + k) * 3 + channel
             used = tl.where(k < active, flow, 0.0)
-            # Of the cameras before; the first one writes every row, later ones what they show.
-            before = tl.load(by_sh + there, shown & (channel < 3) & (camera > 0), 0.0)
-            tl.store(by_sh + there, before + _basis(k, x, y, z) * used, in_channel & (shown | first))
-            weighed = used * tl.load(sh + there, shown & (channel < 3) & (k < active), 0.0)
-            along_x += _basis_x(k, x, y, z) * weighed
-            along_y += _basis_y(k, x, y, z) * weighed
-            along_z += _basis_z(k, x, y, z) * weighed
+            # Sum of the previous cameras; the first camera writes every row, later ones those that are visible.
+            before = tl.load(by_sh + there, visible & (channel < 3) & (camera > 0), 0.0)
+            tl.store(by_sh + there, before + _basis(k, x, y, z) * used, in_channel & (visible | first))
+            weighted = used * tl.load(sh + there, visible & (channel < 3) & (k < active), 0.0)
+            along_x += _basis_x(k, x, y, z) * weighted
+            along_y += _basis_y(k, x, y, z) * weighted
+            along_z += _basis_z(k, x, y, z) * weighted
         if coefficients > 1:
             in_x = tl.sum(along_x, 1)[:, None]
             in_y = tl.sum(along_y, 1)[:, None]
             in_z = tl.sum(along_z, 1)[:, None]
-            radial = in_x * x + in_y * y + in_z * z  # a direction does not change along itself
+            radial = in_x * x + in_y * y + in_z * z  # moving along the direction does not change it
             mean = by_mean + 3 * rows
-            tl.store(mean, tl.load(mean, shown, 0.0) + (in_x - radial * x) * inverse, shown)
-            tl.store(mean + 1, tl.load(mean + 1, shown, 0.0) + (in_y - radial * y) * inverse, shown)
-            tl.store(mean + 2, tl.load(mean + 2, shown, 0.0) + (in_z - radial * z) * inverse, shown)
+            tl.store(mean, tl.load(mean, visible, 0.0) + (in_x - radial * x) * inverse, visible)
+            tl.store(mean + 1, tl.load(mean + 1, visible, 0.0) + (in_y - radial * y) * inverse, visible)
+            tl.store(mean + 2, tl.load(mean + 2, visible, 0.0) + (in_z - radial * z) * inverse, visible)
         of_opacity += tl.load(by_opacity + seen, here, 0.0)
-        tl.debug_barrier()  # the next camera's threads read what others of this block have written
+        tl.debug_barrier()  # the next camera's threads read values that others of this block wrote
     there = 3 * rows + channel
     tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
     opacity = tl.load(opacities + rows, here, 0.0)
     tl.store(by_opacity + rows, of_opacity * opacity * (1.0 - opacity), here)
 
 
-def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor]:
-    """exp (n, 3) and sigmoid (n,) in one kernel; contiguous float32, as all that follows."""
+def activate(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Return exp (n, 3) and sigmoid (n,) in one kernel; all tensors of this module are contiguous float32."""
     scales, opacities = torch.empty_like(log_scales), torch.empty_like(opacity_logits)
     _launch(_activate_kernel, len(scales), (log_scales, opacity_logits, scales, opacities))
     return scales, opacities
 
 
-def colors_of_shown(
+def visible_colors(
     means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours of the Gaussians that each of c cameras shows, and what densification looks at.
+    """Return the colours of Gaussians that are visible to c cameras, and their radii and centres.
 
     Args:
         means: (n, 3).
         centre: (c, 3) of the cameras.
         sh: (n, k, 3).
         degree: highest to evaluate.
-        signed: whether colours are the raw values.
+        signed: whether colours are the raw SH values.
         radii: (c, n, 2) gsplat's, int32; 0 where culled.
-        pixels: (c, n, 2) gsplat's centres, or None where nobody looks at them.
+        pixels: (c, n, 2) gsplat's centres; None if radii and centres are not needed.
 
     Returns:
-        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as `RenderResult` has them, both empty
-        where `pixels` is None.
+        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as in `RenderResult`, both empty if
+        `pixels` is None.
     """
     (cameras, n), describes = radii.shape[:2], pixels is not None
     colors = means.new_empty(cameras, n, 3)
-    shown_radii = radii.new_empty(cameras, n if describes else 0)
-    shown_pixels = means.new_empty(cameras, n if describes else 0, 2)
+    visible_radii = radii.new_empty(cameras, n if describes else 0)
+    visible_pixels = means.new_empty(cameras, n if describes else 0, 2)
     _launch(
         _color_kernel,
         n,
-        (means, centre, sh, radii, means if pixels is None else pixels, colors, shown_radii, shown_pixels),
+        (means, centre, sh, radii, means if pixels is None else pixels, colors, visible_radii, visible_pixels),
         (cameras, (degree + 1) ** 2, int(signed)),
         programs=cameras,
         coefficients=sh.shape[1],
         describes=describes,
     )
-    return colors, shown_radii, shown_pixels
+    return colors, visible_radii, visible_pixels
 
 
-def place_seen(
+def write_to_stack(
     means: Tensor,
     centre: Tensor,
     sh: Tensor,
     signed: bool,
-    found: Sequence[Tensor],
-    placed: Sequence[Tensor],
+    projected: Sequence[Tensor],
+    stacked: Sequence[Tensor],
     start: int,
 ) -> None:
-    """Put what a camera sees of one field, and its colours, where the fields of a view are in one list.
+    """Write one field's projection and colours to the tensors of a stack of fields.
 
     Args:
-        means, sh, signed: as `colors_of_shown` takes them; all coefficients are evaluated.
+        means, sh, signed: as `visible_colors` takes them; all coefficients are evaluated.
         centre: (3,) of the camera.
-        found: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
-        placed: the same of all fields, and colours (m, 3); written from row `start` on.
+        projected: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
+        stacked: the same of all fields, and colours (m, 3); written from row `start` on.
     """
     _launch(
-        _place_kernel,
+        _stack_kernel,
         len(means),
-        (means, centre, sh, *found, *placed),
+        (means, centre, sh, *projected, *stacked),
         (sh.shape[1], int(signed), start),
         coefficients=sh.shape[1],
     )
@@ -345,14 +345,15 @@ def finish_gradients(
     means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
     scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
 ) -> Tensor:  # fmt: skip
-    """The gradient by SH (n, k, 3), summed over c cameras; others become by mean, logarithm and logit in place.
+    """Return the gradient by SH (n, k, 3), summed over c cameras, and complete the other gradients in place.
 
     Args:
-        means, centre, sh, degree, signed, radii: as `colors_of_shown` took them.
-        colors: what it gave.
-        scales, opacities: what `activated` gave.
+        means, centre, sh, degree, signed, radii: arguments of `visible_colors`.
+        colors: its result.
+        scales, opacities: results of `activate`.
         by_color: (c, n, 3) gradients of each camera.
-        by_mean, by_scale: (n, 3) gradients, summed over cameras; by_mean without the way over the direction of view.
+        by_mean: (n, 3) gradient summed over cameras; the part through the view direction is added.
+        by_scale: (n, 3) gradient summed over cameras; becomes that by logarithms.
         by_opacity: (c, n) of each camera; the first row becomes the sum by logits.
     """
     by_sh = torch.empty_like(sh)
@@ -369,5 +370,5 @@ def finish_gradients(
 def _launch(
     kernel: Any, n: int, given: tuple[Tensor, ...], numbers: tuple[int, ...] = (), programs: int = 1, **constants: int
 ) -> None:
-    """Start a kernel with so many programs for each block of Gaussians."""
-    kernel[(triton.cdiv(n, GAUSSIANS) * programs,)](*given, n, *numbers, block=GAUSSIANS, **constants)
+    """Start a kernel with `programs` programs for each block of Gaussians."""
+    kernel[(triton.cdiv(n, BLOCK) * programs,)](*given, n, *numbers, block=BLOCK, **constants)

@@ -1,6 +1,6 @@
-"""What training took, from the records of a run's levels: for metrics.json and for rows of experiments alike.
+"""Sum up the records of a run's levels, for metrics.json and for rows of experiments.
 
-Needs nothing but the records, so that experiments can be gathered where no image can be read.
+Imports nothing that reads images, so that experiments can be gathered where no image can be read.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from lapgs_plugin.runs.archive import LevelRecord
 
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
-    """Figures of finished levels as JSON, with levels as text because JSON has no other keys.
+    """Return the figures of finished levels as JSON, with levels as text as JSON requires.
 
     Keys:
-        train_seconds: iterative optimization over all stages; overhead_seconds: everything else, by name.
-        breakdown_seconds: of the optimization by part (`breakdown.PARTS`); empty unless all levels were broken down.
-        num_gaussians: by level, of the fields that the finest picture is rendered from: of nested levels the last.
-        peak_gaussians: the most that were optimized at once.
-        weighted_gaussians: those of every level weighted by its iterations, as the paper's plot of time against count.
-        mean_gaussians: those being optimized, mean over all iterations; None when not recorded.
-        peak_memory_bytes, peak_memory_without_images_bytes: of the GPU in training, the highest stage; None on a CPU.
+        train_seconds: seconds of optimization over all stages; overhead_seconds: all other seconds, by name.
+        breakdown_seconds: seconds of the optimization by part (`breakdown.PARTS`); empty unless all levels have them.
+        num_gaussians: by level, Gaussians of the fields that the image is rendered from; of nested levels the last.
+        peak_gaussians: the most that were optimized at a time.
+        weighted_gaussians: mean of the levels' Gaussians, weighted by iterations, as in the paper's plot of time.
+        mean_gaussians: Gaussians being optimized, mean over all iterations; None when not recorded.
+        peak_memory_bytes, peak_memory_without_images_bytes: GPU memory of the highest stage; None on a CPU.
     """
     iterations = [record.iterations for record in records]
     means = [record.mean_gaussians for record in records if record.mean_gaussians is not None]
@@ -42,12 +42,12 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
 
 
 def _rendered(records: Sequence[LevelRecord]) -> Sequence[LevelRecord]:
-    """The last field that makes an image by itself, and the residuals that are added to it."""
+    """Select the last field that renders a whole image, and the residuals that are added to it."""
     return records[max((index for index, record in enumerate(records) if not record.signed), default=0) :]
 
 
 def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Each name's values added up."""
+    """Add up the values of each name."""
     total: dict[str, float] = {}
     for each in parts:
         for name, value in each.items():

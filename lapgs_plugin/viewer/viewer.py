@@ -1,4 +1,4 @@
-"""The viewer: the clients of a page, and whoever draws for all of them."""
+"""Draw for all clients of a page."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ import viser
 
 from lapgs_plugin.rendering.rig import Vector
 from lapgs_plugin.viewer.page import Page
-from lapgs_plugin.viewer.session import Exhibit, Pace, Session
-from lapgs_plugin.viewer.start import Start
+from lapgs_plugin.viewer.poses import InitialView
+from lapgs_plugin.viewer.session import PictureBudget, Session, ViewerContent
 
 logger = logging.getLogger(__name__)
 
 
 class Viewer:
-    """Draws for any number of browsers, one picture after the other, in the thread that asks it to.
+    """Draws for any number of clients, one picture after the other, in the calling thread.
 
     Args:
-        page: that they load; clients may have loaded it already.
-        pace: of their pictures.
+        page: the page; clients may be connected already.
+        budget: limits of the pictures.
     """
 
-    def __init__(self, page: Page, pace: Pace | None = None) -> None:
-        self._page, self._pace = page, pace or Pace()
+    def __init__(self, page: Page, budget: PictureBudget | None = None) -> None:
+        self._page, self._budget = page, budget or PictureBudget()
         self._sender = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lapgs-jpeg")
-        self._exhibit: Exhibit | None = None
-        self._start: Start | None = None
+        self._content: ViewerContent | None = None
+        self._start: InitialView | None = None
         self._sessions: dict[int, Session] = {}
         self._awake = threading.Condition()
         page.server.on_client_connect(self._connect)
         page.server.on_client_disconnect(self._disconnect)
 
-    def begin_at(self, start: Start) -> None:
-        """Let clients begin there, and those that are connected come there."""
+    def set_initial_view(self, start: InitialView) -> None:
+        """Set the view that new clients begin with, and move connected clients there."""
         server = self._page.server
         server.scene.set_up_direction(start.up)
         first = server.initial_camera
@@ -47,28 +47,28 @@ class Viewer:
             self._start = start
             sessions = list(self._sessions.values())
         for session in sessions:
-            session.stand_at(start)
+            session.move_to(start)
 
-    def show(self, exhibit: Exhibit) -> None:
-        """Show this from the next picture on."""
+    def show(self, content: ViewerContent) -> None:
+        """Show this content from the next picture on."""
         with self._awake:
-            self._exhibit = exhibit
+            self._content = content
             for session in self._sessions.values():
-                session.show(exhibit)
+                session.show(content)
             self._awake.notify()
 
-    def forget(self) -> None:
-        """Let go of what was shown: nothing is drawn until there is something else."""
+    def clear(self) -> None:
+        """Drop the content; nothing is drawn until there is a new one."""
         with self._awake:
-            self._exhibit = None
+            self._content = None
             for session in self._sessions.values():
-                session.forget()
+                session.clear()
 
     def serve(self, stop: threading.Event | None = None, at_rest: Callable[[], None] | None = None) -> None:
-        """Draw for whoever is connected, until `stop` is set or the process is interrupted.
+        """Draw for all clients until `stop` is set or the process is interrupted.
 
         Args:
-            at_rest: called once, when somebody has been drawn for and nobody waits for more.
+            at_rest: called once, when pictures were drawn and none is needed.
         """
         drawn = False
         while stop is None or not stop.is_set():
@@ -79,7 +79,7 @@ class Viewer:
                 at_rest = None
 
     def draw_next(self, patience: float) -> bool:
-        """Draw for who has waited longest; False when nobody wanted a picture for `patience` seconds."""
+        """Draw for the client that has waited longest; False when none needed a picture for `patience` seconds."""
         session = self._next_session(patience)
         if session is not None:
             self._draw(session)
@@ -87,11 +87,11 @@ class Viewer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected."""
+        """Whether a client is connected."""
         return bool(self._sessions)
 
     def _draw(self, session: Session) -> None:
-        """One client's picture; what goes wrong with it, such as too little memory, ends that client alone."""
+        """Draw one client's picture; an error, such as too little memory, ends this client alone."""
         self._page.end_preview()
         try:
             session.draw()
@@ -101,7 +101,7 @@ class Viewer:
                 self._sessions = {each: other for each, other in self._sessions.items() if other is not session}
 
     def _next_session(self, patience: float) -> Session | None:
-        """Who has waited longest for a picture; None when nobody wanted one for `patience` seconds."""
+        """Return the client that has waited longest; None when none needed a picture for `patience` seconds."""
         deadline = time.perf_counter() + patience
         with self._awake:
             while True:
@@ -115,21 +115,21 @@ class Viewer:
                 self._awake.wait(min(due, deadline) - now)
 
     def _connect(self, client: viser.ClientHandle) -> None:
-        session = Session(client, self._pace, self._sender, self._wake)
+        session = Session(client, self._budget, self._sender, self._wake)
         with self._awake:
             self._sessions[client.client_id] = session
-            if self._exhibit is not None:
-                session.show(self._exhibit)
+            if self._content is not None:
+                session.show(self._content)
             start = self._start
         if start is not None:
-            session.stand_at(start)
+            session.move_to(start)
         self._wake()
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
         with self._awake:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
-            session.leave()
+            session.disconnect()
 
     def _wake(self) -> None:
         with self._awake:

@@ -1,14 +1,14 @@
-"""Several fields seen by one camera in one set of gsplat's launches, each at a size of its own.
+"""Render several fields from one camera in one set of gsplat's launches, each at its own size.
 
-Up to some two megapixels a field takes a GPU less time than the processor needs to launch its dozen kernels. So the
-fields of a view are sorted into tiles and blended together, as if they were the images of several cameras: Gaussians of
-all fields lie in one list, which gsplat calls packed, with the number of its image beside each.
+For small images launching a field's kernels takes longer than running them. So the fields of a view are sorted into
+tiles and blended together, as if they were images of several cameras: the Gaussians of all fields are in one list,
+which gsplat calls packed, each with the number of its image.
 
-Projection alone stays one launch a field. By the size of the image gsplat culls, and limits the Jacobian: a coarse
-field projected for the canvas of a finer one would look different near its border, and all that is right of its image
-and below would be blended for nobody. That is why this is not `gsplat.rasterization` with one dimension more.
+Only projection takes a launch for each field. gsplat culls and limits the Jacobian by the image size, so that a coarse
+field projected for the canvas of a finer one would differ near its border and be blended outside its image as well.
+Hence this is not `gsplat.rasterization` with one more dimension.
 
-Tested with gsplat 1.5.3, whose `rasterization` is made of the same five functions.
+Tested with gsplat 1.5.3, whose `rasterization` consists of the same five functions.
 """
 
 from __future__ import annotations
@@ -22,27 +22,28 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.rasterizers import gsplat_direct
-from lapgs_plugin.rasterizers.gsplat import cameras_on_device
-from lapgs_plugin.rasterizers.gsplat_direct import TILE
+from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
+from lapgs_plugin.rasterizers.gsplat.direct import TILE
 from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
 
 
 class GsplatStack:
-    """Fields on a device, one after the other in one tensor of each kind, activated; see `raster.FieldStack`.
-
-    They are copies: what becomes of `fields` later is not seen.
+    """Hold activated copies of fields on a device, concatenated in one tensor per parameter; see `FieldStack`.
 
     Args:
-        fields: float32, wherever they are.
-        device: where they are rendered.
+        fields: float32, on any device. Later changes to them have no effect.
+        device: that renders.
         antialiased: dim Gaussians that are smaller than a pixel.
+        direct: call gsplat's kernels directly, see `direct`; not with `antialiased`.
     """
 
-    def __init__(self, fields: Sequence[GaussianField], device: torch.device, *, antialiased: bool = False) -> None:
+    def __init__(
+        self, fields: Sequence[GaussianField], device: torch.device, *, antialiased: bool = False, direct: bool = False
+    ) -> None:
         self._antialiased = antialiased
         self._signed = [field.signed for field in fields]
-        self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field in the list, and its end
+        self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field, and the end
         self._means = _joined([field.means for field in fields], device)  # (n, 3)
         self._quaternions = _joined([field.quaternions for field in fields], device)  # (n, 4)
         self._scales = _joined([field.log_scales for field in fields], device).exp_()  # (n, 3)
@@ -50,7 +51,7 @@ class GsplatStack:
         self._sh = _joined([field.sh for field in fields], device)  # (n, k, 3)
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
-        self._direct = device.type == "cuda" and not antialiased and gsplat_direct.works()
+        self._direct = direct
         parts = self._means, self._quaternions, self._scales, self._opacities, self._sh
         self._parts = [[part[self._rows(i)] for part in parts] for i in range(len(fields))]
         if device.type == "cuda":
@@ -58,16 +59,16 @@ class GsplatStack:
 
     @torch.no_grad()
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
-        """Images of the first fields; see `raster.FieldStack.render`."""
+        """Render the first fields; see `fields.rasterizer.FieldStack.render`."""
         height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
         viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
         if self._starts[len(cameras)] == 0:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
-            with torch.cuda.device(self._means.device):  # Triton launches on the current one
-                projected, colors = self._see_directly(cameras, viewmats, intrinsics, positions[0])
+            with torch.cuda.device(self._means.device):  # Triton launches on the current device
+                projected, colors = self._project_directly(cameras, viewmats, intrinsics, positions[0])
                 count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
-                images, alphas, *_ = gsplat_direct.blend(
+                images, alphas, *_ = direct.blend(
                     projected, colors, self._opacities[:count], None, size, len(cameras), of_image
                 )
         else:
@@ -84,11 +85,11 @@ class GsplatStack:
     def _rows(self, index: int) -> slice:
         return slice(self._starts[index], self._starts[index + 1])
 
-    def _see_directly(
+    def _project_directly(
         self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """What `_project` and `_colors` give, but for opacities, in two launches a field."""
-        from lapgs_plugin.rasterizers.gsplat_triton import place_seen
+        """Return the results of `_project`, without opacities, and of `_colors` in two launches per field."""
+        from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
 
         count, like = self._starts[len(cameras)], self._means
         radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
@@ -98,13 +99,13 @@ class GsplatStack:
             if len(means) == 0:
                 continue  # gsplat divides by their number
             pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], (camera.width, camera.height)
-            found = gsplat_direct.project(means, quaternions, scales, opacities, pose, matrix, size)
-            placed = radii, means2d, depths, conics, colors
-            place_seen(means, position, sh, self._signed[i], found, placed, self._starts[i])
+            projected = direct.project(means, quaternions, scales, opacities, pose, matrix, size)
+            stacked = radii, means2d, depths, conics, colors
+            write_to_stack(means, position, sh, self._signed[i], projected, stacked, self._starts[i])
         return [radii, means2d, depths, conics], colors
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
-        """Radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields' n."""
+        """Return radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields."""
         from gsplat import fully_fused_projection
 
         fields = []
@@ -132,7 +133,7 @@ class GsplatStack:
         return [*joined[:4], opacities * joined[4] if self._antialiased else opacities]
 
     def _colors(self, positions: Tensor) -> Tensor:
-        """(n, 3) of the first fields from the one place that all cameras, as many as `positions` (f, 3), have."""
+        """Return colours (n, 3) of the first f fields, seen from `positions` (f, 3), which are all the same."""
         from gsplat import spherical_harmonics
 
         count = self._starts[len(positions)]
@@ -146,20 +147,20 @@ class GsplatStack:
     def _blend(
         self, projected: Sequence[Tensor], colors: Tensor, count: int, size: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
-        """Colours (f, h, w, 3) and opacities (f, h, w, 1) of `count` images of one size (h, w)."""
+        """Return colours (f, h, w, 3) and opacities (f, h, w, 1) of `count` images of one size (h, w)."""
         from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
         radii, means2d, depths, conics, opacities = projected
         height, width = size
         columns, rows = -(-width // TILE), -(-height // TILE)
         of_image = self._images[: len(depths)]
-        # It asks for the number of each Gaussian, too, and makes no use of it.
+        # gsplat also takes the index of each Gaussian, but does not use it.
         _, keys, order = isect_tiles(
             means2d, radii, depths, TILE, columns, rows,
             packed=True, n_images=count, image_ids=of_image, gaussian_ids=of_image,
         )  # fmt: skip
         offsets = isect_offset_encode(keys, count, columns, rows)  # (f, rows, columns)
-        # No backgrounds: 1.5.3 takes one for all images of a packed list, not one for each.
+        # Without backgrounds: for a packed list gsplat 1.5.3 takes one background, not one per image.
         images, alphas = rasterize_to_pixels(
             means2d, conics, colors, opacities, width, height, TILE, offsets, order, packed=True
         )
@@ -167,12 +168,12 @@ class GsplatStack:
 
 
 def _joined(values: Sequence[Tensor], device: torch.device) -> Tensor:
-    """(n_i, ...) of several fields as (n, ...) on `device`; those with fewer SH coefficients are filled with zeros."""
+    """Concatenate (n_i, ...) of several fields to (n, ...) on `device`; missing SH coefficients are zeros."""
     shape = [max(value.shape[axis] for value in values) for axis in range(1, values[0].ndim)]
     joined = torch.zeros(sum(len(value) for value in values), *shape, device=device)
     start = 0
     for value in values:
-        # One by one into their places: brought there first and then joined, all would be there twice for a while.
+        # One by one into one tensor: torch.cat of copies on the device would take twice the memory.
         joined[(slice(start, start + len(value)), *map(slice, value.shape[1:]))] = value.detach()
         start += len(value)
     return joined

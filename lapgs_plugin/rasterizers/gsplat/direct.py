@@ -1,0 +1,263 @@
+"""Render one view, or several of one size, by calling gsplat's compiled kernels directly.
+
+`gsplat.rasterization` is a chain of five differentiable functions with PyTorch operations between them. For small
+images its launches take more time than its kernels. Here a render is one autograd node: gsplat's kernels for
+projection, tiles and blending, and three of our own (`kernels`) for the rest. Several views take as many launches as
+one.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
+from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
+from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
+
+TILE = 16
+FAR_PLANE = 1e10
+
+
+class Intermediates(NamedTuple):
+    """Intermediate results of a render, which the backward pass needs; n Gaussians, c cameras."""
+
+    radii: Tensor  # (c, n, 2)
+    means2d: Tensor  # (c, n, 2)
+    depths: Tensor  # (c, n)
+    conics: Tensor  # (c, n, 3)
+    colors: Tensor  # (c, n, 3)
+    scales: Tensor  # (n, 3)
+    opacities: Tensor  # (c, n), equal for all cameras
+    offsets: Tensor  # (c, tiles down, tiles across)
+    flat: Tensor  # Gaussian of each pair with a tile
+    alphas: Tensor  # (c, h, w, 1)
+    last: Tensor  # (c, h, w)
+    visible_radii: Tensor  # (c, n) the larger of both, 0 where culled
+    centres: Tensor  # (c, n, 2) as in `RenderResult.means2d`
+
+
+GradientTargets = list[weakref.ref[Tensor]]
+"""Tensors to which a backward pass writes its gradients by centres and their absolute values, (n, 2) or (c, n, 2) each.
+
+References are weak, so that nothing is written for a result that was dropped, and no reference cycle arises.
+"""
+
+
+def render(
+    field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int, *, absgrad: bool, own_radii: bool
+) -> RenderResult:
+    """Render a field of at least one Gaussian, float32 on the device.
+
+    Args:
+        field: on the cameras' device.
+        cameras: one or several; for several, tensors of the result have a leading dimension.
+        background: (3,).
+        degree: highest SH degree to evaluate.
+        absgrad: fill in `RenderResult.absgrad2d` in the backward pass.
+        own_radii: as in `GsplatRasterizer`.
+    """
+    differentiated = is_differentiated(field)
+    absgrad = absgrad and differentiated
+    image, found, targets = _render(field, cameras, background, degree, describes=True, absgrad=absgrad)
+    radii, means2d, conics = found.visible_radii, found.centres, found.conics
+    if len(cameras.poses) == 1:
+        radii, means2d, conics = radii[0], means2d[0], conics[0]
+    with torch.no_grad():
+        if not own_radii:
+            radii = torch.where(radii > 0, three_sigma_radii(conics), 0).to(torch.int32)
+    means2d.requires_grad_(differentiated)
+    absgrad2d = means2d.new_zeros(means2d.shape) if absgrad else None
+    targets += [weakref.ref(tensor) for tensor in (means2d, absgrad2d) if tensor is not None]
+    return RenderResult(image, None, radii, means2d, absgrad2d)
+
+
+def render_images(field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int) -> Tensor:
+    """Render images alone, (3, h, w) or (c, 3, h, w) of several; arguments as `render` takes them."""
+    return _render(field, cameras, background, degree, describes=False, absgrad=False)[0]
+
+
+def _render(
+    field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int, *, describes: bool, absgrad: bool
+) -> tuple[Tensor, Intermediates, GradientTargets]:
+    """Render, and return a list to which the tensors that take gradients can be added.
+
+    Args:
+        field, cameras, background, degree, absgrad: as `render` takes them.
+        describes: fill in visible radii and centres, which are empty otherwise.
+    """
+    background = _for_each_camera(background.to(field.means), len(cameras.poses))
+    parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
+    means, quaternions, log_scales, logits, sh = (value.contiguous() for value in parameters)  # kernels rely on it
+    targets: GradientTargets = []
+    with torch.cuda.device(means.device):  # Triton launches on the current device
+        if is_differentiated(field):
+            box: list[Intermediates] = []
+            options = cameras, background, degree, field.signed, describes, absgrad, box, targets
+            image: Tensor = _Render.apply(means, quaternions, log_scales, logits, sh, *options)  # type: ignore[no-untyped-call]  # torch's
+            return image, box[0], targets
+        images, found = _forward(
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes
+        )
+    return _channels_first(images), found, targets
+
+
+def _channels_first(images: Tensor) -> Tensor:
+    """View (c, h, w, 3) as (c, 3, h, w), or (3, h, w) for one camera."""
+    return images[0].permute(2, 0, 1) if len(images) == 1 else images.permute(0, 3, 1, 2)
+
+
+class _Render(torch.autograd.Function):
+    """(field, cameras) -> contiguous image (3, h, w), or images (c, 3, h, w) of several."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor,
+        cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool, absgrad: bool,
+        box: list[Intermediates], targets: GradientTargets,
+    ) -> Tensor:  # fmt: skip
+        images, found = _forward(
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, signed, describes
+        )
+        ctx.save_for_backward(means, quaternions, sh, background, *cameras[:3], *found)
+        ctx.size, ctx.degree, ctx.signed, ctx.absgrad = cameras[3:], degree, signed, absgrad
+        ctx.targets = targets
+        box.append(found)
+        return _channels_first(images).contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_image: Tensor) -> tuple[Tensor | None, ...]:
+        from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
+
+        means, quaternions, sh, background, poses, intrinsics, centres, *rest = ctx.saved_tensors
+        found, (width, height), compiled = Intermediates(*rest), ctx.size, compiled_functions()
+        by_images = by_image.movedim(-3, -1).contiguous().view(*found.alphas.shape[:-1], 3)
+        by_absolute, by_means2d, by_conics, by_colors, by_opacities = compiled.rasterize_to_pixels_3dgs_bwd(
+            found.means2d, found.conics, found.colors, found.opacities, background, None,
+            width, height, TILE, found.offsets, found.flat, found.alphas, found.last,
+            by_images, _zeros(found.alphas.shape, means.device), ctx.absgrad,
+        )  # fmt: skip
+        by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
+            means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
+            compiled.CameraModelType.PINHOLE, found.radii, found.conics, None,
+            by_means2d, _zeros(found.depths.shape, means.device), by_conics, None, False,
+        )  # fmt: skip
+        by_sh = finish_gradients(
+            means, centres, sh, ctx.degree, ctx.signed, found.radii, found.colors, found.scales, found.opacities,
+            by_colors, by_means, by_scales, by_opacities,
+        )  # fmt: skip
+        by_absolute = by_absolute if ctx.absgrad else None
+        if len(poses) == 1:
+            by_means2d, by_absolute = by_means2d[0], None if by_absolute is None else by_absolute[0]
+        _write_gradients(ctx.targets, by_means2d, by_absolute)
+        return by_means, by_quaternions, by_scales, by_opacities[0], by_sh, *[None] * 8
+
+
+def _forward(
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor,
+    cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool,
+) -> tuple[Tensor, Intermediates]:  # fmt: skip
+    """Return images (c, h, w, 3) and intermediate results; `background` is (c, 3)."""
+    from lapgs_plugin.rasterizers.gsplat.kernels import activate, visible_colors
+
+    size, count = (cameras.width, cameras.height), len(cameras.poses)
+    scales, opacities = activate(log_scales, logits)
+    projected = project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
+    radii, means2d, depths, conics = projected
+    pixels = means2d if describes else None
+    colors, visible_radii, centres = visible_colors(means, cameras.centres, sh, degree, signed, radii, pixels)
+    opacities = _for_each_camera(opacities, count)
+    images, alphas, last, offsets, flat = blend(projected, colors, opacities, background, size, count)
+    found = Intermediates(
+        radii, means2d, depths, conics, colors, scales, opacities, offsets, flat, alphas, last, visible_radii, centres
+    )
+    return images, found
+
+
+def _for_each_camera(values: Tensor, cameras: int) -> Tensor:
+    """Repeat (k,) to contiguous (c, k), without a copy for one camera."""
+    return values.expand(cameras, -1).contiguous()
+
+
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, poses: Tensor, intrinsics: Tensor,
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Return radii (c, n, 2), centres (c, n, 2), depths (c, n) and conics (c, n, 3) of one or more activated Gaussians.
+
+    Args:
+        poses, intrinsics: (c, 4, 4) and (c, 3, 3).
+        size: (width, height) of the image.
+    """
+    compiled = compiled_functions()
+    radii, means2d, depths, conics, _ = compiled.projection_ewa_3dgs_fused_fwd(
+        means, None, quaternions, scales, opacities, poses, intrinsics, *size,
+        PIXEL_VARIANCE, NEAR_DEPTH, FAR_PLANE, 0.0, False, compiled.CameraModelType.PINHOLE,
+    )  # fmt: skip
+    return radii, means2d, depths, conics
+
+
+def blend(
+    projected: Sequence[Tensor], colors: Tensor, opacities: Tensor, background: Tensor | None, size: tuple[int, int],
+    count: int = 1, of_image: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Sort Gaussians into tiles and blend them. This waits for the GPU, for the number of pairs with tiles.
+
+    Args:
+        projected: results of `project`; or, without the leading dimension, those of several images in one list.
+        colors, opacities: (count, n, 3) and (count, n), or (n, 3) and (n,) in such a list.
+        background: (count, 3), None for black.
+        size: (width, height) of all images.
+        count: number of images.
+        of_image: in a list, the image number (n,) of each Gaussian.
+
+    Returns:
+        Images (count, h, w, 3), opacities (count, h, w, 1), the last Gaussian of each pixel, the first pair of each
+        tile, and the Gaussian of each pair.
+    """
+    compiled = compiled_functions()
+    radii, means2d, depths, conics = projected
+    across, down = (math.ceil(side / TILE) for side in size)
+    # gsplat also takes the index of each Gaussian, but does not use it.
+    _, pairs, flat = compiled.intersect_tile(
+        means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
+    )
+    offsets = compiled.intersect_offset(pairs, count, across, down)
+    images, alphas, last = compiled.rasterize_to_pixels_3dgs_fwd(
+        means2d, conics, colors, opacities, background, None, *size, TILE, offsets, flat
+    )
+    return images, alphas, last, offsets, flat
+
+
+def _write_gradients(targets: GradientTargets, by_centre: Tensor, by_absolute: Tensor | None) -> None:
+    """Write the gradients by centres, (n, 2) or (c, n, 2), to the tensors of a `RenderResult`."""
+    held = [target() for target in targets]
+    if held and held[0] is not None:
+        held[0].grad = by_centre
+    if by_absolute is not None and len(held) > 1 and held[1] is not None:
+        held[1].copy_(by_absolute)
+
+
+@lru_cache(maxsize=8)
+@torch.inference_mode(False)  # cached for later calls, which may need gradients
+def _zeros(shape: torch.Size, device: torch.device) -> Tensor:
+    """Return cached zeros, the gradients by unused outputs; they must not be written to."""
+    return torch.zeros(shape, device=device)
+
+
+@lru_cache(maxsize=1)
+def compiled_functions() -> Any:
+    """Return gsplat's module of compiled functions."""
+    from gsplat.cuda._backend import _C
+
+    return _C

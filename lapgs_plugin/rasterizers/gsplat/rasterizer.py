@@ -1,0 +1,215 @@
+"""Render with gsplat behind the interface `fields.rasterizer.Rasterizer`.
+
+gsplat takes colours as they are, so signed colour needs no change to it: its own kernel evaluates SH, and nothing is
+added or clamped. Ordinary colour is evaluated here as well, because gsplat would invert the camera's pose for it, which
+waits for the GPU.
+
+A call waits for the GPU once, inside gsplat, which needs the number of pairs of Gaussians and tiles. A packed call also
+needs the number of visible Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.environment import gsplat_built
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics
+from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
+from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
+from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
+
+NAME = "gsplat"
+
+LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
+SEMANTICS = Semantics(
+    three_sigma_cut=False,
+    expanded_conic_gradient=True,
+    rebuilt_transmittance=True,
+    departures={
+        "saturated": "alpha is capped at 0.999, without a gradient there",
+        **dict.fromkeys(("off_centre", "outside_frustum", "same_plane"), LIMIT),
+    },
+    note="alpha is capped at 0.999 instead of 0.99, and where it is, there is no gradient by opacity and position; the "
+    "Jacobian's limit counts from the border of the image instead of 1.3 half sides from its centre, which differs for "
+    "principal points off the centre, and beyond it depth has another gradient; footprints end where alpha = 1/255 "
+    "instead of at three sigma; a depth of exactly 0.2 is not culled; gradients of needles are right to a few "
+    "thousandths, and by way of pixels that are nearly opaque to 3e-4",
+)
+
+
+def missing() -> str:
+    """Return why gsplat cannot render on this machine, as a clause; empty if it can. Imports and compiles nothing."""
+    if not torch.cuda.is_available():
+        return "PyTorch sees no CUDA device"
+    built = gsplat_built()
+    if built is None:
+        return "gsplat is not installed"
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    return "" if built or CUDA_HOME else "gsplat's CUDA part is not built, and there is no nvcc to build it"
+
+
+class GsplatRasterizer:
+    """Render float32 fields on a CUDA device with gsplat and the conventions of the 3DGS family.
+
+    If its CUDA part is not built yet, gsplat compiles it in the first call, which takes minutes.
+
+    Args:
+        device: that renders; tests render on a CPU with a stand-in for gsplat.
+        antialiasing: dim Gaussians that are smaller than a pixel, as graphdeco's option of that name.
+        packed: store intermediate results of visible Gaussians alone: less memory, a little slower.
+        absgrad: offer `RenderResult.absgrad2d`, which makes the backward pass a little slower.
+        own_radii: return gsplat's radii, which bound where alpha reaches 1/255, instead of computing those of three
+            sigma; training only asks which are above 0.
+        direct: call gsplat's kernels directly (`gsplat.direct`), which takes half of the launches. None does so if it
+            is validated on this machine. Not available with `packed` or `antialiasing`.
+
+    Raises:
+        MissingExtraError: gsplat cannot render on this machine.
+    """
+
+    def __init__(
+        self,
+        device: torch.device | str = "cuda",
+        *,
+        antialiasing: bool = False,
+        packed: bool = False,
+        absgrad: bool = True,
+        own_radii: bool = False,
+        direct: bool | None = None,
+    ) -> None:
+        self._device = torch.device(device)
+        if self._device.type == "cuda" and (reason := missing()):
+            raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
+        self._stock = StockRasterization(antialiasing, packed, own_radii)
+        self._absgrad = absgrad
+        self._may_be_direct = self._device.type == "cuda" and not (packed or antialiasing) and direct is not False
+        self._must_be_direct = bool(direct)
+        self._cameras = CameraCache()
+
+    @property
+    def name(self) -> str:
+        return NAME
+
+    @property
+    def semantics(self) -> Semantics:
+        """Its differences from the oracle."""
+        return SEMANTICS
+
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`; see `fields.rasterizer.Rasterizer`.
+
+        Raises:
+            UserInputError: the field is not float32 on `device`.
+        """
+        means = field.means
+        if means.device.type != self._device.type or means.dtype != torch.float32:
+            raise UserInputError(
+                f"means is {means.dtype} on {means.device}, expected float32 on {self._device}; use .to()"
+            )
+        return self._render(field, [camera], background, sh_degree, self._absgrad)
+
+    @property
+    def can_batch(self) -> bool:
+        """See `fields.rasterizer.BatchRasterizer`. Packed results have no row for each camera and Gaussian."""
+        return self._device.type == "cuda" and not self._stock.packed
+
+    def render_batch(
+        self,
+        field: GaussianField,
+        cameras: Sequence[Camera],
+        *,
+        background: Tensor,
+        sh_degree: int | None = None,
+        describes: bool = True,
+    ) -> RenderResult:
+        """Render several cameras in one set of launches; see `fields.rasterizer.BatchRasterizer`."""
+        if describes:
+            return self._render(field, cameras, background, sh_degree, self._absgrad)
+        image = self._images(field, cameras, background, sh_degree)
+        centres = field.means.new_zeros(len(cameras), 0, 2)
+        return RenderResult(image, None, centres[..., 0].int(), centres)
+
+    def render_image(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> Tensor:
+        """Render the image without radii, centres and transmittance; see `fields.rasterizer.PlainRasterizer`."""
+        return self._images(field, [camera], background, sh_degree)
+
+    @torch.no_grad()
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        """Render images of several cameras together; see `fields.rasterizer.ImageRasterizer`."""
+        if len(field) == 0 or (self._direct and len(cameras) == 1):
+            images = self._images(field, cameras, background, None)
+            return images[None] if len(cameras) == 1 else images
+        return self._stock.images(field, cameras, background, field.sh_degree)
+
+    @property
+    def can_stack(self) -> bool:
+        """See `fields.rasterizer.StackingRasterizer`. The stack calls functions of gsplat 1.5."""
+        from gsplat import spherical_harmonics
+
+        return self._device.type == "cuda" and not self._stock.packed and not takes_viewmats(spherical_harmonics)
+
+    def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
+        """Copy several fields to render them together; see `fields.rasterizer.StackingRasterizer`."""
+        antialiased = self._stock.antialiased
+        direct = self._device.type == "cuda" and not antialiased and direct_works()
+        return GsplatStack(fields, self._device, antialiased=antialiased, direct=direct)
+
+    @property
+    def _direct(self) -> bool:
+        return self._may_be_direct and (self._must_be_direct or direct_works())
+
+    def _render(
+        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None, absgrad: bool
+    ) -> RenderResult:
+        """Render cameras of one size with radii and centres."""
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        if len(field) == 0:
+            return _without_gaussians(field, cameras, background, absgrad)
+        if self._direct:
+            on_device, own_radii = self._cameras.get(cameras, field.means), self._stock.own_radii
+            return direct.render(field, on_device, background, degree, absgrad=absgrad, own_radii=own_radii)
+        return self._stock.render(field, cameras, background, degree, absgrad=absgrad)
+
+    def _images(
+        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
+    ) -> Tensor:
+        """Render images alone, (3, h, w) of one camera and (b, 3, h, w) of several."""
+        degree = field.sh_degree if sh_degree is None else sh_degree
+        if len(field) == 0:
+            return _without_gaussians(field, cameras, background, absgrad=False).image
+        if self._direct:
+            return direct.render_images(field, self._cameras.get(cameras, field.means), background, degree)
+        images = self._stock.images(field, cameras, background, degree)
+        # All that follows in training reads channel by channel: better reordered once than in each operation.
+        return (images if len(cameras) > 1 else images[0]).contiguous()
+
+
+def _without_gaussians(
+    field: GaussianField, cameras: Sequence[Camera], background: Tensor, absgrad: bool
+) -> RenderResult:
+    """Return the result for a field of no Gaussians: the background."""
+    leading, size, means = (
+        (len(cameras),) if len(cameras) > 1 else (),
+        (cameras[0].height, cameras[0].width),
+        field.means,
+    )
+    means2d = means.new_zeros(*leading, 0, 2).requires_grad_(is_differentiated(field))
+    absgrad2d = means.new_zeros(*leading, 0, 2) if means2d.requires_grad and absgrad else None
+    # Zero, but in the graph: a loss of the image can be differentiated by the empty parameters.
+    nothing = torch.cat([value.flatten() for value in (means2d, *field.parameters.values())]).sum()
+    image = (background.to(means) + nothing)[:, None, None].expand(*leading, 3, *size)
+    transmittance = None if leading else means.new_ones(size)
+    return RenderResult(image, transmittance, means2d.detach()[..., 0].int(), means2d, absgrad2d)

@@ -1,0 +1,81 @@
+"""Validate direct calls of gsplat's kernels against `gsplat.rasterization` on this machine."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.ops.self_check import largest, matches_reference
+from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization
+
+logger = logging.getLogger(__name__)
+
+KNOWN_RELEASES = "1.5."
+"""Releases of gsplat whose compiled functions have the signatures that `direct` uses."""
+LARGEST_DIFFERENCE = 1e-3
+"""Largest accepted difference of images and gradients, relative to the largest value; atomics alone make 1e-6."""
+
+
+@lru_cache(maxsize=1)
+def direct_works() -> bool:
+    """Return whether `direct` gives the results of `gsplat.rasterization` with this machine's gsplat and Triton."""
+    import gsplat
+
+    if not gsplat.__version__.startswith(KNOWN_RELEASES):
+        logger.info("gsplat %s: rendering by its own `rasterization`, which takes more launches", gsplat.__version__)
+        return False
+    return matches_reference(
+        "rendering by `gsplat.rasterization`", lambda: _largest_difference(torch.device("cuda")), LARGEST_DIFFERENCE
+    )
+
+
+def _largest_difference(device: torch.device) -> float:
+    """Return the largest relative difference of images, gradients and densification statistics.
+
+    An ordinary field is rendered from one camera, a signed one from two cameras together.
+    """
+    camera = Camera(70, 45, 60.0, 61.0, 34.0, 23.0, torch.eye(4))
+    moved = torch.eye(4)
+    moved[0, 3], moved[2, 3] = 0.4, 1.0
+    other = replace(camera, world_to_camera=moved)
+    background, stock = torch.tensor([0.1, 0.2, 0.3], device=device), StockRasterization(own_radii=True)
+    generator = torch.Generator().manual_seed(0)
+    differences = []
+    for signed, degree, cameras in ((False, 3, [camera]), (True, 2, [camera, other])):
+        values = _random_parameters(500, generator)
+        weights = torch.randn(len(cameras), 3, camera.height, camera.width, generator=generator).to(device)
+        found = []
+        for is_direct in (False, True):
+            leaves = [value.to(device).requires_grad_() for value in values]
+            field = GaussianField(leaves[0], leaves[1], leaves[2], leaves[3], leaves[4], signed)
+            if is_direct:
+                on_device = CameraCache().get(cameras, field.means)
+                result = direct.render(field, on_device, background, degree, absgrad=True, own_radii=True)
+            else:
+                result = stock.render(field, cameras, background, degree, absgrad=True)
+            (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            assert result.absgrad2d is not None
+            assert result.means2d.grad is not None
+            visible = (result.radii > 0).float()
+            by_screen = [result.means2d, result.means2d.grad, result.absgrad2d]
+            found.append([result.image, visible, *by_screen, *(leaf.grad for leaf in leaves)])
+        differences += [(one - theirs).abs() / theirs.abs().max() for theirs, one in zip(*found, strict=True)]
+    return largest(differences)
+
+
+def _random_parameters(count: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
+    """Return parameters of `count` Gaussians in front of the camera, in the order of a field's attributes."""
+    return (
+        torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0.0, 4.0]),
+        torch.randn(count, 4, generator=generator),
+        torch.randn(count, 3, generator=generator) * 0.3 - 2.5,
+        torch.randn(count, generator=generator),
+        torch.randn(count, 16, 3, generator=generator) * 0.3,
+    )

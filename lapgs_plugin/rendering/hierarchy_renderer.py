@@ -1,0 +1,294 @@
+"""Render the finished levels of a hierarchy and compose them to images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.composition import AS_TRAINED, Composition, compose, scaled
+from lapgs_plugin.rendering.field_renderer import FieldOffload, FieldRenderer
+from lapgs_plugin.runs.archive import Manifest, RunArchive
+
+CLAMPED = "clamped"
+"""Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
+
+STACK_PIXELS = 3_000_000
+"""Pixels of the finest rendered level up to which one set of launches for all fields is faster than streams."""
+
+LARGEST_GAIN = 1000.0
+"""Largest gain of a band; more is a typing error."""
+
+
+@dataclass(frozen=True)
+class HierarchyRenderer:
+    """Render the finished levels of a hierarchy and compose them.
+
+    A signed field is added to the upsampled image of the coarser ones. With nested levels no field is signed: each
+    makes its level's whole image, so that an image takes the rendering of one field.
+
+    Upsampling and adding a level is one kernel, in the stream that is current when `render` is called.
+
+    Attributes:
+        fields: by level; contiguous from `levels - 1` down to the finest that is finished. On the device that renders
+            them, or anywhere when there is an `offload`.
+        levels: number of levels of the whole hierarchy, L.
+        pyramid: Up between two levels; on the grid the hierarchy was trained with.
+        rasterizer: renders every field.
+        background: RGB behind the base. Residuals are always rendered over zero.
+        clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
+            paper authors' release does in training and rendering.
+        concurrent: on a GPU, let fields be rendered at the same time if the rasterizer can. The extensions of 3DGS
+            codebases cannot: all their kernels go to one stream.
+        stack_pixels: with `concurrent`, the most pixels of the finest rendered level for which all fields of a view are
+            rendered in one set of launches; 0 for never. It needs an `offload` that keeps fields on the device, because
+            it renders a copy of them.
+        offload: copies fields to the device when they are needed; None when they are there, and may still change.
+
+    Raises:
+        UserInputError: a level between the coarsest and the finest given is missing, the base is signed, or some of
+            the finer fields are and others not.
+    """
+
+    fields: Mapping[int, GaussianField]
+    levels: int
+    pyramid: Pyramid
+    rasterizer: Rasterizer
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clamped: bool = False
+    concurrent: bool = True
+    stack_pixels: int = STACK_PIXELS
+    offload: FieldOffload | None = None
+
+    def __post_init__(self) -> None:
+        given = sorted(self.fields, reverse=True)
+        expected = list(range(self.levels - 1, -1, -1))[: len(given)]
+        if not given or given != expected:
+            raise UserInputError(
+                f"fields of levels {given}, expected {self.levels - 1}, ..., 0 or the first of these without gaps"
+            )
+        signed = [self.fields[level].signed for level in expected]
+        if signed[0] or len(set(signed[1:])) > 1:
+            kinds = zip(given, ("signed" if one else "unsigned" for one in signed), strict=True)
+            found = ", ".join(f"{level} {kind}" for level, kind in kinds)
+            raise UserInputError(
+                f"fields of levels {found}; expected the coarsest, {self.levels - 1}, unsigned (the base), and the "
+                "others all signed (residuals) or, where levels are nested, all unsigned"
+            )
+
+    @classmethod
+    def from_archive(
+        cls,
+        archive: RunArchive,
+        rasterizer: Rasterizer,
+        device: torch.device | str = "cpu",
+        *,
+        finest: int = 0,
+        keep: bool = True,
+    ) -> HierarchyRenderer:
+        """Return a renderer of a run's finished levels.
+
+        Args:
+            archive: the run.
+            rasterizer: renders every field.
+            device: of the rasterizer; images come out there. Fields are copied to it when they are first rendered.
+            finest: the finest level to read.
+            keep: keep fields on the device. Otherwise they are copied from page-locked memory for every frame, which
+                takes time and saves device memory.
+
+        Raises:
+            RunFolderError: a field is damaged, or no level is finished.
+        """
+        manifest = archive.manifest
+        manifest.record(manifest.levels - 1)
+        fields: dict[int, GaussianField] = {}
+        for level in (each for each in archive.available_levels if each >= finest):
+            try:
+                fields[level] = archive.field(level)
+            except RunFolderError as error:
+                raise _with_undamaged_levels(error, list(fields)) from error
+        return cls.of(manifest, fields, rasterizer, FieldOffload(torch.device(device), keep))
+
+    @classmethod
+    def of(
+        cls,
+        manifest: Manifest,
+        fields: Mapping[int, GaussianField],
+        rasterizer: Rasterizer,
+        offload: FieldOffload | None = None,
+    ) -> HierarchyRenderer:
+        """Return a renderer of these fields of a run."""
+        return cls(
+            fields=fields,
+            levels=manifest.levels,
+            pyramid=Pyramid(manifest.grid),
+            rasterizer=rasterizer,
+            background=manifest.scene.background,
+            clamped=bool(manifest.settings.get(CLAMPED, False)),
+            offload=offload,
+        )
+
+    @cached_property
+    def by_field(self) -> FieldRenderer:
+        """Renders each field by itself."""
+        options = self.clamped, self.concurrent, self.stack_pixels, self.offload
+        return FieldRenderer(self.fields, self.rasterizer, self.background, *options)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that renders, on which images come out."""
+        return self.by_field.device
+
+    def field(self, level: int) -> GaussianField:
+        """Return a level's field on `device`."""
+        return self.by_field.field(level)
+
+    @property
+    def finest(self) -> int:
+        """The finest level that can be rendered; 0 for a complete hierarchy."""
+        return min(self.fields)
+
+    @property
+    def nested(self) -> bool:
+        """Whether each field makes its level's whole image."""
+        return self.finest < self.levels - 1 and not self.fields[self.finest].signed
+
+    def fields_for(self, level: int, gains: Mapping[int, float] = AS_TRAINED) -> list[int]:
+        """Return the levels whose fields `images` renders, coarsest first; arguments as it takes them."""
+        levels = range(self.levels - 1, level - 1, -1)
+        if not self.nested:
+            return [each for each in levels if gains.get(each, 1.0) != 0.0]
+        return [level] if all(gains.get(each, 1.0) == 1.0 for each in levels) else list(levels)
+
+    def fields_for_band(self, level: int, gain: float = 1.0) -> list[int]:
+        """Return the levels whose fields `band` renders, coarsest first; arguments as it takes them."""
+        if self.nested and level < self.levels - 1:
+            return [level + 1, level]
+        return [level] if gain != 0.0 else []
+
+    def require_level(self, level: int) -> None:
+        """Check that `level` can be rendered.
+
+        Raises:
+            UserInputError: it is not there.
+        """
+        if not self.finest <= level < self.levels:
+            raise UserInputError(
+                f"level {level} cannot be rendered, expected {self.finest} to {self.levels - 1}; "
+                "levels count from 0, the finest, and this run has no others"
+            )
+
+    def level_for_size(self, camera: Camera, size: tuple[int, int]) -> int:
+        """Return the level of detail for an image size: the coarsest level that is not smaller, or else the finest.
+
+        Args:
+            camera: of the full-resolution view.
+            size: (width, height) in pixels at which the image is shown.
+        """
+        for level in range(self.levels - 1, self.finest, -1):
+            width, height = level_size((camera.width, camera.height), level)
+            if width >= size[0] and height >= size[1]:
+                return level
+        return self.finest
+
+    def render(self, camera: Camera, level: int = 0, gains: Mapping[int, float] | None = None) -> Composition:
+        """Render a view from the coarsest level down to `level`.
+
+        Args:
+            camera: of the full-resolution view.
+            level: finest level to add.
+            gains: by level, the factor on its band, at least 0; 1 for levels that are not in it. A residual of gain 0
+                is not rendered.
+
+        Raises:
+            UserInputError: the level is not there, or a gain is out of range or of a level that is not there.
+            DeviceMemoryError: the GPU is full.
+        """
+        return self.render_batch([camera], level, gains).view(0)
+
+    @torch.no_grad()
+    def render_batch(
+        self, cameras: Sequence[Camera], level: int = 0, gains: Mapping[int, float] | None = None
+    ) -> Composition:
+        """Render several views together, with fewer launches if the rasterizer takes several cameras.
+
+        Args:
+            cameras: of full-resolution views, all of one size; at least one.
+            level, gains: as `render` takes them.
+
+        Returns:
+            A composition of images (b, 3, h, w).
+
+        Raises:
+            UserInputError: as `render`, or the cameras differ in size.
+        """
+        return self._compose(cameras, range(self.levels - 1, level - 1, -1), self._checked(level, gains))
+
+    @torch.no_grad()
+    def images(self, cameras: Sequence[Camera], level: int = 0, gains: Mapping[int, float] | None = None) -> Tensor:
+        """Return I_hat of `level`, (b, 3, h, w), without its bands: with nested levels one field is rendered.
+
+        Args, Raises:
+            As `render_batch`.
+        """
+        gains = self._checked(level, gains)
+        needed = self.fields_for(level, gains) if self.nested else range(self.levels - 1, level - 1, -1)
+        return self._compose(cameras, needed, gains).composed[level]
+
+    @torch.no_grad()
+    def band(self, camera: Camera, level: int, gain: float = 1.0) -> Tensor:
+        """Return what one level adds to the coarser ones, (3, h, w) at its size; for the coarsest, its image.
+
+        Args:
+            camera: of the full-resolution view.
+            level: whose band.
+            gain: factor on the band, at least 0; 0 gives zeros.
+
+        Raises:
+            UserInputError: as `render`.
+        """
+        gains = self._checked(level, {level: gain})
+        needed = self.fields_for_band(level, gain)
+        if len(needed) > 1:
+            return self._compose([camera], needed, gains).residuals[level][0]
+        if not needed:
+            return self.by_field.zeros([camera], level)[0]
+        return scaled(self.by_field.render_level([camera], level), gain)[0]
+
+    def _compose(self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]) -> Composition:
+        """Render and compose these levels, coarsest first. With nested levels the first may be any."""
+        if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
+            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
+            raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
+        nested = self.nested  # a nested field's image includes the coarser bands, so none can be omitted
+        omitted = [] if nested else [level for level in levels if gains.get(level, 1.0) == 0.0]
+        return compose(self.pyramid, self.by_field.render(cameras, levels, omitted), nested=nested, gains=gains)
+
+    def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:
+        """Check a level and gains, and return the gains."""
+        self.require_level(level)
+        for each, gain in (gains or {}).items():
+            self.require_level(each)
+            if not (math.isfinite(gain) and 0.0 <= gain <= LARGEST_GAIN):
+                raise UserInputError(
+                    f"gain {gain:g} of level {each}: expected a number from 0 (leave the band out) to "
+                    f"{LARGEST_GAIN:g}; 1 is the band as trained"
+                )
+        return gains or AS_TRAINED
+
+
+def _with_undamaged_levels(error: RunFolderError, undamaged: Sequence[int]) -> RunFolderError:
+    """Add to the error of a damaged level how to render the levels before it."""
+    if not undamaged:
+        return error
+    return RunFolderError(f"{error}; what was trained before it is whole: `lapgs render --level {min(undamaged)}`")
