@@ -1,9 +1,9 @@
-"""Train one field at full resolution in a loop on gsplat; `gsplat_after.py` adds a hierarchy.
+"""A training loop on gsplat, one field at full resolution: `gsplat_after.py` is this with a hierarchy added.
 
     python examples/gsplat_before.py SCENE -o RUN --resolution 1/4 --iterations 3000
 
-lapgs_plugin reads the scene and computes the loss; any loader and any L1 + SSIM would do. Nothing here knows of levels.
-Without a CUDA device give `--rasterizer cpu`: gsplat's two functions then come from a stand-in.
+lapgs_plugin reads the scene and computes the loss; any loader and any L1 + SSIM would do. There are no levels here.
+Without a CUDA device, `--rasterizer cpu` takes gsplat's two functions from a stand-in.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class View:
 
 
 class Runner:
-    """Hold a scene and the splats that are fitted to it, and render them."""
+    """Fit splats to a scene."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.device = torch.device("cpu" if args.rasterizer == "cpu" else "cuda")
@@ -52,7 +52,7 @@ class Runner:
         )
 
     def set_splats(self, splats: dict[str, Tensor]) -> None:
-        """Start from these parameters with fresh optimizers."""
+        """Start with these parameters and fresh optimizers."""
         rates = {**RATES, "means": RATES["means"] * self.scene.extent}
         self.splats = {name: torch.nn.Parameter(value.detach().to(self.device)) for name, value in splats.items()}
         self.optimizers = {
@@ -61,7 +61,7 @@ class Runner:
         }
 
     def render(self, view: View, sh_degree: int = SH_DEGREE) -> tuple[Tensor, dict]:
-        """Return the (3, h, w) image and gsplat's information about it."""
+        """Return the image (3, h, w) and gsplat's information about it."""
         colors = torch.cat([self.splats["sh0"], self.splats["shN"]], 1)
         images, _, info = self.gsplat.rasterization(
             self.splats["means"],
@@ -107,7 +107,7 @@ class Runner:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Return the mean over the held-out views, in dB."""
+        """Return the mean PSNR of the held-out views in dB."""
         errors = [(self.render(view)[0].clamp(0, 1) - view.image).square().mean() for view in self.test_views]
         return float((-10 * torch.stack(errors).log10()).mean())
 

@@ -1,8 +1,9 @@
-"""Train with a hierarchy in plain PyTorch on the CPU rasterizer: `vanilla_before.py` with a dozen lines changed.
+"""A training loop in plain PyTorch on the CPU rasterizer with a hierarchy: `vanilla_before.py` and a dozen lines.
 
     python examples/vanilla_after.py SCENE --resolution 1/2 --iterations 500
 
-No densification, no schedules: the least that trains. lapgs_plugin reads the scene, renders and computes the loss.
+The shortest loop that trains, without densification and schedules. lapgs_plugin reads the scene, renders and computes
+the loss.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def train(field: lapgs.GaussianField, views: list[View], iterations: int) -> tup
 
 @torch.no_grad()
 def predict(field: lapgs.GaussianField, view: View) -> Tensor:
-    """Return the rendered image, (3, h, w)."""
+    """Return the image (3, h, w)."""
     image = CpuRasterizer()(field, view.camera, background=torch.zeros(3)).image
     return image + CACHE.get(view.name) if field.signed else image
 

@@ -1,8 +1,9 @@
-"""Train one field in plain PyTorch on the CPU rasterizer; `vanilla_after.py` adds a hierarchy.
+"""A training loop in plain PyTorch on the CPU rasterizer, one field at full resolution: see also `vanilla_after.py`.
 
     python examples/vanilla_before.py SCENE --resolution 1/2 --iterations 500
 
-No densification, no schedules: the least that trains. lapgs_plugin reads the scene, renders and computes the loss.
+The shortest loop that trains, without densification and schedules. lapgs_plugin reads the scene, renders and computes
+the loss.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def train(field: lapgs.GaussianField, views: list[View], iterations: int) -> tup
 
 @torch.no_grad()
 def predict(field: lapgs.GaussianField, view: View) -> Tensor:
-    """Return the rendered image, (3, h, w)."""
+    """Return the image (3, h, w)."""
     return CpuRasterizer()(field, view.camera, background=torch.zeros(3)).image
 
 

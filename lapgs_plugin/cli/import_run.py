@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lapgs_plugin.adapters.registry import OWN
 from lapgs_plugin.errors import UserInputError
 
 
@@ -20,7 +21,7 @@ def import_run(
     ] = None,
     backbone: Annotated[
         str | None,
-        typer.Option(help="fastgs, taming or graphdeco: what it was trained with, where the folder does not tell."),
+        typer.Option(help=f"Backbone that trained it, where the folder does not tell: {', '.join(OWN)}."),
     ] = None,
     iteration: Annotated[
         int | None, typer.Option(help="Take the fields saved at this iteration. Default: the last ones.")

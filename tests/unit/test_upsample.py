@@ -19,7 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid, transposed_taps
+from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
+from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.ops import upsample as raising
 from lapgs_plugin.ops.self_check import matches_reference
 from lapgs_plugin.ops.upsample import upsample, upsample_add

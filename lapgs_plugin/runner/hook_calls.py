@@ -1,13 +1,11 @@
-"""Users' hooks in a checkout's training loop, which knows nothing of them.
+"""Call users' hooks from a checkout's training loop, which does not know them.
 
-The loop renders, makes its loss, goes backward and densifies; the hooks' methods are called where those happen:
-
-    before_render, compose, loss    when the rasterizer has rendered a training view with gradients
-    after_backward                  when the gradients of that image's graph are there
+    before_render, compose, loss    after the rasterizer has rendered a training view with gradients
+    after_backward                  after the backward pass through that image
     on_densify                      after density control
 
-A hook's loss is added without touching the loop's: the image passes through a function whose backward pass gives the
-hook's term a gradient of one, as if it had been added to the loss.
+A hook's loss leaves the loop's own unchanged: the image passes through a function whose backward pass gives the hook's
+term a gradient of one, as if the loop had added it.
 """
 
 from __future__ import annotations
@@ -23,14 +21,14 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
 
 if TYPE_CHECKING:
-    from lapgs_plugin.runner.shim import StageRendering
+    from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
 
 
 class HookCaller:
-    """Calls users' hooks; false when there are none, so that a run without hooks pays nothing.
+    """Call users' hooks; false without hooks, so that a run without them has no overhead.
 
     Args:
-        hooks: given besides those registered by entry point.
+        hooks: hooks besides those registered by entry point.
 
     Raises:
         UserInputError: a hook is not usable.
@@ -48,42 +46,45 @@ class HookCaller:
         return self._hooks is not None
 
     def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
+        """Call `on_stage_start`."""
         self._stage, self._rendering = stage, rendering
         if self._hooks is not None:
             self._hooks.on_stage_start(stage)
 
     def stage_ends(self, stage: Stage) -> None:
+        """Call `on_stage_end`."""
         if self._hooks is not None:
             self._hooks.on_stage_end(stage)
 
     def iteration_begins(self, iteration: int) -> None:
+        """Note the number of the iteration."""
         self._iteration = iteration
 
     def on_image(self, key: str, image: Tensor, below: Tensor | None) -> Tensor:
-        """(3, h, w) what a training view's render gives the loop, as hooks and their terms make it.
+        """Call `before_render`, `compose` and `loss`, and return the image (3, h, w) for the loop.
 
         Args:
-            key: of the view.
-            image: (3, h, w) as it would be without hooks.
-            below: (3, h, w) what the finished levels gave to it; None where the image is a field's alone.
+            key: key of the view.
+            image: (3, h, w) image for the loop without hooks.
+            below: (3, h, w) upsampled prediction in the image; None if the image is not composed.
         """
         assert self._hooks is not None
         context = self._context = self._make_context(key, below)
-        # Hooks see composed images; where the loop is to see the residual alone, it is taken apart again behind them.
-        apart = context.accumulated if below is None else None
-        if apart is not None:
-            image = image + apart
+        # Hooks get composed images, even where the loop's loss is about the residual alone.
+        added = context.accumulated if below is None else None
+        if added is not None:
+            image = image + added
         self._hooks.before_render(context)
         image = self._hooks.compose(context, image)
         term = self._hooks.extra_loss(context, image)
         result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
-        return result if apart is None else result - apart
+        return result if added is None else result - added
 
     def _make_context(self, key: str, below: Tensor | None) -> StageContext:
         assert self._stage is not None
         assert self._rendering is not None
         targets, accumulated, coarse = self._rendering.targets, self._rendering.accumulated, self._rendering.coarse
-        assert targets is not None, "a stage that is trained has something to be compared with"
+        assert targets is not None, "a stage that is trained has targets"
         if below is None and accumulated is not None:
             below = accumulated.get(key)
         return StageContext(
@@ -96,6 +97,7 @@ class HookCaller:
         )
 
     def densified(self) -> None:
+        """Call `on_densify`."""
         if self._hooks is not None and self._context is not None:
             self._hooks.on_densify(self._context)
 
@@ -106,7 +108,7 @@ class HookCaller:
 
 
 class _WithTerm(torch.autograd.Function):
-    """(image, term) -> image; backward gives the term a gradient of one."""
+    """Return the image unchanged; the backward pass gives the term a gradient of one."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, term: Tensor | None, done: Any) -> Tensor:
@@ -115,6 +117,6 @@ class _WithTerm(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        # Runs the callback when this whole backward pass has ended, as data-parallel training does.
+        # The engine calls it at the end of this backward pass; data-parallel training relies on the same.
         torch.autograd.Variable._execution_engine.queue_callback(ctx.done)
         return gradient, gradient.new_ones(()) if ctx.term else None, None

@@ -1,7 +1,7 @@
-"""Between a checkout's `render` and its CUDA rasterizer: signed colour, a zero background, and composition.
+"""Wrap a checkout's CUDA rasterizer to add signed colour, a zero background and composition.
 
-The two names that every `render` of the family looks up in its own module are replaced. So whoever renders - the
-training loop, score functions, reports - gets composed images, and no consumer of `render` has to be known.
+The wrapper replaces the two names that every `render` of the family looks up in its own module. So every caller of
+`render` (the training loop, score functions, reports) gets composed images.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
 from lapgs_plugin.runs.image_store import ImageStore
 
 GREY = 0.5
-"""Around which a residual is shown to a camera that is no view of the scene, such as a viewer's."""
+"""Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
 
 
 class Predictions(Protocol):
-    """What lies below every view, by key: kept images, raised, or finished levels that render it."""
+    """Return upsampled predictions of coarser levels by view: cached images, or renders of finished fields."""
 
     def prefetch(self, key: str, /) -> None:
-        """Told of a view that will be asked for soon."""
+        """Prepare for a `get` of this view."""
 
     def get(self, key: str, /) -> Tensor:
-        """(3, h, w) on the device, float32, at the size of what is rendered over it."""
+        """Return the prediction (3, h, w) on the device, float32, at the size of the finer level."""
 
 
 @dataclass
 class StageRendering:
-    """What has to be known of the running stage whenever something is rendered.
+    """Describe to the rasterizer's wrapper how a stage is rendered.
 
     Attributes:
-        signed: whether residuals are rendered.
+        signed: whether the field is a residual.
         path: how signed colour is evaluated.
         views: key of each view by the identity of its world-to-camera matrix, which level views share with the
             checkout's cameras.
-        targets: I^l by key; None where nothing is compared.
+        targets: I^l by key; None if images are compared with nothing.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
-        composed: keys of the views that composition is done for; of the others, a residual is compared with a residual.
-        on_image: called with key, composed image and what of it lies below when gradients are recorded; what it returns
-            takes the image's place.
-        capture: keep what was composed last, before exposure or clamping, in `captured`.
+        composed: keys of the views to compose; the residuals of all others are compared with a residual.
+        on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
+            without composition); returns the image to use instead.
+        capture: keep the last composed image, before exposure or clamping, in `captured`.
     """
 
     signed: bool
@@ -62,10 +62,11 @@ class StageRendering:
     captured: Tensor | None = field(default=None, repr=False)
 
     def key(self, settings: Any) -> str | None:
+        """Return the key of the view that settings of the rasterizer belong to; None for any other camera."""
         return self.views.get(id(settings.viewmatrix))
 
     def prefetch(self, key: str) -> None:
-        """Bring a view's images while it is being rendered."""
+        """Copy a view's images to the device while it is being rendered."""
         if self.targets is not None:
             self.targets.prefetch(key)
         below = self.accumulated if key in self.composed else self._below_target
@@ -73,15 +74,15 @@ class StageRendering:
             below.prefetch(key)
 
     def target(self, key: str) -> Tensor:
-        """(3, h, w) what `compose` is compared with: I^l, or what is missing of it."""
-        assert self.targets is not None, "there is something to compare with"
+        """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
+        assert self.targets is not None, "a stage that is trained has targets"
         target = self.targets.get(key)
         if key in self.composed or self._below_target is None:
             return target
         return target - self._below_target.get(key)
 
     def compose(self, key: str | None, image: Tensor) -> Tensor:
-        """(3, h, w) what a rasterizer made of a view -> what `render` returns of it."""
+        """Return the composed image (3, h, w) of a view, given the rendered one; `key` is None for other cameras."""
         if key is None:
             return image + GREY if self.signed else image
         below = None
@@ -92,17 +93,27 @@ class StageRendering:
             image = self.on_image(key, image, below)
         return image
 
+    def render(self, rasterizer: Any, inputs: dict[str, Any], settings: Any) -> tuple[Any, ...]:
+        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image."""
+        if self.signed and self.path is ColorPath.PRECOMPUTED:
+            inputs = _with_signed_colors(inputs, settings)
+        image, *others = rasterizer(**inputs)
+        image = self.compose(self.key(settings), image)
+        if self.capture:
+            self.captured = image
+        return (image, *others)
+
     @property
     def _below_target(self) -> Predictions | None:
-        """What is taken from a target where a residual is supervised alone."""
+        """Images to subtract from targets where residuals are supervised alone."""
         return self.accumulated if self.coarse is None else self.coarse
 
 
-class RasterizerShim:
-    """Makes the replacements of `GaussianRasterizationSettings` and `GaussianRasterizer`.
+class RasterizerWrapper:
+    """Make the replacements of `GaussianRasterizationSettings` and `GaussianRasterizer`.
 
     Attributes:
-        stage: the running stage; None lets every call through unchanged.
+        stage: the running stage; None leaves every call unchanged.
     """
 
     def __init__(self) -> None:
@@ -110,6 +121,8 @@ class RasterizerShim:
         self._zeros: Tensor | None = None
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the replacement of the settings' constructor."""
+
         def make_settings(*args: Any, **kwargs: Any) -> Any:
             settings = original(*args, **kwargs)
             stage = self.stage
@@ -127,9 +140,14 @@ class RasterizerShim:
         return make_settings
 
     def rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the replacement of the rasterizer's constructor."""
+
         def make_rasterizer(raster_settings: Any) -> Any:
             made = original(raster_settings=raster_settings)
-            return made if self.stage is None else _ComposingRasterizer(made, raster_settings, self.stage)
+            stage = self.stage
+            if stage is None:
+                return made
+            return WrappedRasterizer(made, lambda call, inputs: stage.render(call, inputs, raster_settings))
 
         return make_rasterizer
 
@@ -139,28 +157,21 @@ class RasterizerShim:
         return self._zeros
 
 
-class _ComposingRasterizer:
-    """A rasterizer of the checkout for one view; everything but the call is the original's."""
+class WrappedRasterizer:
+    """Replace the call of a checkout's rasterizer for one view by `call(rasterizer, inputs)`; keep all else."""
 
-    def __init__(self, original: Any, settings: Any, stage: StageRendering) -> None:
-        self._original, self._settings, self._stage = original, settings, stage
+    def __init__(self, original: Any, call: Callable[[Any, dict[str, Any]], Any]) -> None:
+        self._original, self._call = original, call
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._original, name)
 
-    def __call__(self, **inputs: Any) -> tuple[Any, ...]:
-        stage = self._stage
-        if stage.signed and stage.path is ColorPath.PRECOMPUTED:
-            inputs = _with_signed_colors(inputs, self._settings)
-        image, *others = self._original(**inputs)
-        image = stage.compose(stage.key(self._settings), image)
-        if stage.capture:
-            stage.captured = image
-        return (image, *others)
+    def __call__(self, **inputs: Any) -> Any:
+        return self._call(self._original, inputs)
 
 
 def _with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]:
-    """The inputs with SH evaluated here, as the patched kernels do it."""
+    """Return a rasterizer's inputs with colours instead of SH, evaluated as patched kernels do."""
     if inputs.get("colors_precomp") is not None:
         return inputs
     dc, rest, means = inputs.get("dc"), inputs["shs"], inputs["means3D"]
