@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.ops.self_check import matches_reference
+from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Default, Mcmc
@@ -150,7 +149,7 @@ class Densifier(DensityControl):
         if self.state["grad2d"] is None:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
         size = camera.width, camera.height
-        add_up(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
+        add_statistics(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
 
     def _gradient(self, result: RenderResult) -> Tensor:
         """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
@@ -160,52 +159,6 @@ class Densifier(DensityControl):
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:
         reset_opa(model.params, model.optimizers, self.state, value=highest)
-
-
-def add_up(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
-    """Add the norms of gradients by centres, in normalised device coordinates, and 1 where a Gaussian is shown.
-
-    Args:
-        gradient: (n, 2) in loss per pixel; of several views (b, n, 2).
-        radii: (n,) or (b, n), 0 where it is not shown.
-        size: (width, height) of the image.
-        norms, counts: (n,) what is added to.
-    """
-    if gradient.device.type == "cuda" and statistics_in_triton():
-        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
-
-        add_statistics(gradient, radii, size, norms, counts)
-    else:
-        _add_statistics(gradient, radii, size, norms, counts)
-
-
-def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
-    """`densification_triton.add_statistics` in PyTorch's operations."""
-    scaled = gradient.clone().view(-1, len(norms), 2)
-    scaled[..., 0] *= size[0] / 2.0
-    scaled[..., 1] *= size[1] / 2.0
-    for of_view, shown in zip(scaled, (radii > 0).view(-1, len(norms)), strict=True):
-        norms += torch.where(shown, of_view.norm(dim=-1), 0.0)
-        counts += shown
-
-
-@lru_cache(maxsize=1)
-def statistics_in_triton() -> bool:
-    """Whether our kernel sums up what PyTorch's operations do."""
-
-    def difference() -> float:
-        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
-
-        gradient = torch.linspace(-1, 1, 1200, device="cuda").view(2, 300, 2)
-        radii = torch.arange(600, dtype=torch.int32, device="cuda").view(2, 300) % 7
-        sums = [torch.ones(2, 300, device="cuda") for _ in range(2)]
-        for add, both in zip((add_statistics, _add_statistics), sums, strict=True):
-            add(gradient, radii, (8, 6), both[0], both[1])
-        return float((sums[0] - sums[1]).abs().max())
-
-    return matches_reference(
-        "statistics of densification in several operations instead of one kernel", difference, 1e-5
-    )
 
 
 class McmcDensifier(DensityControl):

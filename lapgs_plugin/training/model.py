@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats, splats_from_field
-from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, adam_in_triton, step_together
+from lapgs_plugin.ops.adam import (
+    ADAM_EPS,
+    ONE_VIEW,
+    GpuFieldAdam,
+    StepScale,
+    step_together,
+    triton_works,
+)
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.training.settings import LearningRates
 
@@ -51,7 +58,7 @@ class TrainableField:
             sparse: with gsplat's `SelectiveAdam`, on a GPU.
         """
         on_gpu = field.means.device.type != "cpu"
-        if sparse or (on_gpu and not adam_in_triton()):
+        if sparse or (on_gpu and not triton_works()):
             return cls._in_two(field, rates, extent, sparse)
         names = {**SPLAT_NAMES, "sh": "sh"}
         params = {

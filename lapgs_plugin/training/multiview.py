@@ -17,7 +17,8 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.inheritance import SH_C0
-from lapgs_plugin.training.densification import Densifier, add_up
+from lapgs_plugin.ops.densification_statistics import add_statistics
+from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Multiview
@@ -138,7 +139,7 @@ class MultiviewDensifier(Densifier):
         if self.state["absgrad2d"] is None:
             self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
         size = camera.width, camera.height
-        add_up(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
+        add_statistics(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
 
     @torch.no_grad()
     def _refine(self, model: TrainableField, iteration: int, scores: ViewScores) -> None:

@@ -24,6 +24,7 @@ from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
+from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
@@ -38,7 +39,6 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
-from lapgs_plugin.training.densification import statistics_in_triton
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
@@ -105,7 +105,7 @@ def warm_up(
         photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))
     if torch.device(device).type == "cuda":
-        statistics_in_triton()
+        densification_statistics.triton_works()
     coarse = torch.zeros(3, 8, 8, device=device)
     if residuals:
         upsample(Pyramid(), coarse, (16, 16))

@@ -52,7 +52,7 @@ def test_it_is_used() -> None:
 
 
 def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
-    direct_works.cache_clear()
+    direct_works.forget()
     with torch.inference_mode():
         assert direct_works()
 

@@ -220,7 +220,7 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
     names = ("off_centre", "non_square_pixels", "invisible", "no_gaussians", "lower_degree", "degree_0_white")
     chosen = [case for case in conformance_cases() if case.name in names]
     with install(variant):
-        module = VARIANTS[variant][0]
+        module = VARIANTS[variant].module
         assert module in installed_extensions()
         extension = CudaExtension(module, device="cpu")
         assert SignedColorRasterizer(extension).path is ColorPath.NATIVE
@@ -262,7 +262,7 @@ def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
 def brittle(variant: str) -> Iterator[CudaExtension]:
     """A stand-in that refuses calls in which no tile has a Gaussian, like CUDA rasterizers that blend in buckets."""
     with install(variant) as modules:
-        module = modules[VARIANTS[variant][0]]
+        module = modules[VARIANTS[variant].module]
 
         class Brittle(module.GaussianRasterizer):  # type: ignore[misc, name-defined]  # a class made at run time
             @wraps(module.GaussianRasterizer.forward)  # the wrapper reads the arguments' names
@@ -271,7 +271,7 @@ def brittle(variant: str) -> Iterator[CudaExtension]:
                 return super().forward(**inputs)
 
         module.GaussianRasterizer = Brittle
-        yield CudaExtension(VARIANTS[variant][0], device="cpu")
+        yield CudaExtension(VARIANTS[variant].module, device="cpu")
 
 
 def sparse_case(places: list[tuple[float, float, float]], opacities: list[float], camera: Camera) -> Case:
