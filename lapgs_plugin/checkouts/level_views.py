@@ -12,9 +12,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-
-BYTE_TOLERANCE = 1e-3
-"""Largest distance of 255 times a value from a whole number in an 8-bit image; float32 rounding is far smaller."""
+from lapgs_plugin.runs.image_store import eight_bit_levels
 
 
 @dataclass(frozen=True)
@@ -26,10 +24,8 @@ class FullSizeImage:
     @classmethod
     def of(cls, image: Tensor) -> FullSizeImage:
         """Return the image for values (3, h, w) in [0, 1]."""
-        levels = image * 255
-        rounded = levels.round()
-        if bool(((levels - rounded).abs() <= BYTE_TOLERANCE).all()):
-            return cls(rounded.to("cpu", torch.uint8))
+        if (levels := eight_bit_levels(image)) is not None:
+            return cls(levels.cpu())
         return cls(image.to("cpu", torch.float16))
 
     @property

@@ -1,4 +1,4 @@
-"""The typer application: every command registered in one place, errors turned into one line and an exit code."""
+"""Register every command, and turn errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -23,15 +23,20 @@ from lapgs_plugin.cli.run import CONTEXT as RUN_CONTEXT
 from lapgs_plugin.cli.run import run as run_backbone
 from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
+from lapgs_plugin.cli.usage import one_line_usage_errors
 from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError
 
 
 class Commands(TyperGroup):
-    """All commands; each ends on a signal as `training.interrupt` says."""
+    """Run a command so that signals end it as `lapgs_plugin.interrupt` says and usage errors are one line."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        with one_line_usage_errors():
+            return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
-        with interrupt.command():
+        with interrupt.command(), one_line_usage_errors(ctx):
             return super().invoke(ctx)
 
 
@@ -56,10 +61,11 @@ def options(
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Train 3D Gaussian Splatting from coarse to fine: nested levels, or the paper's Laplacian frequency hierarchy.
+    """Train 3D Gaussian Splatting coarse to fine, on your scenes or inside an existing 3DGS codebase.
 
-    A scene comes from `lapgs sample` or `lapgs prepare`, `lapgs train` makes a run folder of it, and `lapgs eval`,
-    `lapgs render` and `lapgs report` look at that. `lapgs doctor` says what this machine can do.
+    Get a scene with `lapgs sample` or `lapgs prepare`. Train it with `lapgs train`, or with the train.py of a checkout
+    through `lapgs run`. Then use `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` on the run folder.
+    `lapgs doctor` checks this machine.
     """
 
 
@@ -82,7 +88,7 @@ app.command("doctor")(doctor)
 def run() -> None:
     """Run the command line; a `LapgsError` becomes one line on stderr and its exit code."""
     try:
-        app()
+        app(prog_name="lapgs")
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
         sys.exit(interrupt.exit_code(error.exit_code))

@@ -1,4 +1,4 @@
-"""`lapgs bench`: an experiment file, or one of the subcommands."""
+"""Run experiments and benchmarks: `lapgs bench`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lapgs_plugin.cli.bench_experiment import bench_experiment
 from lapgs_plugin.cli.bench_raster import raster
 
 EXPERIMENT = "run"
-"""The subcommand that is meant when none is named: `lapgs bench smoke.toml`."""
+"""The default subcommand: `lapgs bench smoke.toml`."""
 
 
 class _ExperimentByDefault(TyperGroup):
-    """A group whose first argument is the name of a subcommand, or already belongs to `EXPERIMENT`."""
+    """Run `EXPERIMENT` if the first argument is not the name of a subcommand."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in (*self.commands, "--help"):
@@ -67,7 +67,7 @@ def ops(
 bench_app = typer.Typer(
     name="bench",
     cls=_ExperimentByDefault,
-    help="Run an experiment: lapgs bench EXPERIMENT.toml; or measure one part of this program.",
+    help="Run an experiment file (lapgs bench EXPERIMENT.toml), or benchmark one part of this package.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

@@ -1,7 +1,7 @@
-"""Checks every run of an experiment before the first one starts, by the commands that the runs would be.
+"""Check all runs of an experiment before the first one starts.
 
-A run's command line goes through the command's own options, and its settings are made; then the command ends
-(`rehearsal.Rehearsal`). So an experiment refuses whatever a command refuses, in the same words.
+The command line of each run is parsed by its command, which checks its settings and ends (`rehearsal.Rehearsal`). An
+experiment therefore refuses the same options as the commands, with the same messages.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import typer
 
 from lapgs_plugin.cli.rehearsal import Rehearsal
+from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.experiments.commands import LAPGS
 from lapgs_plugin.experiments.expansion import SceneSpec, Selection
@@ -34,19 +35,17 @@ if TYPE_CHECKING:
     from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.training.settings import TrainSettings
 
-_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
-"""click's UsageError, wherever this version of typer has click."""
 READS_SCENES = ("OpenImageIO", "pycolmap")
 """Packages without which no scene can be read."""
 ANY_SIZE = (1 << 20, 1 << 20)
-"""Stands for a size that is not known: no image is larger, so a plan that does not fit it fits none."""
+"""Size to check when that of the images is unknown: no image is larger."""
 LONGEST_RUN = 230
-"""Characters of a run's name: with what attempts and logs add, a file's name holds 255."""
+"""Characters of a run's name, with room for the suffixes of attempts and logs in a file name of 255."""
 OWN_ARGUMENTS = ("-m", "--model_path", "-s", "--source_path")
-"""Of a checkout's script: where a run is written and what it is trained on, which the experiment says itself."""
+"""Options of a checkout's script that the experiment sets itself: output folder and scene."""
 
 Sizes = Callable[[str], tuple[int, int] | None]
-"""A scene's smallest image at a resolution, None where that is not known."""
+"""Size of a scene's smallest image at a resolution; None if unknown."""
 
 
 def check_runs(
@@ -59,15 +58,15 @@ def check_runs(
     *,
     here: bool,
 ) -> None:
-    """Note what is wrong with any of these runs.
+    """Collect the mistakes in these runs.
 
     Args:
-        experiment, selection: that the runs come from.
+        experiment, selection: where the runs come from.
         planned: the runs.
         jobs: their commands.
-        scenes: by name; those that exist, or will be made, with their folders.
-        mistakes: gets what is found.
-        here: whether this is the machine that the runs are for, so that what it lacks is a mistake.
+        scenes: the scenes that exist or will be made, with their folders, by name.
+        mistakes: receives the mistakes.
+        here: whether the runs are for this machine; if so, what it lacks is a mistake.
     """
     by_id = {job.run_id: job for job in jobs}
     sizes = _sizes_of(scenes)
@@ -88,22 +87,22 @@ def check_runs(
             mistakes.add(keys["scene"], str(error))
         except LapgsError as error:
             _note(mistakes, keys, str(error))
-        except _USAGE_ERROR as error:
-            _note(mistakes, keys, cast(Any, error).format_message().rstrip("."))
+        except USAGE_ERROR as error:
+            _note(mistakes, keys, usage_message(error))
 
 
 def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:
-    """Note a message under the key of the first option that it names and that the experiment sets."""
+    """Add a message under the key of the first option in it that the experiment sets."""
     options = (match.replace("-", "_") for match in re.findall(r"--([a-z][a-z-]*[a-z])", message))
     mistakes.add(next((keys[option] for option in options if option in keys), keys["run"]), message)
 
 
 @dataclass
 class _Check(Rehearsal):
-    """Completes what a command checks by itself: is there such a rasterizer here, and do the stages fit the images?"""
+    """Check that the rasterizer exists on this machine and that the images are large enough for all levels."""
 
     spec: RunSpec
-    size: Sizes | None  # None: the scene is missing, which is said already
+    size: Sizes | None  # None: the scene is missing, which is already a mistake
     here: bool
 
     def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
@@ -112,26 +111,26 @@ class _Check(Rehearsal):
 
         if self.size is not None:
             make_plan(self.size(reference.resolution) or ANY_SIZE, settings)
-        if self.here or rasterizer != AUTO:  # elsewhere it may be another one
+        if self.here or rasterizer != AUTO:  # auto may choose another one elsewhere
             check_storage(settings, training_rasterizer(choose_rasterizer(rasterizer), settings).device)
 
     def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
-        assert self.size is not None, "there are no commands of a checkout without a scene"
+        assert self.size is not None, "commands of a checkout need a scene"
         if self.spec.method == "bare" or _sets(self.spec.arguments, "--iterations"):
             return
         known = None
         if not _sets(self.spec.arguments, "-r", "--resolution"):
-            # A script reads scenes in its own way: what we cannot read, it may.
+            # The script may read scenes that we cannot read.
             with suppress(SceneError):
                 known = self.size(BACKBONE_PREFIX + arguments[list(arguments).index("-r") + 1])
         StagePlan.create(known or ANY_SIZE, self.spec.iterations, settings.levels, settings.shares, settings.kind)
 
 
 def _rehearse(job: Job, check: _Check) -> None:
-    """Have a run's first command check its options and end.
+    """Let the first command of a run check its options.
 
     Raises:
-        LapgsError, click's UsageError: the command would refuse them.
+        LapgsError, click's UsageError: the command refuses them.
     """
     name, *words = job.steps[0].command[len(LAPGS) :]
     if not check.here and name == "run":
@@ -142,7 +141,7 @@ def _rehearse(job: Job, check: _Check) -> None:
 
 
 def _without_device(words: Sequence[str]) -> list[str]:
-    """A command line that leaves the device to the machine: another one may have a GPU."""
+    """Return a command line without `--device cuda`, because the machine that runs it may have a GPU."""
     kept = list(words)
     if "--device" in kept and kept[(at := kept.index("--device")) + 1] == "cuda":
         del kept[at : at + 2]
@@ -151,17 +150,17 @@ def _without_device(words: Sequence[str]) -> list[str]:
 
 @cache
 def _command(name: str) -> Any:
-    """The command of that name, as click's object."""
+    """Return a command as click's object."""
     from lapgs_plugin.cli.app import app
 
     return cast(Any, typer.main.get_command(app)).commands[name]
 
 
 def _check_kinds(spec: RunSpec) -> None:
-    """Refuse a value where an option is a flag, and true or false where it takes a value.
+    """Check that flags are true or false and that other options are not.
 
     Raises:
-        UserInputError: an option is given the other kind.
+        UserInputError: an option has a value of the wrong kind.
     """
     flags = {
         p.name: bool(getattr(p, "is_flag", False)) for p in _command("train" if spec.checkout is None else "run").params
@@ -176,20 +175,20 @@ def _check_kinds(spec: RunSpec) -> None:
 
 
 def _check_name(spec: RunSpec) -> None:
-    """Refuse a run whose files would have names that no file system takes.
+    """Check that the names of a run's files are not too long.
 
     Raises:
         UserInputError: the names of its scene and its backbone are too long together.
     """
     if len(spec.run_id) > LONGEST_RUN:
         raise UserInputError(
-            f"a run called {spec.run_id:.60}... takes {len(spec.run_id)} characters, expected at most {LONGEST_RUN}; "
+            f"a run called {spec.run_id:.60}... has {len(spec.run_id)} characters, expected at most {LONGEST_RUN}; "
             "choose shorter names for the scene and the backbone"
         )
 
 
 def _check_arguments(spec: RunSpec) -> None:
-    """Refuse words for a checkout's script that would take its run out of the experiment's folder.
+    """Refuse arguments of a checkout's script that would change the output folder or the scene.
 
     Raises:
         UserInputError: there is one.
@@ -199,8 +198,7 @@ def _check_arguments(spec: RunSpec) -> None:
             raise UserInputError(f"arguments {word!r}: expected no NUL, which no command line can hold")
         if _sets([word], *OWN_ARGUMENTS):
             raise UserInputError(
-                f"arguments {word!r}: the experiment says where a run is written and which scene it is trained on; "
-                "expected other options of the script"
+                f"arguments {word!r}: the experiment sets output folder and scene; expected other options of the script"
             )
 
 
@@ -209,7 +207,7 @@ def _sets(arguments: Sequence[str], *options: str) -> bool:
 
 
 def _sizes_of(scenes: Mapping[str, tuple[SceneSpec, Path]]) -> dict[str, Sizes]:
-    """How large the images of each scene are, each looked up once."""
+    """Return a cached lookup of image sizes for each scene."""
     return {name: cache(_SceneSizes(*where)) for name, where in scenes.items()}
 
 
@@ -219,10 +217,10 @@ class _SceneSizes:
     folder: Path
 
     def __call__(self, resolution: str) -> tuple[int, int] | None:
-        """The smallest width and height, from headers alone; None where nothing here reads scenes.
+        """Return the smallest width and height from image headers; None without the packages that read scenes.
 
         Raises:
-            SceneError: the scene cannot be trained on.
+            SceneError: the scene cannot be used.
         """
         if self.scene.sample is not None and not self.folder.is_dir():
             from lapgs_plugin.scenes.sample import parse_size

@@ -1,4 +1,4 @@
-"""`lapgs bench EXPERIMENT.toml`: run what a file describes, keep what comes out, show it as tables."""
+"""Run an experiment file and make tables of its results: `lapgs bench EXPERIMENT.toml`."""
 
 from __future__ import annotations
 
@@ -21,49 +21,54 @@ if TYPE_CHECKING:
     from lapgs_plugin.experiments.schema import Experiment
     from lapgs_plugin.experiments.store import Job, Outcome, ResultStore
 
-SELECTION = "What to run"
-PLACES = "Where"
-ENGINE = "On what"
+SELECTION = "Selection"
+PLACES = "Folders"
+ENGINE = "Execution"
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
     *("script", "arguments", "off", "record", "view", "view_port"),
 }
-"""Parameters of `lapgs train` and `lapgs run` that an experiment says in its own way."""
-
+"""Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own."""
 
 LONGEST_NAME = 255
-"""Bytes of a file's name that file systems take."""
+"""Bytes that file systems allow in a file name."""
 
 
 class RunsFailedError(LapgsError):
-    """Some runs of an experiment failed; the others are done and shown."""
+    """Report that some runs of an experiment failed. The others are finished and shown."""
 
     exit_code = 1
 
 
 def bench_experiment(
-    experiment: Annotated[Path, typer.Argument(help="Experiment file, such as benchmarks/smoke.toml.")],
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
+    ],
     scene: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this scene; may be given several times.")
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this scene. Repeatable.")
     ] = None,
     backbone: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this backbone; several times as well.")
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this backbone. Repeatable.")
     ] = None,
     variant: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Only this variant; several times as well.")
+        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this variant. Repeatable.")
     ] = None,
     seeds: Annotated[
-        str | None, typer.Option(rich_help_panel=SELECTION, help="Instead of the file's, such as 0,1,2.")
+        str | None, typer.Option(rich_help_panel=SELECTION, help="Seeds instead of those in the file, such as 0,1,2.")
     ] = None,
     iterations: Annotated[
         int | None,
-        typer.Option(min=1, rich_help_panel=SELECTION, help="Instead of the file's; a variant's own in proportion."),
+        typer.Option(
+            min=1,
+            rich_help_panel=SELECTION,
+            help="Iterations instead of the file's; variants are scaled alike.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", rich_help_panel=PLACES, help="Folder for everything. Default: runs/bench/ and its name."
+            "--out", "-o", rich_help_panel=PLACES, help="Folder for runs and results. Default: runs/bench/NAME."
         ),
     ] = None,
     path: Annotated[
@@ -71,51 +76,51 @@ def bench_experiment(
         typer.Option(
             metavar="NAME=FOLDER",
             rich_help_panel=PLACES,
-            help="Where a data set, a scene or a checkout is; several times. Instead, set LAPGS_<NAME>.",
+            help="Folder of a data set, scene or checkout that the file names. Repeatable. LAPGS_<NAME> in the "
+            "environment does the same.",
         ),
     ] = None,
     launcher: Annotated[
-        str, typer.Option(rich_help_panel=ENGINE, help="local, slurm (through submitit) or ray.")
+        str, typer.Option(rich_help_panel=ENGINE, help="Where runs are executed: local, slurm (with submitit) or ray.")
     ] = "local",
     workers: Annotated[
         int | None,
         typer.Option(
-            min=1, max=1024, rich_help_panel=ENGINE, help="Runs at once. Default: one a GPU, or one without GPUs."
+            min=1, max=1024, rich_help_panel=ENGINE, help="Runs at a time. Default: one per GPU, or one without GPUs."
         ),
     ] = None,
     gpus: Annotated[
         str | None,
-        typer.Option(rich_help_panel=ENGINE, help="Which to use, as for CUDA_VISIBLE_DEVICES: 0,1. Default: all."),
+        typer.Option(rich_help_panel=ENGINE, help="GPUs to use, as in CUDA_VISIBLE_DEVICES: 0,1. Default: all."),
     ] = None,
     launcher_option: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
             rich_help_panel=ENGINE,
-            help="For Slurm what submitit takes (slurm_partition=gpu, timeout_min=600), for Ray address, num_gpus, "
-            "num_cpus; several times.",
+            help="Option of the launcher. Slurm: those of submitit (slurm_partition=gpu, timeout_min=600). Ray: "
+            "address, num_gpus, num_cpus. Repeatable.",
         ),
     ] = None,
     evaluate: Annotated[
         bool,
         typer.Option(
             "--eval/--no-eval",
-            help="Measure every run with `lapgs eval`; without, what training noted of its images at its end is taken.",
+            help="Measure every run with `lapgs eval`, or use the metrics that training recorded at its end.",
         ),
     ] = True,
     lpips_weights: Annotated[
-        list[Path] | None, typer.Option(help="For `lapgs eval`: weights of an LPIPS network; once for each network.")
+        list[Path] | None, typer.Option(help="Weights of an LPIPS network for `lapgs eval`. Repeatable.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands of every run, and run none.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands of all runs.")] = False,
     tables_only: Annotated[
-        bool, typer.Option("--tables-only", help="Write the tables again from results that are there.")
+        bool, typer.Option("--tables-only", help="Only write the tables from existing results.")
     ] = False,
 ) -> None:
-    """Run every scene, backbone, variant and seed of EXPERIMENT, and write tables with the paper's figures beside.
+    """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
 
-    Each run is a process of its own. Stop with Ctrl-C or lose the machine: the same command goes on, and repeats no
-    finished run. Several of these commands may work on one folder at a time. Failed runs are reported, and tried again
-    by the next command.
+    Each run is a process of its own. Repeat the command to continue after Ctrl-C or a crash; finished runs are kept and
+    failed ones are tried again. Several commands can work on one folder at the same time.
 
     Examples:
 
@@ -173,7 +178,7 @@ def bench_experiment(
 
 
 def _option_names() -> dict[str, set[str]]:
-    """By command, what an experiment may set."""
+    """Return the options that an experiment may set, by command."""
     from lapgs_plugin.cli.run import run
     from lapgs_plugin.cli.train import train
 
@@ -192,7 +197,7 @@ def _seeds(text: str | None) -> list[int] | None:
     except ValueError as error:
         raise UserInputError(f"--seeds {text}: expected whole numbers separated by commas, such as 0,1,2") from error
     if len(set(numbers)) < len(numbers):
-        raise UserInputError(f"--seeds {text}: expected different numbers, as each run counts once")
+        raise UserInputError(f"--seeds {text}: expected different numbers")
     return numbers
 
 
@@ -214,10 +219,10 @@ def _folder(name: str, text: str) -> Path:
 
 
 def _require_place(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written, before anything is.
+    """Refuse a folder that cannot be made or written.
 
     Raises:
-        UserInputError: it is a file or below one, or it may not be written.
+        UserInputError: it is a file or below one, or it is not writable.
     """
     existing = str(folder.absolute())
     # Not Path.exists, which raises where a name is too long for the file system.
@@ -228,14 +233,14 @@ def _require_place(folder: Path) -> None:
     if not os.path.isdir(existing):  # noqa: PTH112
         raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise UserInputError(f"--out {folder}: {existing} may not be written; choose another folder")
+        raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
 def _require_measuring(weights: Sequence[Path]) -> None:
-    """Refuse what `lapgs eval` would: not every machine has the packages to read scenes, and weights are files.
+    """Check that `lapgs eval` can run: the packages that read scenes are installed and the weights exist.
 
     Raises:
-        UserInputError: a package is missing, or a file of weights.
+        UserInputError: a package or a file of weights is missing.
     """
     from importlib.util import find_spec
 
@@ -245,8 +250,8 @@ def _require_measuring(weights: Sequence[Path]) -> None:
     missing = [name for name in ("OpenImageIO", "pycolmap") if find_spec(name) is None]
     if missing:
         raise UserInputError(
-            f"{' and '.join(missing)} cannot be imported here, which `lapgs eval` reads scenes with; give --no-eval to "
-            "take what training notes of its images"
+            f"{' and '.join(missing)} cannot be imported, and `lapgs eval` needs them to read scenes; install them, or "
+            "use the metrics that training records with --no-eval"
         )
 
 
@@ -260,7 +265,7 @@ def _print_commands(jobs: Sequence[Job]) -> None:
 
 
 def _order(workers: int | None, gpus: str | None, options: dict[str, str], folder: Folder) -> WorkOrder:
-    """What workers are started for; the runs come later."""
+    """Return the settings of the workers; the runs are filled in later."""
     from lapgs_plugin.experiments.launchers import WorkOrder
 
     return WorkOrder(
@@ -280,7 +285,7 @@ def _follow(
     start: Callable[[], Launcher],
     console: Console,
 ) -> None:
-    """Run the jobs with a progress bar and a line for each that ends."""
+    """Run the jobs with a progress bar and a line for each finished run."""
     from rich.markup import escape
 
     from lapgs_plugin.experiments.store import DONE, FAILED
@@ -304,7 +309,7 @@ def _follow(
         try:
             execute(store, run_ids, start, say)
         except KeyboardInterrupt:
-            raise TrainingStoppedError("stopped; the same command goes on with the runs that are left") from None
+            raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 
 
 def _summary(record: dict[str, Any]) -> str:
@@ -315,7 +320,11 @@ def _summary(record: dict[str, Any]) -> str:
 def _write(
     experiment: Experiment, planned: Sequence[PlannedRun], store: ResultStore, folder: Folder, messages: Console
 ) -> None:
-    """Write the results of finished runs, print their tables, and report failed runs."""
+    """Write the results, print their table, and report the runs that failed.
+
+    Raises:
+        RunsFailedError: some did.
+    """
     import shlex
 
     from rich.console import Console

@@ -1,4 +1,4 @@
-"""`lapgs bench raster`: how fast the CPU rasterizer is on this machine, and whether it is as fast as promised."""
+"""Benchmark the CPU rasterizer: `lapgs bench raster`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.evaluation.bench_raster import BenchCase, CaseResult
 
 LONGEST_NAME = 230
-"""Bytes of a file's name that leave room for its temporary one."""
+"""Bytes of a file name, with room left for the suffix of a temporary file."""
 DTYPES = ("float32", "float64")
 
 
@@ -22,26 +22,26 @@ def raster(
     sizes: Annotated[
         str | None,
         typer.Option(
-            help="What to time, separated by commas: 200x150, 400x300, 800x533, 1600x1066, or WIDTHxHEIGHT/GAUSSIANS. "
-            "Default: those four."
+            help="Image sizes, separated by commas: 200x150, 400x300, 800x533, 1600x1066, or WIDTHxHEIGHT/GAUSSIANS. "
+            "Default: the first four."
         ),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=1, max=1000, help="Turns at each size; slow contenders get fewer at large ones.")
+        int, typer.Option(min=1, max=1000, help="Repeats at each size; slow rasterizers get fewer at large sizes.")
     ] = 5,
     json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write everything measured to this file.")
+        Path | None, typer.Option("--json", metavar="FILE", help="Write all measurements to this file.")
     ] = None,
     dtype: Annotated[
-        str, typer.Option(metavar="|".join(DTYPES), help="Precision; gsplat takes part in float32 only.")
+        str, typer.Option(metavar="|".join(DTYPES), help="Precision; gsplat is measured in float32 only.")
     ] = "float32",
-    check: Annotated[bool, typer.Option("--check", help="Exit with 1 if something is slower than promised.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Exit with code 1 if it is slower than required.")] = False,
 ) -> None:
-    """Time whole training iterations of the CPU rasterizer against plain PyTorch.
+    """Measure training iterations of the CPU rasterizer and of rasterizers in plain PyTorch.
 
-    One iteration renders a random scene at SH degree 3, takes L1 + SSIM, goes backward and lets Adam step. The fast
-    rasterizer stands beside the readable oracle, differentiated by PyTorch, and beside gsplat's own PyTorch code, which
-    is made to run on a CPU. They take turns. All sizes together take a few minutes.
+    An iteration renders a random scene at SH degree 3, computes L1 + SSIM and its gradients, and steps Adam. The fast
+    CPU rasterizer is compared with the oracle and with gsplat's PyTorch code, both differentiated by autograd. All
+    sizes together take minutes.
     """
     import json
     import os
@@ -76,7 +76,7 @@ def raster(
 
 
 def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> list[CaseResult]:
-    """All cases, with a progress bar in units of estimated time."""
+    """Measure all cases, with a progress bar of estimated time."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -19,7 +19,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def takes_settings(command: _F) -> _F:
-    """Replace each parameter of a command that is a settings dataclass by the options that its fields declare.
+    """Replace the parameters of a command that are settings dataclasses by the options that their fields declare.
 
     The command is called with an instance, which checks its values when it is made. Fields without a declaration keep
     their defaults, unless they are settings dataclasses themselves: these add their options. A field declared with
@@ -43,11 +43,11 @@ def takes_settings(command: _F) -> _F:
     call.__signature__ = signature.replace(parameters=keyword_only)  # type: ignore[attr-defined]  # typer reads it
     call.__annotations__ = {each.name: each.annotation for each in keyword_only}
     result: Any = call
-    return result  # type: ignore[no-any-return]  # the same name and documentation, another signature
+    return result  # type: ignore[no-any-return]  # another signature
 
 
 def _declared(kind: Any) -> Iterator[tuple[Field[Any], Any, Option | None]]:
-    """Fields of a dataclass with their types and declarations."""
+    """Yield the fields of a dataclass with their types and declarations."""
     hints = get_type_hints(kind)
     for each in fields(kind):
         yield each, hints[each.name], each.metadata.get(KEY)
@@ -110,7 +110,7 @@ def _choices(registry: Registry[Any]) -> dict[str, Any]:
 
 
 def _build(kind: Any, given: dict[str, Any]) -> Any:
-    """Make an instance from a command's arguments, and take those out."""
+    """Make an instance from a command's arguments, and remove these from `given`."""
     values: dict[str, Any] = {}
     for each, hint, declared in _declared(kind):
         if declared is not None:
@@ -150,6 +150,6 @@ def _build_chosen(registry: Registry[Any], by: str, name: str, given: dict[str, 
 
 
 def given_options(context: typer.Context) -> set[str]:
-    """Return the parameters that stand on the command line, as opposed to those left at their defaults."""
+    """Return the parameters that were given on the command line."""
     sources: Mapping[str, Any] = {name: context.get_parameter_source(name) for name in context.params}
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}

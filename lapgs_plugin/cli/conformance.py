@@ -1,4 +1,4 @@
-"""`lapgs conformance`: every rasterizer that can run on this machine against the float64 oracle."""
+"""Check the rasterizers of this machine: `lapgs conformance`."""
 
 from __future__ import annotations
 
@@ -20,26 +20,24 @@ COLUMNS = {
     "opacity_logits": "opacity",
     "sh": "SH",
 }
-"""Errors shown in the table, and their titles."""
+"""Titles of the errors in the table."""
 
 
 def conformance(
     rasterizer: Annotated[
         list[str] | None,
-        typer.Option("--rasterizer", help="Check this one only; may be given several times. Default: all there are."),
+        typer.Option("--rasterizer", help="Rasterizer to check. Repeatable. Default: all that this machine can run."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print every figure as JSON, for scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all errors as JSON, for scripts.")] = False,
 ) -> None:
-    """Prove the rasterizers of this machine right: images, radii and all gradients, clamped and signed colour.
+    """Check images and gradients of the rasterizers on this machine against a float64 reference.
 
-    Each renders the same forty-odd small scenes, most of them built to hurt, and is compared with a float64 reference
-    in plain PyTorch. The table shows the worst error of each scene over both colour maps: of pixels absolute, of
-    gradients relative to the largest. "band" counts pixels that hang on a comparison which rounding can turn; they are
-    checked for plausibility only.
+    Every rasterizer renders the same small scenes, most of them corner cases, with clamped and with signed colour. The
+    table shows the worst error of each scene: absolute for pixels, relative to the largest value for gradients. "band"
+    counts pixels that depend on a comparison which rounding can turn; they are only checked for plausibility.
 
-    A CUDA extension is checked on its own signed colour where it has it, and with colours precomputed in PyTorch.
-    gsplat compiles its CUDA part when it is first used, for some minutes.
-    The exit code is 1 if anything fails.
+    A CUDA extension is checked with its native signed colour, if it has any, and with colours precomputed in PyTorch.
+    gsplat compiles its CUDA code at first use, which takes minutes. The exit code is 1 if a check fails.
     """
     import json
 
@@ -59,7 +57,7 @@ def conformance(
 
 
 def reachable() -> dict[str, Callable[[], list[Subject]]]:
-    """What can run on this machine, by the name to ask for it; each entry makes what is checked under that name."""
+    """Return the rasterizers that this machine can run: by name, a function that makes what is checked."""
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
@@ -85,7 +83,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
 
 
 def _extension_subjects(name: str) -> list[Subject]:
-    """An extension on the path it takes by itself and, where that is the native one, on the other too."""
+    """Return an extension with its own path for signed colour, and with precomputed colours."""
     from lapgs_plugin.evaluation.conformance import Subject
     from lapgs_plugin.rasterizers.extensions import CudaExtension
     from lapgs_plugin.rasterizers.signed_color import ColorPath, SignedColorRasterizer

@@ -1,4 +1,4 @@
-"""`lapgs doctor`: what this machine has, what will be used, and what is missing."""
+"""Check this machine: `lapgs doctor`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 IMPORTED = ("OpenImageIO", "pycolmap")
-"""Packages with compiled parts that no other probe imports."""
-NOT_IN_THE_WAY = ("Kernel cache",)
-"""What may be broken while training still works."""
-ON_THE_CPU = "`lapgs train --rasterizer cpu` does without"
+"""Packages with compiled code that no other probe imports."""
+NOT_NEEDED = ("Kernel cache",)
+"""Findings that do not prevent training."""
+ON_THE_CPU = "`lapgs train --rasterizer cpu` works without it"
 GSPLAT_FILES = ("gsplat/rendering.py", "examples/simple_trainer.py")
 """Files of a checkout of gsplat, which `lapgs run` does not drive."""
 MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold red]!![/bold red]"}
@@ -25,13 +25,13 @@ MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold
 
 def doctor(
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print everything as JSON, for scripts and bug reports.")
+        bool, typer.Option("--json", help="Print all findings as JSON, for scripts and bug reports.")
     ] = False,
 ) -> None:
-    """Look at Python, PyTorch, GPU, compilers, packages and the current folder; say what `lapgs train` will use.
+    """Check Python, PyTorch, GPU, compilers and packages, and say what `lapgs train` will use.
 
-    Nothing is changed, nothing is downloaded, and the exit code is always 0. Lines marked !! stand in the way of
-    something and say what to do; lines marked -- are not there and not needed.
+    The command changes and downloads nothing, and its exit code is always 0. Lines marked !! are problems and say what
+    to do. Lines marked -- are optional parts that are not installed.
     """
     import json
     from dataclasses import asdict
@@ -46,7 +46,7 @@ def doctor(
 
 
 def examine() -> dict[str, list[Finding]]:
-    """All findings by section, the conclusion last. Slow probes run side by side."""
+    """Return all findings by section, the conclusion last. Slow probes run in parallel."""
     from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
@@ -104,12 +104,12 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
-    """What `lapgs train` will use, or what stands in its way, by the rule of `training.backend.choose_rasterizer`."""
+    """Say what `lapgs train` will use, as `training.backend.choose_rasterizer` decides, or what prevents it."""
     from lapgs_plugin.environment import gpus_are_hidden
     from lapgs_plugin.environment.findings import Finding
 
     needed = [*sections["System"], *sections["PyTorch"], *sections["CPU rasterizer"], *sections["Packages"]]
-    broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_IN_THE_WAY]
+    broken = [finding.name for finding in needed if finding.status == "problem" and finding.name not in NOT_NEEDED]
     if gpus_are_hidden():
         broken = [name for name in broken if name != "GPU"]
     advice = "see the lines !!"
@@ -121,7 +121,7 @@ def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Findin
             return [Finding("will use", "ok", f"gsplat on the GPU, {torch.facts['gpus'][0]}")]
         broken, advice = [gsplat.name], f"{gsplat.advice or gsplat.detail}; {ON_THE_CPU}"
     if broken:
-        return [Finding("will use", "problem", f"nothing until this is mended: {', '.join(broken)}", advice)]
+        return [Finding("will use", "problem", f"nothing until this is fixed: {', '.join(broken)}", advice)]
     return [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]
 
 

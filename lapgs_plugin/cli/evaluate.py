@@ -1,4 +1,4 @@
-"""`lapgs eval`: the figures of a run."""
+"""Measure a run: `lapgs eval`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, refuse, show_log
+from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import printable
 
 if TYPE_CHECKING:
@@ -16,63 +17,61 @@ if TYPE_CHECKING:
 FLICKER_FRAMES = 120
 
 SHOWN_VIEWS = 12
-"""How many views the terminal shows; metrics.json and the report hold all."""
+"""Views listed on the terminal; metrics.json and the report list all."""
 
 
+@takes_settings
 def evaluate(
     run: Annotated[
-        Path, typer.Argument(help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+        Path,
+        typer.Argument(metavar="RUN", help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`."),
     ],
-    scene: Annotated[
-        Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
-    ] = None,
+    options: RenderOptions,
     lpips: Annotated[
         str | None,
         typer.Option(
             metavar="VARIANTS",
-            help="Which LPIPS to measure: some of vgg, alex, squeeze and vgg_3dgs (VGG as 3DGS codebases compute and "
-            "print it) with commas between, or none. Default: those of the named weights, or else both of VGG.",
+            help="LPIPS variants to measure, separated by commas: vgg, alex, squeeze, vgg_3dgs (VGG as 3DGS codebases "
+            "compute it), or none. Default: those that --lpips-weights names, else vgg and vgg_3dgs.",
         ),
     ] = None,
     lpips_weights: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Weights of one network in torchvision's layout, .pth or .safetensors; once for each network. "
-            "Default: what torchvision downloaded at some time. Nothing is ever downloaded here."
+            help="Weights of an LPIPS network in torchvision's layout, .pth or .safetensors. Repeatable. Default: "
+            "those in torchvision's cache. Nothing is downloaded."
         ),
     ] = None,
     trajectory: Annotated[
         str | None,
         typer.Option(
             help="Measure flicker along a camera path instead of the views: orbit, spline or a JSON file of cameras, "
-            "as `lapgs render` takes them."
+            "as for `lapgs render`."
         ),
     ] = None,
     baseline: Annotated[
-        Path | None, typer.Option(help="With --trajectory: a single field of the scene, to compare with.")
+        Path | None, typer.Option(help="With --trajectory: a run of one field to compare with.")
     ] = None,
     frames: Annotated[
         int | None,
-        typer.Option(min=2, help=f"Frames of the path. Default: {FLICKER_FRAMES}, or each camera of a file once."),
+        typer.Option(min=2, help=f"Frames of the path. Default: {FLICKER_FRAMES}, or the cameras of the JSON file."),
     ] = None,
-    device: DeviceOption = "auto",
-    rasterizer: RasterizerOption = "auto",
 ) -> None:
-    """Measure RUN on its held-out views, print the figures and write them to RUN/metrics.json.
+    """Measure PSNR, SSIM and LPIPS of RUN on its held-out views, and write RUN/metrics.json.
 
-    PSNR, SSIM and LPIPS are means over the views, of float images clamped to [0, 1], as 3DGS reports them. LPIPS needs
-    weights of its networks; without them its column says so. Without held-out views (`lapgs train --eval`) the training
-    views are measured, which flatters. Times are those of training: the optimization, and everything around it beside
-    it. Frames a second are those of the composed image.
+    The metrics are means over views of float images clamped to [0, 1], as 3DGS reports them. LPIPS is skipped if the
+    weights of its network are missing. A run without held-out views (`lapgs train --eval`) is measured on its training
+    views, where the metrics are higher. The output also shows training times and frames per second of the composed
+    image.
 
-    With --trajectory: how much the composition, and each band, changes from frame to frame along a path besides the
-    camera's motion, which is undone by rendered depth where nothing hides a pixel; written to RUN/stability.json.
+    With --trajectory the command measures flicker instead: how much each frame differs from the one before after
+    warping it by the rendered depth, where both show the same surface. It writes RUN/stability.json.
     """
     if trajectory is not None:
         refuse(
             {"--lpips": lpips, "--lpips-weights": lpips_weights}, "does not go with --trajectory, which has no photos"
         )
-        _stability(run, baseline, trajectory, frames, scene, device, rasterizer)
+        _stability(run, baseline, trajectory, frames, options)
         return
     refuse({"--baseline": baseline, "--frames": frames}, "needs --trajectory")
     from lapgs_plugin.evaluation.figures import evaluate_run
@@ -82,21 +81,13 @@ def evaluate(
     wanted = LpipsRequest.parse(lpips, lpips_weights or ())
     archive = RunArchive.open(run)
     show_log()
-    metrics = evaluate_run(archive, scene, device=device, rasterizer=rasterizer, lpips=wanted)
+    metrics = evaluate_run(archive, options.scene, device=options.device, rasterizer=options.rasterizer, lpips=wanted)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
 
 
-def _stability(
-    run: Path,
-    baseline: Path | None,
-    trajectory: str,
-    frames: int | None,
-    scene: Path | None,
-    device: str,
-    rasterizer: str,
-) -> None:
-    """Measure flicker along a path, print it and write it down."""
+def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | None, options: RenderOptions) -> None:
+    """Measure flicker along a path and print it."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -107,8 +98,10 @@ def _stability(
 
     archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)
     show_log()
-    cameras = path_cameras(archive, trajectory, frames, FLICKER_FRAMES, scene)
-    figures = evaluate_stability(archive, other, trajectory, cameras, device=device, rasterizer=rasterizer)
+    cameras = path_cameras(archive, trajectory, frames, FLICKER_FRAMES, options.scene)
+    figures = evaluate_stability(
+        archive, other, trajectory, cameras, device=options.device, rasterizer=options.rasterizer
+    )
     table = Table("", "mean difference", "PSNR (dB)", box=box.SIMPLE_HEAD)
     for name, each in figures["flicker"].items():
         table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")

@@ -1,4 +1,4 @@
-"""`lapgs export`: the fields of a run for other viewers."""
+"""Export the Gaussians of a run: `lapgs export`."""
 
 from __future__ import annotations
 
@@ -16,20 +16,24 @@ FORMATS = ("ply", "spz")
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+    ],
     file_format: Annotated[
         str,
-        typer.Option("--format", help="ply (standard 3DGS, exact) or spz (version 3, a tenth of the size, rounded)."),
+        typer.Option("--format", help="ply (the standard 3DGS layout) or spz (version 3, smaller, lossy)."),
     ] = "ply",
-    level: Annotated[int | None, typer.Option(help="This level alone. Default: every finished one.")] = None,
+    level: Annotated[
+        int | None, typer.Option(help="Level to export; 0 is the finest. Default: all finished levels.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/export.")] = None,
 ) -> None:
-    """Write each level of RUN as a file for other viewers: level_<l>_base, level_<l>_residual or level_<l>_field.
+    """Export the Gaussians of each level of RUN as PLY or SPZ for other viewers.
 
-    The base is an ordinary field and opens in any 3DGS viewer. A residual is none: it holds what its level adds to the
-    upsampled image of the levels above it, in signed colours over zero. Its file says so, in a comment of the PLY's or
-    gzip's header; what another viewer shows of it is not the composition. Where levels are nested every one is an
-    ordinary field.
+    Files are named level_<l>_base, level_<l>_residual or level_<l>_field. The base and nested levels are ordinary
+    fields that open in any 3DGS viewer. A residual of a Laplacian hierarchy is not: its signed colours are added to the
+    upsampled image of the coarser levels, so another viewer cannot show the composition. A comment in the header of its
+    file says so.
 
     Examples:
 
@@ -45,7 +49,7 @@ def export(
         raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")
     archive = RunArchive.open(run)
     levels, folder = _levels(archive, level), archive.path(EXPORT) if out is None else out
-    fields = {each: archive.field(each) for each in levels}  # all are whole before anything is written
+    fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
     with one_line_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for each, field in fields.items():
@@ -64,15 +68,15 @@ def export(
 
 
 def _levels(archive: RunArchive, level: int | None) -> tuple[int, ...]:
-    """The finished levels to write, or the one that is wanted."""
+    """Return the levels to export."""
     if level is None:
-        archive.manifest.record(archive.manifest.levels - 1)  # refuses a run without any
+        archive.manifest.record(archive.manifest.levels - 1)  # raises if no level is finished
         return archive.available_levels
     return (archive.manifest.record(level).level,)
 
 
 def _note(archive: RunArchive, level: int) -> str:
-    """What a person should know who finds the file."""
+    """Return a comment for the file's header that says what the level is."""
     name, levels = archive.path().name, archive.manifest.levels
     if level == levels - 1:
         return f"base of {name}, a hierarchy of {levels} levels" if levels > 1 else f"field of {name}"

@@ -1,4 +1,4 @@
-"""`lapgs import-run`: a run folder from what other programs trained."""
+"""Make a run folder from a model that another program trained: `lapgs import-run`."""
 
 from __future__ import annotations
 
@@ -13,34 +13,37 @@ from lapgs_plugin.errors import UserInputError
 
 def import_run(
     folder: Annotated[
-        Path, typer.Argument(help="What a 3DGS codebase or the paper authors' release wrote: its -m folder.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Output folder (-m) of a 3DGS codebase or the paper authors' release."),
     ],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder to write. Default: FOLDER/lapgs.")] = None,
     scene: Annotated[
-        Path | None, typer.Option("--scene", "-s", help="Where the scene is now, if it moved since training.")
+        Path | None, typer.Option("--scene", "-s", help="Scene folder, if it was moved after training.")
     ] = None,
     backbone: Annotated[
         str | None,
-        typer.Option(help=f"Backbone that trained it, where the folder does not tell: {', '.join(OWN)}."),
+        typer.Option(help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}."),
     ] = None,
     iteration: Annotated[
-        int | None, typer.Option(help="Take the fields saved at this iteration. Default: the last ones.")
+        int | None, typer.Option(help="Import the model saved at this iteration. Default: the last one.")
     ] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
-            help="An option of its rasterizer that was not the default and is recorded nowhere: mult=0.7 or "
-            "antialiasing=true. May be given several times.",
+            metavar="NAME=VALUE",
+            help="A rasterizer option that FOLDER does not record, if it was not the default: mult=0.7 or "
+            "antialiasing=true. Repeatable.",
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already in OUT.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in OUT.")] = False,
 ) -> None:
-    """Turn FOLDER, trained without this program, into a run folder for `lapgs render`, `lapgs eval` and `lapgs report`.
+    """Make a run folder from a model that was trained without this program.
 
-    FOLDER is that of a 3DGS codebase (point_cloud/), which becomes a run of one level, or of the paper authors' release
-    (L1/, L0/), rendered as its own script renders it, on the assumption that it was trained with --blur_up as in its
-    scripts. The fields are copied; FOLDER stays as it is.
+    `lapgs render`, `lapgs eval`, `lapgs report` and `lapgs view` work on the result. FOLDER is the output of a 3DGS
+    codebase (point_cloud/), which becomes a run of one level, or of the paper authors' release (L1/, L0/). The latter
+    is rendered as its own script does, assuming that it was trained with --blur_up as in its scripts. The fields are
+    copied; FOLDER stays unchanged.
 
     Examples:
 
@@ -62,7 +65,7 @@ def import_run(
             f"level {record.level}: {record.num_gaussians:,} Gaussians, {record.iterations:,} steps, {width}x{height}"
         )
     if not run.times_are_known:
-        print("training time is not recorded there: figures will show it as 0")
+        print("the training time is not recorded there: it is shown as 0")
     print(f"{archive.path()} holds the run")
 
 

@@ -1,4 +1,4 @@
-"""`lapgs patch`: teach a checkout's rasterizer signed colour, make it build with a current CUDA, and take that back."""
+"""Patch the rasterizer of a checkout: `lapgs patch`."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ if TYPE_CHECKING:
     from lapgs_plugin.patching import FileChange, Target
 
 app = typer.Typer(
-    help="Patch a backbone's rasterizer: signed colour, and what a current CUDA needs to build it.",
+    help="Patch a checkout's CUDA rasterizer: add signed colour, or make it build with a current CUDA.",
     no_args_is_help=True,
 )
 
 Checkout = Annotated[
-    Path, typer.Argument(help="The backbone's checkout, or the folder of its rasterizer alone.", show_default=False)
+    Path,
+    typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer."),
 ]
 SetName = Annotated[
     str,
     typer.Option(
         "--set",
-        help="Which edits: signed-color (residual fields rendered natively), build-cuda13 (build with CUDA 12.8 to "
-        "13), or all of them. Not among all, as they change ordinary training too: gradient-fixes and robustness, "
-        "where there are any; patches/README.md says what they mend.",
+        help="Edits to apply: signed-color (native rendering of residual fields), build-cuda13 (build with CUDA 12.8 "
+        "to 13), or all for both. gradient-fixes and robustness exist for some rasterizers; they also change ordinary "
+        "training and are not part of all. See patches/README.md.",
     ),
 ]
-AllowDirty = Annotated[
-    bool, typer.Option("--allow-dirty", help="Also edit files that have changes of yours not yet committed.")
-]
+AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files with uncommitted changes.")]
 
 
 @app.command("status")
 def status_(checkout: Checkout, set_name: SetName = "all") -> None:
-    """Say which edits are in, which can be put in, and what stands in the way."""
+    """Show which edits are applied, which can be applied, and what prevents the others."""
     from lapgs_plugin.patching import plan_apply, read_only, status, uncommitted
 
     chosen = _targets(checkout, set_name, opt_in=True)
@@ -54,22 +53,25 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
                     for path in read_only(plan_apply(target, [found.set])):
                         typer.echo(f"    read-only: {path}")
             for path in uncommitted(_files(target)):
-                typer.echo(f"  has changes that are not committed: {path}")
+                typer.echo(f"  uncommitted changes: {path}")
 
 
 @app.command("diff")
 def diff(checkout: Checkout, set_name: SetName = "all") -> None:
-    """Print what `apply` would change, as a unified diff, and change nothing."""
+    """Print the changes of `lapgs patch apply` as a unified diff."""
     changes = [change for _, change in _planned(_targets(checkout, set_name, opt_in=False))]
     if not changes:
-        typer.echo(f"{checkout}: nothing to apply, these edits are in: {set_name}", err=True)
+        typer.echo(f"{checkout}: nothing to apply, these edits are applied already: {set_name}", err=True)
     for change in changes:
         typer.echo(_unified(change, checkout), nl=False)
 
 
 @app.command("apply")
 def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty = False) -> None:
-    """Put the edits in: all of them, or none if one does not fit. Then reinstall the extension, as it says."""
+    """Apply the edits: all of them, or none if one does not fit.
+
+    Reinstall the extension afterwards with the command that is printed.
+    """
     from lapgs_plugin.errors import PatchError
     from lapgs_plugin.patching import uncommitted, write_all
 
@@ -77,15 +79,15 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
     with _alone(chosen):
         planned = _planned(chosen)
         if not planned:
-            typer.echo(f"{checkout}: nothing to do, these edits are in: {set_name}")
+            typer.echo(f"{checkout}: nothing to do, these edits are applied already: {set_name}")
             return
         changes = [change for _, change in planned]
         _refuse_read_only(changes)
         dirty = [] if allow_dirty else uncommitted(change.path for change in changes)
         if dirty:
             raise PatchError(
-                f"changes that are not committed in {_listed(dirty)}; commit them first, or pass --allow-dirty "
-                "(`lapgs patch revert` takes out only the patch either way); nothing was changed"
+                f"uncommitted changes in {_listed(dirty)}; commit them first, or pass --allow-dirty (`lapgs patch "
+                "revert` removes only the patch in either case); nothing was changed"
             )
         write_all(changes)
     _report("patched", planned)
@@ -93,14 +95,14 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
 
 @app.command("revert")
 def revert(checkout: Checkout, set_name: SetName = "all") -> None:
-    """Take the edits out again; what you changed elsewhere in the same files stays."""
+    """Remove the edits; your own changes in the same files stay."""
     from lapgs_plugin.patching import plan_revert, write_all
 
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         planned = [(target, change) for target, sets in chosen for change in plan_revert(target, sets)]
         if not planned:
-            typer.echo(f"{checkout}: nothing to take out, none of these edits is in: {set_name}")
+            typer.echo(f"{checkout}: nothing to remove, none of these edits is applied: {set_name}")
             return
         changes = [change for _, change in planned]
         _refuse_read_only(changes)
@@ -110,22 +112,21 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
 
 @contextmanager
 def _alone(chosen: Sequence[tuple[Target, Collection[str]]]) -> Iterator[None]:
-    """Keep other `lapgs patch` processes away while this one works, and tidy up after one that was killed."""
+    """Lock out other `lapgs patch` processes, and remove files that a killed one left."""
     from lapgs_plugin.patching import alone
 
     with alone(target for target, _ in chosen) as stuck:
         for path in stuck:
-            typer.echo(f"left by a `lapgs patch` that was killed, and cannot be removed: {path}", err=True)
+            typer.echo(f"a killed `lapgs patch` left {path}, which cannot be removed", err=True)
         yield
 
 
 def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Target, tuple[str, ...]]]:
-    """The extensions in the checkout that take the wanted edits, each with the sets that are meant.
+    """Return the extensions in the checkout that have the wanted edits, each with its sets of edits.
 
     Args:
-        checkout: see the commands.
-        set_name: see the commands.
-        opt_in: whether all sets are also those that have to be asked for.
+        checkout, set_name: as the commands take them.
+        opt_in: whether "all" includes the sets that must be named otherwise.
     """
     from lapgs_plugin.errors import PatchError
     from lapgs_plugin.patching import ALL_SETS, find_targets
@@ -166,7 +167,7 @@ def _report(verb: str, planned: Sequence[tuple[Target, FileChange]]) -> None:
     for _, change in planned:
         typer.echo(f"{verb} {change.path}")
     commands = [target.recipe.reinstall.format(folder=target.folder) for target, _ in planned]
-    typer.echo("One thing is left to do, build and install again what changed:")
+    typer.echo("Next, reinstall the changed extensions:")
     for command in dict.fromkeys(commands):
         typer.echo(f"  {command}")
 

@@ -1,4 +1,4 @@
-"""`lapgs prepare`: from a folder of photos to a scene that trains."""
+"""Make a scene from photos: `lapgs prepare`."""
 
 from __future__ import annotations
 
@@ -9,36 +9,42 @@ import typer
 
 
 def prepare(
-    photos: Annotated[Path, typer.Argument(help="Folder of JPEG, PNG, TIFF, BMP or WebP photos of one scene at rest.")],
-    out: Annotated[Path, typer.Argument(help="Scene folder to write.")],
+    photos: Annotated[
+        Path, typer.Argument(metavar="PHOTOS", help="Folder of JPEG, PNG, TIFF, BMP or WebP photos of a static scene.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write.")],
     matcher: Annotated[
         str,
         typer.Option(
-            help="exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours by name, for a video."
+            help="Pairs of photos to match. exhaustive: all pairs, for up to a few hundred photos. sequential: "
+            "neighbours in name order, for frames of a video."
         ),
     ] = "exhaustive",
     camera_model: Annotated[
         str,
-        typer.Option(help="COLMAP's lens model to fit: SIMPLE_RADIAL for few photos, OPENCV_FISHEYE for fisheyes, ..."),
+        typer.Option(
+            help="COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens)."
+        ),
     ] = "OPENCV",
     single_camera: Annotated[
         bool | None,
         typer.Option(
             "--single-camera/--own-cameras",
-            help="All photos share one lens, or only those with the same EXIF. Default: one if all have one size.",
+            help="Fit one camera to all photos, or one to each group of photos with the same EXIF data. Default: one "
+            "camera if all photos have the same size.",
         ),
     ] = None,
     max_size: Annotated[
-        int | None, typer.Option(help="Longest side in pixels of the scene's images. Default: as the photos.")
+        int | None, typer.Option(help="Longest side of the scene's images in pixels. Default: that of the photos.")
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the scene that OUT holds, or start unfinished work over.")
+        bool, typer.Option("--overwrite", help="Replace the scene in OUT, or restart unfinished work.")
     ] = False,
 ) -> None:
-    """Recover cameras and points from photos with COLMAP and undistort the photos.
+    """Make a scene from photos: recover cameras and points with COLMAP, then undistort the photos.
 
-    OUT becomes a scene with PINHOLE cameras that `lapgs train` and every 3DGS codebase read. An interrupted run goes on
-    where it stopped when the command is repeated.
+    OUT becomes a COLMAP scene with PINHOLE cameras, which `lapgs train` and every 3DGS codebase read. Repeat the
+    command to continue an interrupted run.
     """
     from lapgs_plugin.scenes.prepare import prepare_scene
 

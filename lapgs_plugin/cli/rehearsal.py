@@ -1,4 +1,4 @@
-"""Let a command check its options and end, for experiments that check all runs before the first one."""
+"""Check the options of a command without running it. Experiments check all runs before the first one starts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Rehearsal:
-    """Receive what a command would train with. A command whose context has one as its object ends there."""
+    """Receive the checked options of a command. With a Rehearsal as its context's object, a command ends there."""
 
     def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
         """Receive the settings of `lapgs train`, the scene and how it is read, and the value of --rasterizer."""

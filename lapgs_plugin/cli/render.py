@@ -1,4 +1,4 @@
-"""`lapgs render`: the images of a run."""
+"""Render the images of a run: `lapgs render`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, refuse, show_log
+from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -23,70 +24,70 @@ OTHER_VIDEOS = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".webm")
 DEFAULT_FRAMES, DEFAULT_FPS = 240, 30
 
 
+@takes_settings
 def render(
-    run: Annotated[Path, typer.Argument(help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+    ],
+    options: RenderOptions,
     views: Annotated[
         str | None,
-        typer.Option(help="test (held out), train or all. Default: test, or train when nothing was held out."),
+        typer.Option(help="test (held-out views), train or all. Default: test if views were held out, else train."),
     ] = None,
     image_format: Annotated[
-        str, typer.Option("--format", help="png (8 bits, clamped) or exr (float, unclamped, residuals as they are).")
+        str, typer.Option("--format", help="png (8 bits, clamped) or exr (float, unclamped, signed residuals).")
     ] = "png",
     level: Annotated[
-        int | None, typer.Option(help="Finest level to add; 0 is full resolution. Default: the finest that is trained.")
+        int | None,
+        typer.Option(help="Finest level to render; 0 is full resolution. Default: the finest finished level."),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             "-o",
-            help="Folder to write to. Default: RUN/renders. With --trajectory an .mp4 file or a folder of images; "
-            "default: RUN/renders/<trajectory>.mp4.",
+            help="Folder to write to, default RUN/renders. With --trajectory an .mp4 file or a folder of images, "
+            "default RUN/renders/<trajectory>.mp4.",
         ),
     ] = None,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Also write photo, composition and their difference side by side.")
+        bool, typer.Option("--compare", help="Also write photo, composition and difference side by side.")
     ] = False,
     trajectory: Annotated[
         str | None,
         typer.Option(
-            help="Render a camera path instead of views: orbit (around what the cameras look at), spline (through the "
-            "training cameras) or a JSON file of cameras, laid out like transforms.json."
+            help="Render along a camera path instead of the views: orbit (around the scene's centre), spline (through "
+            "the training cameras) or a JSON file of cameras in the layout of transforms.json."
         ),
     ] = None,
     frames: Annotated[
         int | None,
         typer.Option(
             min=2,
-            help=f"Frames of the path. Default: {DEFAULT_FRAMES}, or each camera of a file once; with it, a smooth "
-            "path through those.",
+            help=f"Frames of the path. Default: {DEFAULT_FRAMES}, or the cameras of the JSON file; given with a file, "
+            "its cameras are interpolated.",
         ),
     ] = None,
     frame_rate: Annotated[
-        float | None, typer.Option(min=1.0, max=1000.0, help=f"Frames a second of a video. Default: {DEFAULT_FPS}.")
+        float | None, typer.Option(min=1.0, max=1000.0, help=f"Frames per second of the video. Default: {DEFAULT_FPS}.")
     ] = None,
     size: Annotated[
         str | None,
-        typer.Option(help="Size of a path's views or of --fps, such as 1280x720. Default: the cameras' own."),
+        typer.Option(help="Image size with --trajectory or --fps, such as 1280x720. Default: that of the cameras."),
     ] = None,
     panels: Annotated[
-        bool, typer.Option("--panels", help="Base, residuals and composition side by side; with --trajectory.")
+        bool, typer.Option("--panels", help="With --trajectory: show base, residuals and composition side by side.")
     ] = False,
     fps: Annotated[
         bool,
-        typer.Option("--fps", help="Write nothing; print frames a second over the views, level by level, instead."),
+        typer.Option("--fps", help="Measure frames per second at each level instead of writing images."),
     ] = False,
-    scene: Annotated[
-        Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
-    ] = None,
-    device: DeviceOption = "auto",
-    rasterizer: RasterizerOption = "auto",
 ) -> None:
-    """Write the images of RUN: base, each residual, and their composition, for every view or along a camera path.
+    """Render the base, the residuals and the composition of RUN, for its views or along a camera path.
 
-    Files are called <view>_base, <view>_residual_<level> and <view>_composed, in one folder for held-out and one for
-    training views. Base and residuals have their own level's size; of nested levels a residual is what its level adds.
-    In PNG residuals lie around mid-grey: zero is grey, lighter adds, darker takes away.
+    Files are named <view>_base, <view>_residual_<level> and <view>_composed, in the folders test and train. Base and
+    residuals have the size of their level. For nested levels, a residual is the difference that its level makes. In PNG
+    files residuals are shown around mid-grey: grey is zero, lighter is positive, darker is negative.
 
     Examples:
 
@@ -111,23 +112,23 @@ def render(
 
     _require_one_of("--views", views, (None, *SPLITS))
     _require_one_of("--format", image_format, FORMATS)
-    # A damaged field is no obstacle to rendering coarser levels.
+    # Without the check, coarser levels can be rendered if a finer one is damaged.
     archive = RunArchive.open(run, check=False)
     show_log()
     wanted = level if level in archive.available_levels else None
-    renderer = run_renderer(archive, device, rasterizer, finest=wanted or 0)
+    renderer = run_renderer(archive, options.device, options.rasterizer, finest=wanted or 0)
     level = renderer.finest if level is None else level
     renderer.require_level(level)
     if fps:
         refuse({"--trajectory": trajectory, "--out": out, "--compare": compare or None}, "does not go with --fps")
         with one_pool():
-            splits = _choose(run_scene(archive, scene), views).values()
+            splits = _choose(run_scene(archive, options.scene), views).values()
             _print_speeds(renderer, [view.camera for split in splits for view in split], level, size)
         return
     if trajectory is not None:
         clip = archive.path(RENDERS, f"{Path(trajectory).stem}.mp4") if out is None else out
         with one_pool():
-            cameras = path_cameras(archive, trajectory, frames, DEFAULT_FRAMES, scene)
+            cameras = path_cameras(archive, trajectory, frames, DEFAULT_FRAMES, options.scene)
             _write_clip(
                 renderer, cameras, clip, level, size, frame_rate=frame_rate, panels=panels, image_format=image_format
             )
@@ -135,7 +136,7 @@ def render(
         return
     folder = archive.path(RENDERS) if out is None else out
     with one_pool():
-        loaded = run_scene(archive, scene)
+        loaded = run_scene(archive, options.scene)
         for split, chosen in _choose(loaded, views).items():
             _write_views(renderer, chosen, level, folder=folder / split, image_format=image_format, compare=compare)
     print(f"{folder} holds the images")
@@ -179,7 +180,7 @@ def _require_one_of(option: str, value: str | None, accepted: Sequence[str | Non
 
 
 def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
-    """The views to render, by the name of their folder."""
+    """Return the views to render by the name of their folder."""
     if views == "test" and not scene.test:
         raise UserInputError(
             "--views test: nothing was held out of this run; render --views train, or train with --eval"
@@ -193,7 +194,7 @@ def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
 
 
 def _print_speeds(renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, size: str | None) -> None:
-    """A table of frames a second over the cameras of the chosen views, at another size than theirs if so asked."""
+    """Print frames per second over these cameras, at another size if one is given."""
     from rich.console import Console
     from rich.table import Table
 
@@ -225,7 +226,7 @@ def _write_views(
     from lapgs_plugin.scenes import write_image
 
     stems = file_stems(views)
-    # Compressing a PNG takes longer than rendering it.
+    # In threads, because compressing a PNG takes longer than rendering it.
     with item_progress("views") as progress, ThreadPoolExecutor() as pool:
         task = progress.add_task(f"Rendering {folder.name} views", total=len(views))
         for view in views:

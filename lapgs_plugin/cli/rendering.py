@@ -1,42 +1,44 @@
-"""What the commands that render a run have in common: where, with what, and the line that says so."""
+"""Options and messages that the commands share which render a run."""
 
 from __future__ import annotations
 
 import logging
-from typing import Annotated
-
-import typer
+from dataclasses import dataclass
+from pathlib import Path
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import option
 
-DeviceOption = Annotated[
-    str, typer.Option(help="Where to render: cuda, cpu, or auto, which takes CUDA where there is any.")
-]
-RasterizerOption = Annotated[
-    str,
-    typer.Option(
-        help="What renders: cpu, oracle, gsplat, or the module of an installed rasterizer such as "
-        "diff_gaussian_rasterization. auto takes the one that the run was trained with, or else gsplat, or else cpu."
-    ),
-]
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Choose where a run's scene is, and where and with which rasterizer the run is rendered."""
+
+    scene: Path | None = option(None, "Scene folder, if it was moved after training.")  # noqa: RUF009  # ruff knows no field specifiers
+    device: str = option("auto", "cuda, cpu, or auto: CUDA if there is a CUDA device, else the CPU.")
+    rasterizer: str = option(
+        "auto",
+        "cpu, oracle, gsplat, or the module of an installed CUDA rasterizer such as diff_gaussian_rasterization. "
+        "auto: the rasterizer that the run was trained with, else gsplat, else cpu.",
+    )
 
 
 def show_log() -> None:
-    """Let what renders a run, and why, appear on stderr."""
+    """Print on stderr which rasterizer renders a run, and why."""
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
 
 
 def refuse(options: dict[str, object], why: str) -> None:
-    """Say that options would have no effect.
+    """Refuse options that would have no effect.
 
     Args:
-        options: by name; None for one that was not given.
-        why: after the name.
+        options: values by name; None for an option that was not given.
+        why: the reason, as it follows the option's name.
 
     Raises:
         UserInputError: one was given.
     """
-    for option, value in options.items():
+    for option_name, value in options.items():
         if value is not None:
-            raise UserInputError(f"{option} {why}; leave it out")
+            raise UserInputError(f"{option_name} {why}; leave it out")

@@ -1,4 +1,4 @@
-"""`lapgs report`: a run, and its baseline beside it, as a table and as a page."""
+"""Report on a run and its baseline: `lapgs report`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.rendering import RenderOptions, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
 
 if TYPE_CHECKING:
@@ -16,28 +17,26 @@ if TYPE_CHECKING:
     from lapgs_plugin.reports.report import MeasuredRun
 
 
+@takes_settings
 def report(
+    options: RenderOptions,
     run: Annotated[
         Path | None,
         typer.Argument(
+            metavar="RUN",
             help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`, or folder of `lapgs bench`. "
-            "Default: whichever of them in runs/ is the newest."
+            "Default: the newest one in runs/.",
         ),
     ] = None,
     baseline: Annotated[
-        Path | None, typer.Option(help="Another run to compare it with, such as one trained with --levels 1.")
+        Path | None, typer.Option(help="Another run to compare with, such as one trained with --levels 1.")
     ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="Where the scene is now, if it moved since the runs were trained.")
-    ] = None,
-    device: DeviceOption = "auto",
-    rasterizer: RasterizerOption = "auto",
 ) -> None:
-    """Print the figures of RUN as a table and write RUN/report.html, with curves and images.
+    """Print the metrics of RUN and write RUN/report.html with curves and images.
 
-    The page is one file that needs no network. With --baseline both show the two runs side by side and the ratio
-    between them. Runs that were not measured yet are measured first, as `lapgs eval` does. Of an experiment the page
-    holds the tables and every scene, as far as its runs are still there.
+    The page is a single file that needs no network. With --baseline, table and page show both runs and their ratio. A
+    run without metrics is measured first, as by `lapgs eval`. For a folder of `lapgs bench`, the page shows its tables
+    and the scenes whose runs still exist.
     """
     from lapgs_plugin.evaluation.figures import run_metrics
     from lapgs_plugin.experiments.exports import CSV
@@ -45,29 +44,28 @@ def report(
     from lapgs_plugin.runs.archive import RunArchive
 
     run = run or _newest(Path("runs"))
+    scene, where = options.scene, {"device": options.device, "rasterizer": options.rasterizer}
     if (run / CSV).is_file():
         if baseline or scene:
             raise UserInputError(
-                f"{run} is an experiment, which has its own baselines and scenes; leave out --baseline and --scene"
+                f"{run} is an experiment with baselines and scenes of its own; leave out --baseline and --scene"
             )
         from lapgs_plugin.experiments.report import write_experiment_report
 
         show_log()
-        page = write_experiment_report(run, device=device, rasterizer=rasterizer)
+        page = write_experiment_report(run, **where)
         print(f"{page} shows the experiment")
         return
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
     show_log()
-    runs = [
-        MeasuredRun(archive, run_metrics(archive, scene, device=device, rasterizer=rasterizer)) for archive in archives
-    ]
-    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, scene, device=device, rasterizer=rasterizer)
+    runs = [MeasuredRun(archive, run_metrics(archive, scene, **where)) for archive in archives]
+    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, scene, **where)
     _print(runs)
     print(f"{page} shows this with curves and images")
 
 
 def _newest(folder: Path) -> Path:
-    """The run or experiment in a folder of such that was written to last.
+    """Return the run or experiment in a folder that was written to last.
 
     Raises:
         RunFolderError: there is none.
@@ -79,7 +77,7 @@ def _newest(folder: Path) -> Path:
     found = [path for pattern in patterns for path in folder.glob(pattern)]
     if not found:
         raise RunFolderError(
-            f"{folder.absolute()} holds no run and no experiment; say which to report on, or train one with "
+            f"{folder.absolute()} holds no run and no experiment; name one, or train one with "
             "`lapgs train SCENE -o runs/NAME`"
         )
     return max(found, key=lambda path: path.stat().st_mtime).parent

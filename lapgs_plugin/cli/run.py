@@ -1,4 +1,4 @@
-"""`lapgs run`: a backbone's own training script, trained as a hierarchy."""
+"""Run a checkout's training script with a hierarchy: `lapgs run`."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.options import MeasuringOptions
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
 
 OF_OFF = {"off", "script", "arguments", "record", "backbone", "device", "verbose"}
-"""What `--off` goes with."""
+"""Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
-"""Everything after the script belongs to the script, options included."""
+"""Options after the script are passed to the script."""
 
 
 @takes_settings
 def run(
     context: typer.Context,
-    script: Annotated[Path, typer.Argument(help="The training script of a checkout: its train.py.", metavar="SCRIPT")],
+    script: Annotated[Path, typer.Argument(help="Training script of a checkout: its train.py.", metavar="SCRIPT")],
     settings: RunSettings,
+    measuring: MeasuringOptions,
     arguments: Annotated[
-        list[str] | None, typer.Argument(help="The script's own arguments, as without lapgs.", metavar="ARGUMENTS...")
+        list[str] | None, typer.Argument(help="Arguments of the script, as without lapgs.", metavar="ARGUMENTS...")
     ] = None,
-    off: Annotated[bool, typer.Option("--off", help="Replace nothing: the script as Python would run it.")] = False,
+    off: Annotated[bool, typer.Option("--off", help="Run the script unchanged, without a hierarchy.")] = False,
     record: Annotated[
         bool,
         typer.Option(
             "--record",
-            help="With --off: note time, Gaussians, memory and held-out PSNR of the script's own run in its -m folder.",
+            help="With --off: record time, Gaussians, memory and held-out PSNR of the unchanged run in its -m folder.",
         ),
     ] = False,
     backbone: Annotated[
@@ -50,42 +52,30 @@ def run(
     device: Annotated[
         str,
         typer.Option(
-            help="cuda, or cpu: the unmodified checkout on CPU stand-ins of its CUDA modules. auto: what is there."
+            help="cuda, cpu (the checkout on CPU stand-ins for its CUDA extensions), or auto: CUDA if there is a CUDA "
+            "device, else the CPU."
         ),
     ] = "auto",
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in -m after its last finished level.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -m.")] = False,
-    test_every: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Measure held-out PSNR this often, for the curves of `lapgs report`; its time is not counted. "
-            "Default: at the end of the run.",
-        ),
-    ] = None,
-    breakdown: Annotated[
-        bool,
-        typer.Option(
-            "--breakdown",
-            help="Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
-        ),
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in -m.")] = False,
     view: ViewOption = False,
     view_port: ViewPortOption = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say which symbols are replaced, and who uses them.")
+        bool,
+        typer.Option("--verbose", "-v", help="Log which symbols are replaced, and where they are used."),
     ] = False,
 ) -> None:
-    """Train a backbone's checkout as a hierarchy: one word before the command you type today.
+    """Train with a 3DGS checkout's own train.py, coarse to fine; its files stay unchanged.
 
-    lapgs run train.py -s data/garden -i images --eval
+    Put `lapgs run` before the arguments that you give to Python today:
 
-    The checkout stays unmodified, and --backbone says which ones are recognised. Everything after the script is handed
-    to it. The run goes into the script's own output folder (-m), one folder a level, and `lapgs render`,
-    `eval` and `report` work on it. After Ctrl-C the finished levels are kept; the same command with --resume goes on
-    after them.
+        lapgs run train.py -s data/garden -i images --eval
+
+    --backbone lists the recognised codebases. Everything after the script is passed to it. The run is written to the
+    script's output folder (-m) with one folder per level; `lapgs render`, `lapgs eval` and `lapgs report` read it.
+    After Ctrl-C, repeat the command with --resume to continue after the last finished level.
     """
     import logging
 
@@ -99,17 +89,15 @@ def run(
 
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
-        raise UserInputError(
-            f"{options_given} with --off: nothing is replaced, so there is nothing for that to act on; leave it out"
-        )
+        raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
     if record and not off:
-        raise UserInputError("--record is for --off: a hierarchy's own run folder says what it took; leave it out")
+        raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
     if device not in ("auto", "cuda", "cpu"):
         raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise UserInputError(
-            "--device cuda: PyTorch sees no CUDA device here; --device cpu runs the checkout on stand-ins"
+            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
     checkout, words = require_script(script).parent, arguments or []
@@ -139,9 +127,9 @@ def run(
                 device=chosen,
                 resume=resume,
                 overwrite=overwrite,
-                breakdown=breakdown,
+                breakdown=measuring.breakdown,
                 watcher=watcher,
-                test_every=test_every,
+                test_every=measuring.test_every,
             )
             driver.run()
         if driver.folder is not None:

@@ -1,4 +1,4 @@
-"""`lapgs sample`: a scene to try everything on, made on the spot."""
+"""Make a procedural scene: `lapgs sample`."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ import typer
 
 
 def sample(
-    out: Annotated[Path, typer.Argument(help="Scene folder to write; it appears when it is complete.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write. It appears when complete.")],
     size: Annotated[str, typer.Option(help="Image size in pixels, WIDTHxHEIGHT.")] = "480x320",
-    views: Annotated[int, typer.Option(help="Number of images. Fewer are the first of more.")] = 40,
+    views: Annotated[int, typer.Option(help="Number of images. Image i does not depend on this number.")] = 40,
     points: Annotated[int, typer.Option(help="Number of sparse points, each seen by at least two views.")] = 4000,
-    seed: Annotated[
-        int, typer.Option(help="Chooses colours, patterns and cameras; the same seed, the same bytes.")
-    ] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene that OUT holds.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of patterns and cameras. The same seed gives the same files.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene in OUT.")] = False,
 ) -> None:
-    """Make a procedural scene: a still life of test patterns in a round library.
+    """Make a procedural scene to try everything on: a still life of test patterns in a round hall.
 
-    Hard edges, fine print, wires and a chain-link fence, with exact camera poses and noisy sparse points, in COLMAP's
-    layout. The finest detail is as small as a pixel at 480x320: every level of a hierarchy has something to show.
+    The scene is a COLMAP folder with exact camera poses and noisy sparse points. Its patterns repeat at doubling
+    frequencies with sharp edges, down to the size of a pixel at 480x320.
     """
     from lapgs_plugin.scenes.sample import make_sample_scene, parse_size
 

@@ -1,4 +1,4 @@
-"""`lapgs train`: a hierarchy without a checkout, on gsplat or on the CPU rasterizer."""
+"""Train with the built-in trainer: `lapgs train`."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ if TYPE_CHECKING:
     from lapgs_plugin.scenes import Scene
 
 MAY_CHANGE = ("images_on", "prediction_precision")
-"""Settings that a continued run may have otherwise."""
+"""Settings that may change when a run is continued."""
 
 
 @takes_settings
 def train(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="Folder of a COLMAP or Blender-style scene.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Blender-style scene.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     photos: SceneOptions,
     settings: TrainSettings,
     control: TrainingControl,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in --out where it stopped, with its settings.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out with its settings.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
     view: ViewOption = False,
     view_port: ViewPortOption = None,
 ) -> None:
-    """Train SCENE level by level, from small images to its own, into the run folder --out.
+    """Train a scene coarse to fine with the built-in trainer, on a GPU (gsplat) or a CPU.
+
+    Each level trains at twice the image size of the level before.
 
     Examples:
 
         lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
 
-        lapgs train data/garden -o runs/plain --levels 1       (the baseline: one field)
+        lapgs train data/garden -o runs/plain --levels 1       (baseline: one field)
 
-        lapgs train data/garden -o runs/bands --hierarchy laplacian       (the paper's method: a base and a residual)
+        lapgs train data/garden -o runs/bands --hierarchy laplacian       (the paper's method: base and residual)
 
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
     """
@@ -65,7 +65,7 @@ def train(
     from lapgs_plugin.training.backend import choose_rasterizer
 
     if resume and overwrite:
-        raise UserInputError("--resume and --overwrite contradict each other: give the one that is meant")
+        raise UserInputError("--resume and --overwrite contradict each other; give one of them")
     watcher = context.with_resource(watching(view, view_port, out.absolute().name))
     reference = SceneReference(
         str(scene.absolute()), photos.resolution, photos.eval, photos.background_color, images=photos.images, kind=""
@@ -84,13 +84,13 @@ def train(
     keep_preview(out.absolute())
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     console.print(
-        f"[bold]{name}[/bold] holds the run; look at it with `lapgs eval {word}` and `lapgs render {word}`",
+        f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
         soft_wrap=True,
     )
 
 
 def _wanted(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
-    """Return what decides a run's result, by the name of its option."""
+    """Return the values that a run's result depends on, by option name."""
     return {
         "resolution": reference.resolution,
         "images": reference.images,
@@ -104,12 +104,19 @@ def _wanted(reference: SceneReference, settings: TrainSettings, rasterizer: str)
 def _resume(
     out: Path, scene: Path, wanted: Mapping[str, Any], given: set[str]
 ) -> tuple[RunArchive, Scene, TrainSettings]:
-    """Open a run to continue it, refusing a scene and options that are others than it was started with.
+    """Open a run to continue it.
 
-    A scene may have moved: then there is none any more where it was.
+    Args:
+        out: the run folder.
+        scene: the scene folder, which may have been moved.
+        wanted: as `_wanted`.
+        given: names of the options on the command line.
 
     Returns:
-        The run, its scene, and its settings, of which `MAY_CHANGE` are as wanted where they are given.
+        The run, its scene, and its settings, with those of `MAY_CHANGE` that were given.
+
+    Raises:
+        UserInputError: the scene or an option differs from those that the run was started with.
     """
     from lapgs_plugin.files import MANIFEST
     from lapgs_plugin.rendering.run import require_same_scene
@@ -165,7 +172,7 @@ def _load(reference: SceneReference) -> Scene:
 def _create(
     out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
 ) -> tuple[RunArchive, Scene]:
-    """Read the scene, check that it can be trained as asked, and only then make the run folder."""
+    """Read the scene and check the settings before the run folder is made."""
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import training_rasterizer

@@ -1,4 +1,4 @@
-"""`lapgs view`: a run in the browser."""
+"""Show a run in the browser: `lapgs view`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.rendering import DeviceOption, RasterizerOption, show_log
+from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.rendering import RenderOptions, show_log
 from lapgs_plugin.cli.viewing import HOST, PORT, open_page, require_viser
 from lapgs_plugin.files import require_manifest
 
@@ -16,27 +17,26 @@ if TYPE_CHECKING:
     from lapgs_plugin.viewer.page import Page
 
 
+@takes_settings
 def view(
-    run: Annotated[Path, typer.Argument(help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
+    ],
+    options: RenderOptions,
     baseline: Annotated[
-        Path | None, typer.Option(help="Another run of the scene, to the right of a divider that can be dragged.")
+        Path | None, typer.Option(help="Another run of the same scene, shown beside RUN behind a movable divider.")
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on. Default: this machine alone; 0.0.0.0 lets others in.")
+        str, typer.Option(help="Address to listen on. The default accepts this machine only; 0.0.0.0 accepts all.")
     ] = HOST,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; the next free one where it is taken.")] = PORT,
-    scene: Annotated[
-        Path | None, typer.Option(help="Where the scene is now, if it moved since the run was trained.")
-    ] = None,
-    device: DeviceOption = "auto",
-    rasterizer: RasterizerOption = "auto",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, the next free one.")] = PORT,
 ) -> None:
-    """Look at RUN in a web browser, one frequency band at a time.
+    """Show RUN in a web browser, with a switch and a gain for each frequency band.
 
-    Drag to orbit, W A S D Q E to fly, scroll to come closer, or go to the cameras of the scene. The panel has each
-    band's gain from 0 to 3, the level of detail, residuals around mid-grey, and what each band takes to render. On a
-    CPU pictures are small while something moves and grow when it stops. Levels that are finished later appear by
-    themselves. Any number of browsers may look; Ctrl-C ends it. Needs the extra: pip install 'lapgs_plugin\\[viewer]'.
+    Drag to orbit, scroll to zoom, fly with W A S D Q E, or jump to a camera of the scene. The panel sets the gain of
+    each band and the level of detail, and shows residuals around mid-grey and render times. On a CPU, images are small
+    while the camera moves and full-size when it stops. Levels that finish later appear by themselves. Several browsers
+    can connect. Ctrl-C stops the viewer. Needs the extra: pip install 'lapgs_plugin\\[viewer]'.
 
     Examples:
 
@@ -51,24 +51,24 @@ def view(
         require_manifest(folder.absolute())
     from lapgs_plugin.viewer.preview import read_preview
 
-    # A browser loads the page while this process imports what draws.
+    # The browser loads the page while this process imports torch and the rasterizer.
     with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run.absolute())) as page:
         from lapgs_plugin.jit.threads import one_pool
 
         show_log()
         with one_pool():
-            _serve(page, run, baseline, scene, device, rasterizer)
+            _serve(page, run, baseline, options)
 
 
-def _serve(page: Page, run: Path, baseline: Path | None, scene: Path | None, device: str, rasterizer: str) -> None:
-    """Show the runs, as they are and as they grow, until Ctrl-C."""
+def _serve(page: Page, run: Path, baseline: Path | None, options: RenderOptions) -> None:
+    """Show the runs and their new levels until Ctrl-C."""
     from lapgs_plugin.viewer.following import FollowedRun, RunFollower
     from lapgs_plugin.viewer.viewer import Viewer
 
-    shown, other = (None if folder is None else FollowedRun(folder, device, rasterizer) for folder in (run, baseline))
-    assert shown is not None, "it is a required argument"
+    shown = FollowedRun(run, options.device, options.rasterizer)
+    other = None if baseline is None else FollowedRun(baseline, options.device, options.rasterizer)
     viewer, stop = Viewer(page), threading.Event()
-    following = RunFollower(viewer, page, shown, other, scene, report=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, options.scene, report=lambda line: print(line, flush=True))
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)

@@ -1,4 +1,4 @@
-"""What the commands that open a viewer have in common: its options, and the line that says how to reach it."""
+"""Options and helpers of the commands that open a viewer."""
 
 from __future__ import annotations
 
@@ -20,34 +20,36 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8080
 
-ViewOption = Annotated[bool, typer.Option("--view", help="Watch training in a web browser, for 1.5 % of its time.")]
+ViewOption = Annotated[bool, typer.Option("--view", help="Show training in a web browser.")]
 ViewPortOption = Annotated[
     int | None,
-    typer.Option(min=1, max=65535, help=f"Port of --view; the next free one where it is taken. Default: {PORT}."),
+    typer.Option(min=1, max=65535, help=f"Port of --view; if it is taken, the next free one. Default: {PORT}."),
 ]
 
 
 def require_viser(what: str) -> None:
-    """Check that pages can be served.
+    """Check that viser is installed.
 
     Args:
-        what: needs them.
+        what: command or option that needs it, for the message.
 
     Raises:
-        MissingExtraError: they cannot.
+        MissingExtraError: it is not.
     """
     if importlib.util.find_spec("viser") is None:
         raise MissingExtraError(
-            f"{what} needs viser, which is not installed; pip install 'lapgs_plugin[viewer]' brings it"
+            f"{what} needs viser, which is not installed; pip install 'lapgs_plugin[viewer]' installs it"
         )
 
 
 def open_page(host: str, port: int, label: str, until: str, preview: Image | None = None) -> Page:
-    """Serve the page, and say where.
+    """Serve the viewer's page and print its address.
 
     Args:
-        until: what ends it.
-        preview: what it shows before anything can be rendered.
+        host, port: address to listen on; a taken port is replaced by the next free one.
+        label: title of the page.
+        until: when the page is closed, for the printed line.
+        preview: image to show until the first one is rendered.
     """
     from lapgs_plugin.viewer.page import Page
 
@@ -58,16 +60,16 @@ def open_page(host: str, port: int, label: str, until: str, preview: Image | Non
 
 @contextmanager
 def watching(view: bool, port: int | None, label: str, device: str = "auto") -> Iterator[Watcher]:
-    """Who watches a run that is about to be trained: with `--view` whoever loads a page, else nobody.
+    """Return a watcher for a training run: the viewer with `--view`, else one that does nothing.
 
     Args:
-        view, port: as the options say.
-        label: of the page.
-        device: where pictures are rendered.
+        view, port: values of --view and --view-port.
+        label: title of the page.
+        device: where images are rendered.
 
     Raises:
-        UserInputError: a port without a viewer, or none that is free.
-        MissingExtraError: pages cannot be served.
+        UserInputError: a port without --view, or no port is free.
+        MissingExtraError: viser is not installed.
     """
     if not view:
         if port is not None:
@@ -82,10 +84,10 @@ def watching(view: bool, port: int | None, label: str, device: str = "auto") -> 
 
 
 def keep_preview(run: Path, device: str = "auto") -> None:
-    """Let the viewer begin with a picture of a run that has just been trained. Whatever fails is a line of the log.
+    """Render a preview of a trained run, which `lapgs view` shows first. A failure is only logged.
 
     Args:
-        run: its folder.
+        run: the run folder.
         device: where to render.
     """
     from lapgs_plugin.jit.threads import one_pool

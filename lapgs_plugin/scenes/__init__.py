@@ -1,6 +1,6 @@
-"""Scenes from disk: COLMAP and Blender-style folders, their images, and the sizes they are trained at.
+"""Read and write scenes: COLMAP and Blender-style folders, their images and image sizes.
 
-Each name is imported when it is first looked at: `resolution` is also used where what reads images is not installed.
+Names are imported on first use, because `resolution` must work without the packages that read images.
 """
 
 from __future__ import annotations

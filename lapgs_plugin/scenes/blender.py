@@ -1,4 +1,4 @@
-"""Scenes of transforms files: NeRF's Blender scenes, instant-ngp and nerfstudio.
+"""Read scenes of transforms files: NeRF's Blender scenes, instant-ngp and nerfstudio.
 
 Poses are camera-to-world matrices in OpenGL axes (x right, y up, z backwards). Two layouts exist: the pair
 `transforms_train.json` and `transforms_test.json` with one horizontal field of view and PNGs named without extension
@@ -40,36 +40,36 @@ TEST_FILE = "transforms_test.json"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 SHORTEST_FOCAL = 1e-3
-"""Of a side of the image; shorter ones are of files that hold other units than radians."""
+"""Shortest focal length in sides of the image. Files with angles in other units than radians have shorter ones."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
 RANDOM_POINTS = 100_000
 OBJECT_RADIUS = 1.3 / 4.03
-"""Half side of the cube of random points for a Blender scene, in distances from the cameras to its middle: 3DGS's
-cube of 1.3 around NeRF's objects, which are seen from a distance of 4.03."""
+"""Half the side of the cube of random points for a Blender scene, in mean distances of the cameras from its centre.
+3DGS uses 1.3 for NeRF's objects, whose cameras are 4.03 away."""
 CAPTURE_RADIUS = 1.0
-"""The same for a single transforms file, whose photos show surroundings too: up to the cameras and as far behind."""
+"""The same for a single transforms file, whose photos also show the surroundings."""
 
 Values = dict[str, Any]
 
 
 def has_transforms(path: Path) -> bool:
-    """Whether the folder holds a transforms layout."""
+    """Return whether the folder holds a transforms layout."""
     return is_file(path / TRAIN_FILE) or is_file(path / SINGLE_FILE)
 
 
 def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
-    """The frames and points of a transforms layout in folder `path`.
+    """Read the frames and points of a transforms layout.
 
-    A pair of files holds out what `transforms_test.json` lists and trains on both without `evaluate`, as 3DGS does; a
-    single file holds out every eighth frame. Without a PLY of points (`ply_file_path`, points3d.ply) 100,000 random
-    grey ones, always the same, fill a cube around the point that the cameras look at.
+    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file every eighth view.
+    Without it, both files of a pair are trained on, as in 3DGS. If there is no PLY of points (`ply_file_path` or
+    points3d.ply), 100,000 random grey points fill a cube around the point that the cameras look at.
 
     Args:
         path: the scene folder.
-        images: a folder to take the images from instead of the one that `file_path` names; "images" leaves it.
+        images: folder of the images, replacing the one in `file_path`; "images" keeps it.
         evaluate: hold out views.
 
     Raises:
@@ -136,7 +136,7 @@ def _image_path(path: Path, file_path: str, images: str) -> Path:
 
 
 def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
-    """(4, 4) in OpenCV axes from a camera-to-world matrix in OpenGL axes, 4x4 or 3x4."""
+    """Return world-to-camera (4, 4) in OpenCV axes from camera-to-world in OpenGL axes, 4x4 or 3x4."""
     try:
         camera_to_world = np.array(matrix, np.float64)
     except (TypeError, ValueError, ArithmeticError):
@@ -159,7 +159,7 @@ def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
 
 
 def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np.float64]) -> Camera:
-    """The pinhole camera of a frame whose own values stand before the file's in `values`."""
+    """Return the pinhole camera of a frame, from its values and those of the file."""
     model = values.get("camera_model", "OPENCV")
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
     if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
@@ -186,7 +186,7 @@ def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np
 
 
 def _focal(values: Values, axis: str, side: int) -> float | None:
-    """Focal length in pixels along an axis, from pixels or from a field of view in radians; None without either."""
+    """Return the focal length in pixels along an axis, from pixels or a field of view in radians; None without both."""
     if f"fl_{axis}" in values:
         return float(values[f"fl_{axis}"])
     if f"camera_angle_{axis}" in values:
@@ -195,7 +195,7 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
 
 
 def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Positions and colours (n, 3) of the scene's PLY; None if it has none."""
+    """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
     named = values.get("ply_file_path")
     if named is not None and not isinstance(named, str):
         raise SceneError(f"{path}: ply_file_path is {named!r}, expected the name of a file; export the scene again")
@@ -221,12 +221,12 @@ def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArr
 
 
 def _random_points(frames: list[Frame], radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Grey points in a cube around what the cameras look at, `radius` times their mean distance from it each way."""
+    """Return grey points in a cube around the point that the cameras look at; see `OBJECT_RADIUS` for `radius`."""
     poses = np.stack([frame.camera.world_to_camera.numpy() for frame in frames])  # (v, 4, 4)
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])  # (v, 3)
     axes = poses[:, 2, :3]  # (v, 3) viewing directions in world coordinates
-    # Least-squares point closest to all optical axes; relative to the mean centre, so that parallel axes, which leave
-    # the depth open, put it among the cameras.
+    # The least-squares point closest to all optical axes, relative to the mean centre: parallel axes, which do not
+    # determine its depth, put it among the cameras.
     projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)  # (v, 3, 3)
     middle = centers.mean(axis=0)
     offsets = np.einsum("vij,vj->i", projectors, centers - middle)

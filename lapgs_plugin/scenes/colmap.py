@@ -1,4 +1,4 @@
-"""COLMAP scenes: `images/` and a sparse model in `sparse/0/` or `sparse/`, binary or text.
+"""Read COLMAP scenes: `images/` and a sparse model in `sparse/0/` or `sparse/`, binary or text.
 
 The formats are described at https://colmap.github.io/format.html; pycolmap reads them.
 """
@@ -22,14 +22,14 @@ from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check
 MODEL_FILES = ("cameras", "images", "points3D")
 
 UNIT_TOLERANCE = 1e-2
-"""How far a rotation's quaternion may be from length 1; COLMAP writes 17 digits."""
+"""Largest difference of a quaternion's length from 1; COLMAP writes 17 digits."""
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models that are pinhole cameras when all their distortion parameters are zero; fisheye models never are."""
+"""Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder below `path` that holds a COLMAP model, complete or not; None if there is none."""
+    """Return the folder below `path` that holds files of a COLMAP model; None if there is none."""
     for folder in (path / "sparse" / "0", path / "sparse"):
         if any(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES for suffix in ("bin", "txt")):
             return folder
@@ -37,12 +37,12 @@ def find_model(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
-    """The frames and points of the COLMAP model in folder `model` of the scene `path`.
+    """Read the frames and points of a COLMAP scene.
 
     Args:
         path: the scene folder.
-        model: what `find_model` found.
-        images: name of the image folder inside the scene, "images" or a smaller copy such as "images_4".
+        model: folder of the sparse model, from `find_model`.
+        images: name of the image folder in the scene: "images", or smaller copies such as "images_4".
         evaluate: hold out every eighth image.
 
     Raises:
@@ -93,7 +93,7 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
 
 
 def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
-    """The camera without a pose."""
+    """Return the camera without a pose."""
     kind = camera.model.name
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     if kind not in PINHOLE_MODELS or any(distortion):

@@ -1,8 +1,8 @@
-"""Whether COLMAP's binary files are whole.
+"""Check that COLMAP's binary files are complete, before pycolmap reads them.
 
-pycolmap trusts the counts in them: reading a file that was cut short it fills records with whatever is in memory, or
-allocates and loops for minutes. So their records are walked first. Their layout is that of
-https://colmap.github.io/format.html, and for rigs and frames that of COLMAP's reconstruction_io_binary.cc.
+pycolmap trusts the counts in these files. In a truncated file it reads uninitialised memory, or allocates and loops for
+minutes. The layout is that of https://colmap.github.io/format.html, and for rigs and frames that of COLMAP's
+reconstruction_io_binary.cc.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ SENSOR_BYTES = 4 + 4  # type and id
 
 
 def check_whole(folder: Path) -> None:
-    """Check every binary file of the model in `folder` that exists.
+    """Check the binary files of the model in `folder`.
 
     Raises:
-        SceneError: a file ends before the records that it announces.
+        SceneError: a file ends before its last record.
     """
     for name, record_end in RECORD_ENDS.items():
         file = folder / f"{name}.bin"
         if not file.is_file():
-            continue  # rigs and frames exist only in models that COLMAP 3.12 or later wrote
+            continue  # COLMAP before 3.12 writes no rigs and frames
         data = file.read_bytes()
         if not _holds_all(data, record_end):
             raise SceneError(
-                f"{file}: the file is damaged or cut short at {len(data)} bytes, "
-                "expected all the records that it announces; copy it again"
+                f"{file}: the file is damaged or cut short at {len(data)} bytes, expected all records that its header "
+                "counts; copy it again"
             )
 
 
 def _holds_all(data: bytes, record_end: Callable[[bytes, int], int]) -> bool:
+    """Return whether the data holds as many records as it counts."""
     try:
         offset = COUNT.size
         for _ in range(COUNT.unpack_from(data)[0]):
@@ -52,7 +53,7 @@ def _holds_all(data: bytes, record_end: Callable[[bytes, int], int]) -> bool:
 
 
 def disagreement(folder: Path) -> str | None:
-    """Say which ids of whole binary files do not fit together, for a model that pycolmap refuses; None if all do."""
+    """Return which ids in complete binary files contradict each other, or None."""
     cameras, images, points = (_records(folder / f"{name}.bin") for name in ("cameras", "images", "points3D"))
     files = {"cameras": (cameras, "<I"), "images": (images, "<I"), "points3D": (points, "<Q")}
     ids: dict[str, set[int]] = {}
@@ -72,7 +73,7 @@ def disagreement(folder: Path) -> str | None:
 
 
 def _records(file: Path) -> tuple[bytes, list[int]]:
-    """A whole file, and where its records start."""
+    """Return the bytes of a complete file and the offsets of its records."""
     data = file.read_bytes()
     starts = [COUNT.size]
     for _ in range(COUNT.unpack_from(data)[0]):
@@ -119,4 +120,4 @@ RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
     "rigs": _rig_end,
     "frames": _frame_end,
 }
-"""For each file, where the record that starts at an offset ends."""
+"""For each file, the end of the record that starts at an offset."""

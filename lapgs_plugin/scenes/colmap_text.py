@@ -1,7 +1,6 @@
-"""Whether COLMAP's text files are as https://colmap.github.io/format.html describes them.
+"""Check COLMAP's text files (https://colmap.github.io/format.html), before pycolmap reads them.
 
-pycolmap refuses most of what is wrong with them too, in words about its own source code, and takes a count of -96
-pixels for 18446744073709551520.
+pycolmap's messages about mistakes quote its own source code, and it reads -96 pixels as 18446744073709551520.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from lapgs_plugin.errors import SceneError
 _Number = TypeVar("_Number", int, float)
 
 LARGEST_ID = 2**32 - 2
-"""Of a camera or an image; the next number means none."""
+"""Largest id of a camera or an image; the next number means none."""
 SHOWN = 60
-"""Characters of a line that a message quotes."""
+"""Characters of a line that are quoted in a message."""
 
 
 def check_text(folder: Path) -> None:
-    """Check the text files of the model in `folder`: their numbers, their ids, and that ids named in one exist.
+    """Check the numbers in the text files of a model, and that the ids they refer to exist.
 
     Raises:
-        SceneError: names the file, the line, what it says and what was expected.
+        SceneError: a line is wrong.
     """
     cameras = _ids(folder / "cameras.txt", _check_camera)
     images = _ids(folder / "images.txt", lambda line: _check_image(line, cameras), pairs=True)
@@ -35,7 +34,7 @@ def check_text(folder: Path) -> None:
 
 
 class _Line:
-    """A line that is no comment, and the words in it."""
+    """A line of a file and its words."""
 
     def __init__(self, file: Path, number: int, text: str) -> None:
         self.file, self.number, self.text = file, number, text
@@ -48,7 +47,7 @@ class _Line:
         )
 
     def numbers(self, kind: Callable[[str], _Number], words: Sequence[str], what: str) -> list[_Number]:
-        """Words as finite numbers."""
+        """Return words as finite numbers, or refuse the line; `what` was expected."""
         try:
             found = [kind(word) for word in words]
         except ValueError:
@@ -59,7 +58,7 @@ class _Line:
 
 
 def _ids(file: Path, check: Callable[[_Line], int], pairs: bool = False) -> set[int]:
-    """Check a file's lines, of which each or the first of each two begins with an id; the ids."""
+    """Check the lines of a file and return their ids. With `pairs`, every second line lists observations."""
     ids: set[int] = set()
     for line in _lines(file, pairs):
         key = check(line)

@@ -1,8 +1,7 @@
-"""Images in and out, and their resizing. OpenImageIO reads; Pillow encodes what has 8 bits.
+"""Read, write and resize images. OpenImageIO reads them; Pillow writes PNG and JPEG.
 
-Pixel values are used as the file codes them, scaled to [0, 1] for integer formats: photos stay gamma-encoded, as in
-every 3DGS codebase, and EXR stays linear and unbounded. Pixels keep the order in which the file stores them: an EXIF
-orientation is ignored, because COLMAP ignores it when it makes the cameras.
+Values are those of the file, scaled to [0, 1] for integer formats: photos stay gamma-encoded, as in every 3DGS
+codebase, and EXR stays linear and unbounded. EXIF orientation is ignored, because COLMAP ignores it too.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ from lapgs_plugin.scenes.source import is_file
 
 JPEG_QUALITY = 95
 PNG_LEVEL = 4
-"""2.5 times as fast as zlib's default of 6, for files 4 % larger (fox, 1062x1894)."""
-Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own is below what phones have
+"""Faster than zlib's default of 6, for slightly larger files."""
+Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own limit is below that of phones
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 LONGEST_NAME = 255
-"""Of a file, in bytes, on every common file system."""
+"""Longest file name in bytes on common file systems."""
 STRIP_VALUES = 1 << 23
-"""Of all channels in a strip of rows, which is what is in memory of a large image at full size in floating point."""
+"""Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file in pixels, from its header.
+    """Return width and height of an image file in pixels, from its header.
 
     Raises:
         SceneError: the file is missing, no image, or has more pixels than `limits.PHOTO_PIXELS`.
@@ -46,7 +45,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def check_image(path: Path) -> tuple[int, int]:
-    """Width and height of an image file in pixels, after decoding all of it a few rows at a time.
+    """Decode an image file completely, a few rows at a time, and return its width and height in pixels.
 
     Raises:
         SceneError: as `read_image`.
@@ -67,15 +66,15 @@ def read_image(
 ) -> Tensor:
     """Read a JPEG, PNG, TIFF or EXR file of any bit depth as RGB.
 
-    Grey becomes RGB, channels beyond colour and alpha are ignored, alpha is blended over `background` at full size.
-    The full image is never in memory in floating point, unless that is what is asked for.
+    Grey becomes RGB. Channels other than colour and alpha are ignored. Transparent pixels are blended over `background`
+    at full size. Large images are resized in strips, to save memory.
 
     Args:
         path: the file.
-        size: (width, height) to resize to; None keeps the file's. The filter's overshoot next to strong edges is
-            clamped to [0, 1] for integer formats and kept for floating-point ones.
-        background: RGB that shows through transparent pixels.
-        clamp: False keeps the overshoot for integer formats too, for images that are resampled again.
+        size: (width, height) to resize to; None keeps the file's. The filter overshoots next to strong edges: values
+            are clamped to [0, 1] for integer formats and kept for floating-point formats.
+        background: RGB behind transparent pixels.
+        clamp: False never clamps, for images that are resampled again.
 
     Returns:
         (3, h, w) float32, contiguous.
@@ -87,7 +86,7 @@ def read_image(
     source = _open(path)
     full_width, full_height = _image_plane(path, source)
     width, height = size or (full_width, full_height)
-    # The filter is separable: first along each row, which strips of rows allow, then along columns.
+    # The filter is separable: first along the rows of each strip, then along columns.
     narrowed = torch.empty(3, full_height, width)
     for top, strip in _strips(path, source, (full_width, full_height), background):
         rows = slice(top, top + strip.shape[1])
@@ -99,13 +98,13 @@ def read_image(
 
 
 def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, float, float] | None) -> Tensor:
-    """Read an image as the loaders of 3DGS codebases do: with Pillow, resized by it in 8 bits.
+    """Read an image as 3DGS codebases do: decoded and resized by Pillow in 8 bits.
 
     Args:
         path: the file, of a format that Pillow knows.
         size: (width, height) to resize to, with Pillow's default filter (bicubic).
-        background: RGB to blend transparent pixels over, before resizing and rounded down, as these loaders do with
-            transforms scenes; None leaves alpha out, as they do with COLMAP scenes.
+        background: RGB to blend transparent pixels over before resizing, rounded down, as 3DGS does for transforms
+            scenes; None ignores alpha, as 3DGS does for COLMAP scenes.
 
     Returns:
         (3, h, w) float32, k / 255.
@@ -120,7 +119,7 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
             levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
         raise SceneError(
-            f"{path}: Pillow, which 3DGS codebases read images with, cannot read it ({_one_line(str(error))}); "
+            f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({_one_line(str(error))}); "
             "expected a whole 8-bit image, copy or convert it again"
         ) from error
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
@@ -129,9 +128,9 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
 def _resize_8_bits(
     source: Image.Image, size: tuple[int, int], background: tuple[float, float, float] | None
 ) -> Image.Image:
-    """Blend over the background and resize: what Pillow does at once, in bands, or a large photo takes gigabytes.
+    """Blend over the background and resize, in bands of rows to save memory.
 
-    Pillow too resizes along rows first, to 8 bits.
+    The result equals that of Pillow, which also resizes along rows first and rounds to 8 bits between.
     """
     width, height = source.size
     narrowed: Image.Image | None = None
@@ -155,7 +154,7 @@ def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) 
     pixels = np.asarray(picture.convert("RGBA"))  # (h, w, 4)
     steps = np.arange(256) / 255.0
     alpha = steps[:, None]
-    # By table: in float64 a large photo takes half a minute.
+    # By table, because float64 arithmetic on a large photo is slow.
     tables = [((steps * alpha + value * (1 - alpha)) * 255.0).astype(np.uint8) for value in background]
     return Image.fromarray(np.stack([table[pixels[..., 3], pixels[..., i]] for i, table in enumerate(tables)], axis=-1))
 
@@ -163,8 +162,8 @@ def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) 
 def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize with an anti-aliasing bicubic filter (a = -0.5, widened by the factor of reduction).
 
-    This is the filter of 3DGS's own loader, in floating point instead of 8 bits. Both images cover the same image
-    plane: centres lie at half-integer coordinates, and outside the border the filter is cut off and renormalised.
+    This is the filter of 3DGS's loader, in floating point instead of 8 bits. Pixel centres are at half-integer
+    coordinates. The filter is cut off at the border and renormalised.
 
     Args:
         image: (3, h, w) floating point.
@@ -176,16 +175,16 @@ def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     width, height = size
     if image.shape[1:] == (height, width):
         return image
-    # OpenImageIO's own resize agrees to 5e-6 away from the border but takes 25 times as long.
+    # OpenImageIO's resize gives the same values but is much slower.
     return torch.nn.functional.interpolate(image[None], (height, width), mode="bicubic", antialias=True)[0]
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """Write an image; the file appears under its name only when it is complete.
+    """Write an image. The file appears only when it is complete.
 
     Args:
-        path: .png or .jpg (8 bits, values clamped to [0, 1] and rounded) or .exr (float32, values as they are).
-            Missing folders are made.
+        path: .png or .jpg (8 bits, clamped to [0, 1] and rounded) or .exr (float32, unclamped). Missing folders are
+            made.
         image: (3, h, w) RGB.
 
     Raises:
@@ -217,9 +216,9 @@ def write_image(path: Path, image: Tensor) -> None:
 
 
 def _encode_8_bits(levels: NDArray[np.uint8], suffix: str) -> bytes:
-    """A PNG or JPEG file of (h, w, 3) pixels.
+    """Encode (h, w, 3) pixels as PNG or JPEG.
 
-    Encoded in memory by Pillow: on a full disk OpenImageIO's JPEG writer ends the process and its PNG writer reports
+    Pillow does it in memory: on a full disk OpenImageIO's JPEG writer aborts the process and its PNG writer reports
     success.
     """
     encoded = io.BytesIO()
@@ -231,7 +230,11 @@ def _encode_8_bits(levels: NDArray[np.uint8], suffix: str) -> bytes:
 
 
 def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
-    """Write (h, w, 3) pixels as they are; OSError with the writer's reason."""
+    """Write (h, w, 3) pixels as float32.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     target = oiio.ImageOutput.create(str(path))
     if target is None:
         raise OSError(oiio.geterror())
@@ -251,7 +254,7 @@ def _open(path: Path) -> oiio.ImageInput:
     if not is_file(path):
         raise SceneError(f"{path}: no such image; put it there or choose another folder with --images")
     options = oiio.ImageSpec()
-    # Otherwise 8-bit colour is multiplied by alpha in 8 bits, which loses up to 5 levels where alpha is small.
+    # Without it, 8-bit colour is multiplied by alpha in 8 bits, which loses precision where alpha is small.
     options.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), options)
     if source is None:
@@ -261,9 +264,9 @@ def _open(path: Path) -> oiio.ImageInput:
 
 
 def _image_plane(path: Path, source: oiio.ImageInput) -> tuple[int, int]:
-    """Width and height of the whole image, of which an EXR may store a part, after checking both against the limits.
+    """Return width and height of the image, after checking the limits.
 
-    TIFF and PNG offsets are page layout, no such window.
+    An EXR may store only a window of its image. Offsets in TIFF and PNG are page layout and are ignored.
     """
     spec = source.spec()
     stored = (spec.width, spec.height)
@@ -280,9 +283,9 @@ def _image_plane(path: Path, source: oiio.ImageInput) -> tuple[int, int]:
 def _strips(
     path: Path, source: oiio.ImageInput, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Iterator[tuple[int, Tensor]]:
-    """The image (width, height) from top to bottom: the first row of each strip of rows, and its RGB (3, rows, width).
+    """Yield an image from top to bottom: the first row of each strip of rows, and its RGB (3, rows, width).
 
-    What an EXR's display window has beyond the stored pixels is zero, that is transparent.
+    Pixels of an EXR that are not stored are zero and transparent.
     """
     spec = source.spec()
     width, height = size
@@ -321,7 +324,7 @@ def _strips(
 
 
 def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, channels: int) -> NDArray[np.float32]:
-    """Rows of the file and its first channels, (last - first, width, channels)."""
+    """Read rows of the file with its first channels, (last - first, width, channels)."""
     spec = source.spec()
     rows = (spec.y + first, spec.y + last)
     if spec.tile_width:
@@ -329,7 +332,7 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
         pixels = source.read_tiles(*window, 0, channels, oiio.FLOAT)
     else:
         pixels = source.read_scanlines(*rows, spec.z, 0, channels, oiio.FLOAT)
-    # A JPEG that ends early is decoded into grey and reported only by the message left behind.
+    # A truncated JPEG is decoded to grey; only this message reports it.
     complaint = source.geterror()
     if pixels is None or complaint:
         raise SceneError(
@@ -340,8 +343,7 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
 
 
 class _Channels(NamedTuple):
-    """Which channels of a file are red, green and blue, which is alpha (-1 for none), and whether colour is straight,
-    not yet multiplied by alpha."""
+    """Channels of red, green and blue; channel of alpha, -1 for none; whether colour is not premultiplied by alpha."""
 
     colour: list[int]
     alpha: int
@@ -350,7 +352,7 @@ class _Channels(NamedTuple):
 
 def _channels(spec: oiio.ImageSpec) -> _Channels:
     alpha, straight = spec.alpha_channel, bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
-    if alpha >= spec.nchannels:  # OpenImageIO's reader of GIF counts from one, and does not say that colour is straight
+    if alpha >= spec.nchannels:  # OpenImageIO's GIF reader counts from one, and does not tell that colour is straight
         alpha, straight = spec.channelindex("A"), True
     colour = [channel for channel in range(spec.nchannels) if channel != alpha][:3]
     return _Channels(colour if len(colour) == 3 else colour[:1] * 3, alpha, straight)
@@ -359,7 +361,7 @@ def _channels(spec: oiio.ImageSpec) -> _Channels:
 def _blend(
     pixels: NDArray[np.float32], channels: _Channels, background: tuple[float, float, float]
 ) -> NDArray[np.float32]:
-    """RGB (h, w, 3) over the background from (h, w, channels)."""
+    """Blend (h, w, channels) over the background to RGB (h, w, 3)."""
     colour = pixels[..., channels.colour]
     if channels.alpha < 0:
         return colour

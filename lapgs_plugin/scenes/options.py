@@ -1,4 +1,4 @@
-"""Declare how a scene's photos are read. Imports no torch."""
+"""Declare how a scene's images are read. Imports no torch."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Choose which photos of a scene are read, at which size, and what is behind them.
+    """Choose the images of a scene, their size and their background.
 
     Raises:
-        UserInputError: a background that is no colour.
+        UserInputError: the background is no colour.
     """
 
     resolution: str = option(
-        "full", "1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4."
+        "full", "Image size: 1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4."
     )
-    images: str = option("images", "Image folder inside a COLMAP scene, such as images_4.")
-    eval: bool = option(False, "Hold out every eighth view for testing.")
+    images: str = option("images", "Image folder of a COLMAP scene, such as images_4.")
+    eval: bool = option(False, "Hold out every eighth view for `lapgs eval`.")
     background: str = option(
-        "black", "Behind the scene and behind transparent pixels: black, white or R,G,B from 0 to 1."
+        "black", "Background of renders and of transparent pixels: black, white or R,G,B from 0 to 1."
     )
 
     def __post_init__(self) -> None:

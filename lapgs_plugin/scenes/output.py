@@ -1,4 +1,4 @@
-"""The folder a scene is written to: never somebody else's, never half a scene."""
+"""Write scene folders: only complete ones, and never over other files."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.scenes.colmap_binary import check_whole
 
 SCENE_ENTRIES = frozenset({"images", "sparse"})
-"""What a scene folder of ours holds; anything else in it is somebody's work and is never deleted."""
+"""Entries of a scene folder. A folder with any other entry is never overwritten."""
 
 
 def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
-    """Refuse a folder that must not be written to.
+    """Check that a scene may be written to a folder.
 
     Args:
         out: the folder, which may be missing.
-        overwrite: replace the scene that is there.
-        work: name of an entry that may be there in any case: unfinished work of the same command.
+        overwrite: allow a folder that holds a scene.
+        work: name of an entry that is allowed too: unfinished work of the same command.
 
     Raises:
-        UserInputError: `out` is a file, holds a scene and `overwrite` is False, or holds anything else.
+        UserInputError: `out` is a file, holds a scene without `overwrite`, or holds anything else.
     """
     if not os.path.lexists(out):  # not Path.exists, which raises where a name is too long for the file system
         return
@@ -35,7 +35,7 @@ def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
     entries = {entry.name for entry in out.iterdir()} - {work}
     if foreign := sorted(entries - SCENE_ENTRIES):
         raise UserInputError(
-            f"{out}: it holds {foreign[0]}, expected an empty or new folder; choose another or remove that yourself"
+            f"{out}: it holds {foreign[0]}, expected an empty or new folder; choose another or remove it yourself"
         )
     if entries and not overwrite:
         raise UserInputError(f"{out}: the folder already holds a scene; choose another or replace it with --overwrite")
@@ -43,7 +43,7 @@ def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
 
 @contextmanager
 def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
-    """A new folder beside `out` that takes its place when the block ends without an error, and is removed otherwise.
+    """Make a folder that replaces `out` when the block ends, and is removed if it fails.
 
     Raises:
         UserInputError: as `check_output`.
@@ -70,7 +70,7 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def one_line_errors(out: Path) -> Iterator[None]:
-    """Turn an OSError while a scene is written into one line that says what to do."""
+    """Turn an OSError during writing into a LapgsError."""
     try:
         yield
     except OSError as error:
@@ -81,7 +81,7 @@ def one_line_errors(out: Path) -> Iterator[None]:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write COLMAP's binary files into a new folder.
+    """Write a model as COLMAP's binary files into a new folder.
 
     Raises:
         LapgsError: the disk is full.
@@ -92,12 +92,12 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 def check_written(folder: Path) -> None:
-    """Check a model that pycolmap has just written: it does not notice when the disk is full.
+    """Check a model that pycolmap wrote, because pycolmap does not report a full disk.
 
     Raises:
-        LapgsError: a file is not whole.
+        LapgsError: a file is incomplete.
     """
     try:
         check_whole(folder)
     except SceneError as error:
-        raise LapgsError(f"{folder}: the model was cut short; check free space, then run the command again") from error
+        raise LapgsError(f"{folder}: the model is incomplete; check free space, then run the command again") from error

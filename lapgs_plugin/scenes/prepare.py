@@ -1,8 +1,8 @@
-"""From a folder of photos to a scene that trains: structure from motion and undistortion with pycolmap.
+"""Make a scene from a folder of photos: structure from motion and undistortion with pycolmap.
 
 OUT/images/            undistorted photos under their own names
 OUT/sparse/0/          the model: PINHOLE cameras, poses, points with their tracks
-OUT/.prepare/          while unfinished: COLMAP's database and the models, from which an interrupted run goes on
+OUT/.prepare/          while unfinished: COLMAP's database and models, to continue an interrupted run
 """
 
 from __future__ import annotations
@@ -17,17 +17,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import pycolmap
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
 from lapgs_plugin.files import atomic_write
@@ -35,9 +30,12 @@ from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import check_image, read_image, write_image
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
+from lapgs_plugin.scenes.parallel import in_threads
+from lapgs_plugin.scenes.undistort import lens_of, move_observations, undistort
 from lapgs_plugin.untrusted import read_json
 
-_T = TypeVar("_T")
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 MATCHERS = ("exhaustive", "sequential")
 CAMERA_MODELS = (
@@ -45,7 +43,7 @@ CAMERA_MODELS = (
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-MIN_SIDE = 64  # of --max-size; features need room
+MIN_SIDE = 64  # smallest --max-size; features need room
 
 WORK = ".prepare"
 POLL_SECONDS = 0.2
@@ -57,16 +55,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PrepareResult:
-    """What came out of the photos.
+    """The outcome of `prepare_scene`.
 
     Attributes:
-        registered: names of the photos that have a pose, in order.
-        left_out: names of the others.
-        parts: how many separate models the photos fell into; the largest one is the scene.
+        registered: names of the photos that have a pose, sorted.
+        left_out: names of the other photos, sorted.
+        parts: number of separate models; the scene is the largest one.
         points: number of sparse points.
-        reprojection_error: mean distance in pixels between points and the features they explain, in the photos as
-            COLMAP saw them.
-        seconds: wall time of each step by its name; a step that an interrupted run had finished is missing.
+        reprojection_error: mean reprojection error in pixels of the photos before undistortion.
+        seconds: wall time of each step by name, without the steps that an interrupted run had finished.
     """
 
     registered: tuple[str, ...]
@@ -90,24 +87,22 @@ def prepare_scene(
 ) -> PrepareResult:
     """Find features, match them, recover cameras and points, and write undistorted photos with a PINHOLE model.
 
-    An interrupted call continues where it stopped when it is repeated with the same photos and settings. On the same
-    machine, photos with fewer than 25,000 features in all give the same scene each time. With more, the timing of
-    COLMAP's threads decides which photos it starts from, and in which order it sums. Runs on COLMAP's GPU code where
-    pycolmap has it, else on the CPU.
+    Call it again with the same photos and settings to continue an interrupted call. On one machine, photos with fewer
+    than 25,000 features in total give the same scene each time. With more features, the timing of COLMAP's threads
+    decides which photos it starts from and in which order it sums. COLMAP's GPU code is used if pycolmap has it.
 
     Args:
-        photos: folder of JPEG, PNG, TIFF, BMP or WebP files, also in folders below it. At least 2.
-        out: the scene folder; new, empty, with unfinished work, or with `overwrite` one that holds a scene.
-        matcher: "exhaustive" compares all pairs, "sequential" neighbours in name order (frames of a video).
-        camera_model: COLMAP's name of the lens model to fit, one of `CAMERA_MODELS`.
-        single_camera: all photos share one lens. None: they do if they have the same size.
-        max_size: longest side in pixels of the scene's images, and of the photos that features are found in. None keeps
-            the photos' size.
-        overwrite: replace the scene in `out`, and start over if it holds unfinished work of other photos or settings.
+        photos: folder of at least 2 JPEG, PNG, TIFF, BMP or WebP files, also in subfolders.
+        out: the scene folder; new, empty, with unfinished work, or with `overwrite` a scene.
+        matcher: "exhaustive" matches all pairs, "sequential" neighbours in name order (frames of a video).
+        camera_model: COLMAP's name of the camera model to fit, one of `CAMERA_MODELS`.
+        single_camera: fit one camera to all photos. None: do so if they have the same size.
+        max_size: longest side in pixels of the scene's images and for feature extraction. None keeps the photos' size.
+        overwrite: replace the scene in `out`, and discard unfinished work of other photos or settings.
         progress: show a bar for each step on stderr.
 
     Raises:
-        SceneError: too few photos, one that cannot be read, or none that could be registered.
+        SceneError: there are too few photos, one cannot be read, or none could be registered.
         UserInputError: an argument is out of range or `out` must not be written to.
         LapgsError: the disk is full, the folder cannot be written, or COLMAP failed.
     """
@@ -129,7 +124,7 @@ def prepare_scene(
 
 @dataclass(frozen=True)
 class _Job:
-    """What every step needs."""
+    """Arguments and folders that all steps share."""
 
     work: Path
     photos: Path
@@ -170,7 +165,11 @@ def _check_arguments(photos: Path, out: Path, matcher: str, camera_model: str, m
 
 
 def _find_photos(photos: Path) -> tuple[str, ...]:
-    """Names relative to the folder, sorted, after checking that their copies can have different names."""
+    """Return the names of all photos relative to the folder, sorted.
+
+    Raises:
+        SceneError: there are fewer than two, or two would have the same name after undistortion.
+    """
     files = [file for file in photos.rglob("*") if file.is_file() and not file.name.startswith(".")]
     names = sorted(file.relative_to(photos).as_posix() for file in files if file.suffix.lower() in SUFFIXES)
     if len(names) < 2:
@@ -187,13 +186,13 @@ def _find_photos(photos: Path) -> tuple[str, ...]:
 
 
 def _target_name(name: str) -> str:
-    """Name of the undistorted image: JPEG stays JPEG, all else becomes PNG."""
+    """Return the name of the undistorted image: JPEG stays JPEG, all else becomes PNG."""
     path = Path(name)
     return name if path.suffix.lower() in (".jpg", ".jpeg") else path.with_suffix(".png").as_posix()
 
 
 def _read_sizes(job: _Job) -> dict[str, tuple[int, int]]:
-    """Width and height by name. Decodes each photo in full: a damaged one is named now, not after an hour."""
+    """Return width and height of each photo by name. Photos are decoded, to find damaged ones before the long steps."""
 
     def size(name: str) -> tuple[int, int]:
         width, height = check_image(job.photos / name)
@@ -207,6 +206,7 @@ def _read_sizes(job: _Job) -> dict[str, tuple[int, int]]:
 
 
 def _one_camera(photos: Path, sizes: dict[str, tuple[int, int]], asked: bool | None) -> bool:
+    """Return whether all photos share a camera."""
     names = {size: name for name, size in sizes.items()}
     if asked and len(names) > 1:
         (first, one), (second, other) = list(names.items())[:2]
@@ -218,7 +218,7 @@ def _one_camera(photos: Path, sizes: dict[str, tuple[int, int]], asked: bool | N
 
 
 def _open_work(job: _Job, single_camera: bool, overwrite: bool) -> None:
-    """Make the work folder, or take up one that the same photos and settings left."""
+    """Make the work folder, or reuse that of the same photos and settings."""
     stats = {name: (job.photos / name).stat() for name in job.names}
     settings = {
         "photos": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()},
@@ -265,15 +265,15 @@ def _match_pairs(job: _Job) -> None:
 
 
 def _neighbour_pairs(count: int) -> int:
-    """Pairs that sequential matching compares: each photo with those 1, 2, 4, 8, ... ahead."""
+    """Return the number of pairs in sequential matching: each photo with those 1, 2, 4, 8, ... ahead."""
     return sum(max(0, count - 2**power) for power in range(pycolmap.SequentialPairingOptions().overlap))
 
 
 def _map(job: _Job) -> list[pycolmap.Reconstruction]:
-    """All models, the one with most photos first.
+    """Recover the models and return them, the one with most photos first.
 
     Raises:
-        SceneError: there is none.
+        SceneError: no photo could be placed.
     """
     if not job.models.is_dir():
         unfinished, placed = job.work / "models.partial", job.work / "placed"
@@ -289,8 +289,8 @@ def _map(job: _Job) -> list[pycolmap.Reconstruction]:
     models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
     if not models or models[0].num_reg_images() < 2:
         raise SceneError(
-            f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of one scene at "
-            "rest, each sharing most of what it shows with others taken a step aside"
+            f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of a static "
+            "scene that overlap strongly, each taken a step aside from the last"
         )
     return models
 
@@ -313,20 +313,19 @@ def _describe(job: _Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRe
 
 
 def _write_scene(job: _Job, model: pycolmap.Reconstruction) -> None:
-    """Undistorted photos and model in the work folder; the model's images are renamed where their type changes."""
+    """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes."""
     shutil.rmtree(job.scene, ignore_errors=True)
-    lenses = {key: _lens(camera, job.max_size) for key, camera in model.cameras.items()}
+    lenses = {key: lens_of(camera, job.max_size) for key, camera in model.cameras.items()}
     images = [image for image in model.images.values() if image.has_pose]
 
-    def undistort(image: pycolmap.Image) -> None:
+    def write(image: pycolmap.Image) -> None:
         lens = lenses[image.camera_id]
         photo = read_image(job.photos / image.name, size=(lens.resized.width, lens.resized.height), clamp=False)
-        picture = _undistort(photo, lens)
-        write_image(job.scene / "images" / _target_name(image.name), picture)
+        write_image(job.scene / "images" / _target_name(image.name), undistort(photo, lens))
 
-    _each_photo(job, "Undistorting", undistort, images)
+    _each_photo(job, "Undistorting", write, images)
     for image in images:
-        _move_observations(image, lenses[image.camera_id])
+        move_observations(image, lenses[image.camera_id])
         image.name = _target_name(image.name)
     for key, lens in lenses.items():
         camera = model.cameras[key]
@@ -335,56 +334,10 @@ def _write_scene(job: _Job, model: pycolmap.Reconstruction) -> None:
     write_model(model, job.scene / "sparse" / "0")
 
 
-@dataclass(frozen=True)
-class _Lens:
-    """A camera as COLMAP recovered it, the same at the size of the scene's images, and the pinhole camera for it."""
-
-    recovered: pycolmap.Camera
-    resized: pycolmap.Camera
-    pinhole: pycolmap.Camera
-
-
-def _lens(camera: pycolmap.Camera, max_size: int | None) -> _Lens:
-    resized = pycolmap.Camera(camera.todict())
-    longest = max(camera.width, camera.height)
-    if max_size is not None and max_size < longest:
-        resized.rescale(*(max(1, round(side * max_size / longest)) for side in (camera.width, camera.height)))
-    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), resized)
-    return _Lens(pycolmap.Camera(camera.todict()), resized, pinhole)
-
-
-def _undistort(photo: Tensor, lens: _Lens) -> Tensor:
-    """The photo (3, h, w) of the resized lens as the pinhole camera would have taken it, (3, h', w')."""
-    width, height = lens.pinhole.width, lens.pinhole.height
-    rows, columns = np.mgrid[:height, :width] + 0.5  # pixel centres
-    source = _through(lens.pinhole, lens.resized, np.stack([columns.ravel(), rows.ravel()], axis=1))  # (h' w', 2)
-    grid = torch.from_numpy(source / (lens.resized.width, lens.resized.height) * 2.0 - 1.0).float()
-    # pycolmap's own warp has 8 bits and leaves border pixels black.
-    straight = torch.nn.functional.grid_sample(
-        photo[None], grid.reshape(1, height, width, 2), "bicubic", "border", align_corners=False
-    )[0]
-    return straight.clamp(0.0, 1.0)
-
-
-def _through(seen_by: pycolmap.Camera, other: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where a camera in the same place sees what the first one sees at `pixels` (n, 2), (n, 2)."""
-    plane = np.asarray(seen_by.cam_from_img(pixels))  # (n, 2)
-    return np.asarray(other.img_from_cam(np.column_stack([plane, np.ones(len(plane))])))
-
-
-def _move_observations(image: pycolmap.Image, lens: _Lens) -> None:
-    """Put the image's features where they are in the undistorted image."""
-    if image.num_points2D() == 0:
-        return
-    moved = _through(lens.recovered, lens.pinhole, np.array([point.xy for point in image.points2D]))
-    for point, xy in zip(image.points2D, moved, strict=True):
-        point.xy = xy
-
-
 def _move_into_place(work: Path, out: Path) -> None:
-    """The model goes last: without one, the folder is no scene yet."""
+    """Move the scene to `out`, the model last: a folder without one is no scene."""
     replaced = work / "replaced"
-    shutil.rmtree(replaced, ignore_errors=True)  # of a call that was interrupted here; the new scene is complete
+    shutil.rmtree(replaced, ignore_errors=True)  # left by a call that was interrupted here
     replaced.mkdir()
     for name in ("sparse", "images"):
         if (out / name).exists():
@@ -395,7 +348,7 @@ def _move_into_place(work: Path, out: Path) -> None:
 
 
 def _rows(job: _Job, table: str) -> int:
-    """Rows in a table of COLMAP's database, also while its process is writing; 0 before it exists."""
+    """Return the number of rows in a table of COLMAP's database, also while COLMAP writes it; 0 before it exists."""
     try:
         connection = sqlite3.connect(f"{job.database.absolute().as_uri()}?mode=ro", uri=True, timeout=POLL_SECONDS)
         try:
@@ -409,10 +362,10 @@ def _rows(job: _Job, table: str) -> int:
 def _run_step(
     job: _Job, title: str, unit: str, total: int, step: str, options: dict[str, Any], done: Callable[[], int]
 ) -> None:
-    """Run a step of `colmap_worker`, showing how much of it is done; an interruption stops it at once.
+    """Run a step of `colmap_worker` with a progress bar. An interruption stops it at once.
 
     Raises:
-        LapgsError: it failed; COLMAP's last words in one line.
+        LapgsError: it failed, with COLMAP's last error.
     """
     start = time.perf_counter()
     order = json.dumps({"step": step, "database": str(job.database.absolute()), **options})
@@ -426,7 +379,7 @@ def _run_step(
         )
         assert worker.stdin is not None
         try:
-            with suppress(BrokenPipeError):  # its exit code will tell
+            with suppress(BrokenPipeError):  # reported by its exit code
                 worker.stdin.write(order.encode() + b"\n")
             running = True
             while running:
@@ -440,7 +393,7 @@ def _run_step(
     if worker.returncode != 0:
         raise LapgsError(
             f"{job.work.parent}: COLMAP failed at {title.lower()} ({_last_words(log, worker.returncode)}); check free "
-            f"space and memory, then repeat the command to go on from there, or remove {job.work} to start over"
+            f"space and memory, then repeat the command to continue, or remove {job.work} to start over"
         )
     job.seconds[title] = time.perf_counter() - start
 
@@ -454,29 +407,16 @@ def _ended(worker: subprocess.Popen[bytes]) -> bool:
 
 
 def _last_words(log: Path, code: int) -> str:
-    """The reason for a failure: the exception that ended the worker, COLMAP's last error, or the signal."""
+    """Return the reason for a failure: an exception of the worker, COLMAP's last error, or the exit code."""
     lines = log.read_text(errors="replace").splitlines()
     reasons = [line for line in lines if re.match(r"[EF][0-9]{8} |(\w+\.)*\w*(Error|Exception): ", line)]
     return reasons[-1].strip() if reasons else f"exit code {code}"
 
 
-_Item = TypeVar("_Item")
-
-
-def _each_photo(job: _Job, title: str, work: Callable[[_Item], _T], items: Sequence[_Item]) -> list[_T]:
-    """Results of `work` in order, in parallel and with a bar; the first error in order is raised."""
+def _each_photo(job: _Job, title: str, work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """Apply `work` to all items in threads and record the time."""
     start = time.perf_counter()
-    bar = item_progress("photos") if job.progress else None
-    results = []
-    pool = ThreadPoolExecutor(min(MAX_DECODERS, os.cpu_count() or 1), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
-        task = bar.add_task(title, total=len(items)) if bar else None
-        try:
-            for future in [pool.submit(work, item) for item in items]:
-                results.append(future.result())
-                if bar and task is not None:
-                    bar.advance(task)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = min(MAX_DECODERS, os.cpu_count() or 1)
+    results = in_threads(title, "photos", work, items, threads=threads, progress=job.progress)
     job.seconds[title] = time.perf_counter() - start
     return results

@@ -1,8 +1,8 @@
-"""Image sizes by name: the paper's 1k, 2k and 4k settings, a width in pixels, or a fraction of the full size.
+"""Parse image sizes: the paper's 1k, 2k and 4k settings, a width in pixels, or a fraction of the full size.
 
-Only downscaling exists: a setting that asks for more pixels than an image has keeps the image's own size. The exception
-is what 3DGS codebases do with their option -r, under a spelling of its own: runs trained by them are measured on their
-images, to the byte.
+Images are never enlarged: an image that is smaller than the setting keeps its size. The exception is the spelling
+"3dgs:" with the value of a 3DGS codebase's option -r. It gives the same images as these codebases, to the byte, so that
+runs trained by them can be measured.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from fractions import Fraction
 from lapgs_plugin.errors import UserInputError
 
 PAPER_WIDTH = 1600
-"""Width of the paper's 1K setting, which is what 3DGS codebases shrink large photos to unless told otherwise."""
+"""Width of the paper's 1K setting, to which 3DGS codebases shrink large photos by default."""
 
 MIN_WIDTH = 16
-"""Smaller widths are refused: `--resolution 4` is someone who means a quarter."""
+"""Smallest width: `--resolution 4` more likely means a quarter."""
 
 BACKBONE_PREFIX = "3dgs:"
-"""Before the value of a 3DGS codebase's option -r."""
+"""Prefix of the value of a 3DGS codebase's option -r."""
 
 BACKBONE_DIVISORS = (1, 2, 4, 8)
-"""Values of -r that divide both sides. Other positive ones are widths, -1 stands for `PAPER_WIDTH` at most."""
+"""Values of -r that divide both sides. Other positive values are widths; -1 means at most `PAPER_WIDTH`."""
 
 ACCEPTED = (
     "1k, 2k, 4k, full, a width in pixels such as 800, a fraction of the full size such as 1/4 or 0.25, "
@@ -33,16 +33,16 @@ ACCEPTED = (
 
 @dataclass(frozen=True)
 class Resolution:
-    """A rule that turns an image's full size into the size it is trained at.
+    """Compute the training size of an image from its full size.
 
-    Widths decide, in portrait images too, as in the paper and in 3DGS.
+    The width decides, also for portrait images, as in the paper and in 3DGS.
 
     Attributes:
         text: the setting as the user wrote it.
-        width: width to shrink to, in pixels; None where `fraction` decides.
-        midpoint: go only half of the way from the full width to `width`.
-        fraction: share of the full width and height, in (0, 1], used where `width` is None.
-        backbone: value of a 3DGS codebase's -r, which then decides alone; None for our own settings.
+        width: width to shrink to in pixels; None to use `fraction`.
+        midpoint: shrink only to the mean of the full width and `width`.
+        fraction: share of the full width and height, in (0, 1]; used if `width` is None.
+        backbone: value of a 3DGS codebase's -r, which replaces the other fields; None for our own settings.
     """
 
     text: str
@@ -52,11 +52,11 @@ class Resolution:
     backbone: int | None = None
 
     def size_for(self, width: int, height: int) -> tuple[int, int]:
-        """Size (width, height) that an image of `width` x `height` pixels is trained at; never larger than it is.
+        """Return the training size (width, height) of an image of `width` x `height` pixels.
 
-        Rounds as 3DGS does: sides of a fraction to the nearest integer, heights that follow from a width downwards.
-        Unlike 3DGS it divides exactly, so that a width of 1600 never becomes 1599; only for a 3DGS codebase's own -r
-        it does as they do, enlarging included.
+        Sides are rounded as in 3DGS: to the nearest integer for a fraction, downwards for the height that follows from
+        a width. Unlike in 3DGS, division is exact, so a width of 1600 never becomes 1599. With `backbone` the size is
+        that of the 3DGS codebase, also if it is larger than the image.
 
         >>> parse_resolution("1k").size_for(3118, 2078)
         (1600, 1066)
@@ -71,15 +71,15 @@ class Resolution:
         return target, max(1, height * target // width)
 
     def falls_short(self, width: int) -> bool:
-        """Whether this setting asks for more than an image of `width` pixels has, so that the image stays as it is."""
+        """Return whether an image of `width` pixels keeps its size because the setting asks for a larger one."""
         return self.width is not None and self.width > width
 
 
 def parse_resolution(text: str) -> Resolution:
-    """The resolution a user wrote: "1k", "2k", "4k", "full", a width such as "800", "1/4" or "0.25", or "3dgs:-1".
+    """Parse "1k", "2k", "4k", "full", a width such as "800", a fraction such as "1/4" or "0.25", or "3dgs:-1".
 
-    1k is width 1600, 4k the full size and 2k the midpoint of the two widths, as the paper defines them. 3dgs:N is what
-    3DGS codebases make of -r N.
+    1k is width 1600, 4k the full size and 2k the mean of the two widths, as in the paper. 3dgs:N is the size for -r N
+    in a 3DGS codebase.
 
     Raises:
         UserInputError: the text is none of these.
@@ -124,9 +124,9 @@ def _from_backbone(text: str, value: str) -> Resolution:
 
 
 def _backbone_size(value: int, width: int, height: int) -> tuple[int, int]:
-    """What 3DGS codebases make of -r `value`, in their float arithmetic: 1600 may come out as 1599.
+    """Return the size for -r `value` in 3DGS codebases, with their float arithmetic: 1600 may become 1599.
 
-    Where a side would be 0 pixels they stop; here it is 1.
+    Sides are at least 1 pixel, where these codebases would stop at 0.
     """
     if value in BACKBONE_DIVISORS:
         return max(1, round(width / value)), max(1, round(height / value))

@@ -1,12 +1,10 @@
-"""Scenes: posed views with their images in memory, and the sparse points training starts from."""
+"""Load scenes: posed views with their images, and the sparse points that training starts from."""
 
 from __future__ import annotations
 
 import logging
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
@@ -18,15 +16,12 @@ from torch import Tensor
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
-from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
-
-ProgressCallback = Callable[[int, int], None]
-"""Called with the number of images read and their total."""
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1
@@ -36,13 +31,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class View:
-    """One photo and the camera that took it.
+    """An image and its camera.
 
     Attributes:
-        name: unique name of the image in its scene, such as "0001.jpg" or "train/r_0.png": relative to the image folder
-            of a COLMAP scene, to the scene folder otherwise.
-        camera: size, intrinsics and pose; float32. Its size is the image's.
-        image: (3, h, w) float32 RGB, in [0, 1] unless the file holds wider values (EXR), on the CPU.
+        name: unique name of the image, such as "0001.jpg" or "train/r_0.png", relative to the image folder of a COLMAP
+            scene or to the scene folder of other layouts.
+        camera: size, intrinsics and pose, float32; its size is the image's.
+        image: (3, h, w) float32 RGB on the CPU, in [0, 1] unless the file holds wider values (EXR).
     """
 
     name: str
@@ -52,17 +47,17 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything training reads from a scene folder.
+    """The views and points of a scene folder.
 
     Attributes:
         path: the scene folder.
         kind: "colmap" or "transforms".
-        train: views to train on, in name order, at least two.
-        test: views held out, in name order; empty unless asked for.
+        train: training views in name order, at least two.
+        test: held-out views in name order; none by default.
         points: (n, 3) float32 positions of the sparse points, in world units, n at least 1.
         colors: (n, 3) float32 RGB of the points, in [0, 1].
-        extent: size of the scene in world units as 3DGS measures it: 1.1 times the largest distance of a training
-            camera's centre from the mean of all of them.
+        extent: size of the scene in world units as in 3DGS: 1.1 times the largest distance of a training camera from
+            the mean of their centres.
         background: RGB in [0, 1] that transparent pixels were blended over.
     """
 
@@ -77,7 +72,7 @@ class Scene:
 
     @property
     def smallest_size(self) -> tuple[int, int]:
-        """Smallest width and smallest height over all views, in pixels: what a plan must fit into."""
+        """Smallest width and smallest height of all views in pixels, which limit the number of levels."""
         cameras = [view.camera for view in (*self.train, *self.test)]
         return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
 
@@ -91,25 +86,24 @@ def load_scene(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: bool | ProgressCallback = True,
 ) -> Scene:
-    """Read a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
+    """Load a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
 
-    Everything but the pixels is checked first. Views may differ in size.
+    Cameras and points are checked before any image is read. Views may differ in size.
 
     Args:
         path: the scene folder.
-        resolution: "full", "1k", "2k", "4k", a width or a fraction; see `parse_resolution`. It counts from the size of
-            the image files, which may be the model's or a multiple of it. "3dgs:" and the -r of a 3DGS codebase gives
-            the views as such a codebase sees them: its sizes, its pixels to the byte, and the principal point in the
-            middle of the image, wherever the model has it.
+        resolution: "full", "1k", "2k", "4k", a width or a fraction; see `parse_resolution`. It is relative to the size
+            of the image files. "3dgs:" and the -r of a 3DGS codebase load the views as that codebase does: with its
+            sizes and pixels, and with the principal point in the middle of the image.
         images: name of the image folder, such as "images_4" for smaller copies.
-        eval: hold out every eighth view in name order, or what `transforms_test.json` lists.
-        background: RGB that shows through transparent pixels.
-        progress: True shows a bar on stderr, False nothing; a function is called with the number of images read and
+        eval: hold out every eighth view in name order, or the views of `transforms_test.json`.
+        background: RGB behind transparent pixels.
+        progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
 
     Raises:
-        SceneError: the folder, its model or an image is not usable; the message names the file.
-        UserInputError: the resolution is none of the accepted ones.
+        SceneError: the folder, its model or an image cannot be used.
+        UserInputError: the resolution cannot be parsed.
     """
     rule = parse_resolution(resolution)
     path = Path(path)
@@ -139,7 +133,7 @@ def load_scene(
 def load_cameras(
     path: Path | str, *, resolution: str = "full", images: str = "images", eval: bool = False
 ) -> tuple[dict[str, Camera], dict[str, Camera]]:
-    """The cameras of `Scene.train` and `Scene.test` by view name, without reading the images' pixels.
+    """Return the cameras of `Scene.train` and `Scene.test` by view name, without reading images.
 
     Args:
         path, resolution, images, eval: as `load_scene` takes them.
@@ -154,7 +148,7 @@ def load_cameras(
 
 
 def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "images") -> tuple[int, int]:
-    """`Scene.smallest_size` of a scene, from its model and the headers of its images alone.
+    """Return `Scene.smallest_size` from the model and the headers of the images.
 
     Args:
         path, resolution, images: as `load_scene` takes them.
@@ -189,7 +183,7 @@ def _read_source(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _check_source(path: Path, source: SceneSource) -> None:
-    """Refuse what cannot be trained on, before any image is read."""
+    """Check frames and points before any image is read."""
     frames = [*source.train, *source.test]
     if len(source.train) < 2:
         held_out = f" besides {len(source.test)} held out" if source.test else ""
@@ -201,13 +195,13 @@ def _check_source(path: Path, source: SceneSource) -> None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
-            # Renders are written under these names.
+            # because renders are written under these names
             raise SceneError(
                 f"{path}: image {frame.name} is named by a path outside the scene, expected one inside it; "
                 "copy the photos there and reconstruct or export again"
             )
     if len(source.points) == 0 or not np.isfinite(source.points).all():
-        raise SceneError(f"{path}: the sparse points are none or hold NaN or inf; reconstruct or export them again")
+        raise SceneError(f"{path}: there are no sparse points, or they hold NaN or inf; reconstruct or export again")
     if (furthest := float(np.abs(source.points).max())) > LARGEST:
         raise SceneError(
             f"{path}: a sparse point lies at {furthest:g}, expected at most {LARGEST:g}; reconstruct or export them "
@@ -220,10 +214,10 @@ def _check_source(path: Path, source: SceneSource) -> None:
 
 
 def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
-    """The camera at the size its image is trained at, after comparing the file's shape with the model's."""
+    """Return the camera at its training size, after comparing the shapes of model and file."""
     camera = frame.camera
     width, height = image_size(frame.path)
-    # Both sides may have been rounded by up to a pixel when the file was resized.
+    # Resizing may have rounded both sides by up to a pixel.
     if abs(width / camera.width - height / camera.height) > 1.0 / camera.width + 1.0 / camera.height:
         raise SceneError(
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
@@ -239,7 +233,7 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
 def _read(
     kind: str, background: tuple[float, float, float], as_3dgs: bool, path: Path, size: tuple[int, int]
 ) -> Tensor:
-    """An image of a scene of that kind, (3, h, w)."""
+    """Read an image of a scene of this kind, (3, h, w)."""
     if as_3dgs:
         return read_as_3dgs(path, size, background if kind == "transforms" else None)
     return read_image(path, size=size, background=background)
@@ -251,41 +245,28 @@ def _load_views(
     read: Callable[[Path, tuple[int, int]], Tensor],
     progress: bool | ProgressCallback,
 ) -> list[View]:
-    """Read all images in parallel, in the order of `frames`; the first one that fails in that order is the error."""
+    """Read all images in parallel, in the order of `frames`; raise the first error in that order."""
 
-    def load(frame: Frame, camera: Camera) -> View:
+    def load(posed: tuple[Frame, Camera]) -> View:
+        frame, camera = posed
         return View(frame.name, camera, read(frame.path, (camera.width, camera.height)))
 
-    bar = item_progress("images") if progress is True else None
-    task = bar.add_task("Reading images", total=len(frames)) if bar else None
-    views = []
-    # One thread an image: each worker's own pool inside torch would only compete with the others.
-    pool = ThreadPoolExecutor(_workers(), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
-        try:
-            futures = [pool.submit(load, frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
-            for done, future in enumerate(futures, start=1):
-                views.append(future.result())
-                if bar and task is not None:
-                    bar.update(task, completed=done)
-                elif callable(progress):
-                    progress(done, len(frames))
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return views
+    items = list(zip(frames, cameras, strict=True))
+    return in_threads("Reading images", "images", load, items, threads=_workers(), progress=progress)
 
 
 def _workers() -> int:
-    """Threads for reading: the processors this process may use."""
+    """Return the number of threads for reading."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(usable, MAX_WORKERS)
 
 
 def _extent(path: Path, train: Sequence[Frame]) -> float:
+    """Return `Scene.extent`."""
     centers = torch.stack([frame.camera.position for frame in train])  # (v, 3)
     extent = EXTENT_MARGIN * float((centers - centers.mean(dim=0)).norm(dim=1).max())
     if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
         raise SceneError(
-            f"{path}: all {len(train)} training cameras stand at the same point, expected photos from different places"
+            f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
         )
     return extent

@@ -1,4 +1,4 @@
-"""What a scene folder says before any pixel is read: posed frames and points, the same for every layout."""
+"""Hold the cameras and points of a scene folder of any layout, before images are read."""
 
 from __future__ import annotations
 
@@ -13,29 +13,28 @@ from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 
 HOLD_OUT_EVERY = 8
-"""With evaluation every eighth view in name order is held out, starting with the first, as in 3DGS."""
+"""With --eval, every eighth view in name order is held out, starting with the first, as in 3DGS."""
 
-UNDISTORT_HINT = "only pinhole images can be trained on, `lapgs prepare PHOTOS OUT` makes such a scene from photos"
-
+UNDISTORT_HINT = "only pinhole images can be trained on; `lapgs prepare PHOTOS OUT` undistorts photos"
 
 LARGEST = 1e12
-"""Of coordinates in world units. Training in float32 multiplies squares of them with each other."""
+"""Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
 
 LONGEST_SIDE = 1 << 31
-"""Of a camera's image, in pixels; what a file says before it is compared with the photo."""
+"""Longest side of a camera's image in pixels, before it is compared with the image file."""
 
 LONGEST_FOCAL = 1e6
-"""Of a side of the image; a telescope sees less than a tenth of that."""
+"""Longest focal length in sides of the image, longer than that of any telescope."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed image file.
+    """A posed image file.
 
     Attributes:
-        name: unique name, relative to the folder the layout counts from, with forward slashes.
-        path: the image file; not yet known to exist.
-        camera: float64 pose; its size is the model's, which the file's may be a multiple of.
+        name: unique name, relative to the image or scene folder, with forward slashes.
+        path: the image file, which may not exist.
+        camera: float64 pose; its size is the model's, of which the file's may be a multiple.
     """
 
     name: str
@@ -45,10 +44,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class SceneSource:
-    """A scene's frames and points.
+    """The frames and points of a scene.
 
     Attributes:
-        kind: name of the layout.
+        kind: layout, "colmap" or "transforms".
         train, test: in name order.
         points: (n, 3) float64 positions in world units.
         colors: (n, 3) float64 RGB in [0, 1].
@@ -65,18 +64,18 @@ def check_camera(path: Path, name: str, camera: Camera) -> None:
     """Refuse a camera that cannot be trained on.
 
     Args:
-        path: file or folder that holds it.
-        name: of its image.
-        camera: in float64.
+        path: file or folder of the camera, for messages.
+        name: name of its image, for messages.
+        camera: the camera, in float64.
 
     Raises:
-        SceneError: NaN, inf, numbers too large for float32, or sizes and focal lengths out of range.
+        SceneError: the camera has NaN, inf, numbers too large for float32, or a size or focal length out of range.
     """
     who = f"{path}: the camera of {name}"
     numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     pose = camera.world_to_camera.numpy()
     if not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
-        raise SceneError(f"{who} has NaN or inf in it; reconstruct or export it again")
+        raise SceneError(f"{who} has NaN or inf; reconstruct or export it again")
     if np.abs(pose).max() > LARGEST:
         raise SceneError(
             f"{who} has {np.abs(pose).max():g} in its pose, expected at most {LARGEST:g}; reconstruct or export it "
@@ -101,7 +100,7 @@ def check_camera(path: Path, name: str, camera: Camera) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there; False too for names that the file system cannot have, of more than 255 bytes."""
+    """Return whether a file exists; False also for names that the file system does not allow."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -109,7 +108,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder is there; False too for names that the file system cannot have."""
+    """Return whether a folder exists; False also for names that the file system does not allow."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -117,11 +116,12 @@ def is_folder(path: Path) -> bool:
 
 
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Return the frames sorted by name."""
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
 def hold_out(frames: Sequence[Frame], evaluate: bool) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """Training and held-out frames in name order; nothing is held out unless `evaluate`."""
+    """Return training and held-out frames in name order; none are held out unless `evaluate`."""
     ordered = in_name_order(frames)
     if not evaluate:
         return ordered, ()

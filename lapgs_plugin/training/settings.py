@@ -11,6 +11,8 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.options import check_bounds, option, option_name, options_of
+from lapgs_plugin.runs.options import PANEL as RUN
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import DEFAULT, PANEL, STRATEGIES, Strategy, require_positive
 from lapgs_plugin.untrusted import STRICT, STRICT_WITH_MORE, checked
 
@@ -33,7 +35,6 @@ ANTIALIASING = "antialiasing"
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
-RUN = "Run"
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that are fields of the manifest itself."""
@@ -367,7 +368,7 @@ LEFT_OUT_ONCE: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class TrainingControl:
+class TrainingControl(MeasuringOptions):
     """Set how a run is executed and observed, which does not change its result except for the rasterizer's rounding."""
 
     rasterizer: str = option(
@@ -378,14 +379,6 @@ class TrainingControl:
     )
     threads: int | None = option(
         None, "Processor threads. Default: all this process may use.", panel=RUN, least=1, most=1024
-    )
-    test_every: int | None = option(
-        None, "Measure held-out PSNR this often. Default: at the end of each stage.", panel=RUN, least=1
-    )
-    breakdown: bool = option(
-        False,
-        "Measure where the time of iterations goes: forward, loss, backward, densification, optimizer, other.",
-        panel=RUN,
     )
     checkpoint_every: int | None = option(
         None,

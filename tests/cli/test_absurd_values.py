@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.app import app, run
 from lapgs_plugin.errors import LapgsError
 
 LONG = "n" * 300
@@ -23,9 +24,9 @@ HUGE = "1000000000000000000"
         ("bench raster --sizes 1000000x1000000/5", "expected at most 8192x8192 pixels"),
         (f"bench raster --sizes 64x48/{HUGE}", "10000000 Gaussians"),
         (f"bench raster --sizes {HUGE}{HUGE}x1/1", "expected one of"),
-        ("bench raster --repeats 0", "Invalid value for '--repeats'"),
-        (f"bench raster --repeats {HUGE}", "Invalid value for '--repeats'"),
-        ("bench raster --repeats inf", "Invalid value for '--repeats'"),
+        ("bench raster --repeats 0", "--repeats 0: expected at least 1; see `lapgs bench raster --help`"),
+        (f"bench raster --repeats {HUGE}", f"--repeats {HUGE}: expected at most 1000"),
+        ("bench raster --repeats inf", "--repeats inf: expected a valid integer"),
         ("bench raster --json file/x", "--json file/x: expected a file in a folder that exists"),
         ("bench raster --json folder", "--json folder: expected a file in a folder that exists"),
         ("bench raster --json nowhere/x", "--json nowhere/x: expected a file in a folder that exists"),
@@ -39,10 +40,10 @@ HUGE = "1000000000000000000"
         ("sample s --size 99999x99999", "--size 99999x99999: expected at most 8192x8192"),
         ("sample s --views 0", "--views 0: expected 2 to 9999"),
         (f"sample s --views {HUGE}", "expected 2 to 9999"),
-        ("sample s --views nan", "Invalid value for '--views'"),
+        ("sample s --views nan", "--views nan: expected a valid integer"),
         ("sample s --points -5", "--points -5: expected at least 1"),
         (f"sample s --points {HUGE}", "expected at most 1000000"),
-        ("sample s --points inf", "Invalid value for '--points'"),
+        ("sample s --points inf", "--points inf: expected a valid integer"),
         ("sample s --seed -1", "--seed -1: expected 0 or more"),
         ("sample file", "file: a file, expected a folder or a new name"),
         ("sample file/x", "the scene cannot be written"),
@@ -59,12 +60,39 @@ def test_one_line_and_nothing_written(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
-    result = CliRunner(env={"COLUMNS": "300"}).invoke(app, words.split(" "))
-    if isinstance(result.exception, LapgsError):
-        assert result.exception.exit_code == 2
-        assert "\n" not in str(result.exception)
-        assert expected in str(result.exception)
-    else:  # what typer says of a word that is no such number
-        assert result.exit_code == 2, result.exception
-        assert expected in result.output
+    result = CliRunner().invoke(app, words.split(" "))
+    assert isinstance(result.exception, LapgsError), result.output
+    assert result.exception.exit_code == 2
+    assert "\n" not in str(result.exception)
+    assert expected in str(result.exception)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder"]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("train", "lapgs: missing argument 'SCENE'; see `lapgs train --help`"),
+        ("train scene", "lapgs: missing option '--out' / '-o'; see `lapgs train --help`"),
+        ("train scene --out", "lapgs: option '--out' requires an argument; see `lapgs train --help`"),
+        ("bench raster --repeats 0", "lapgs: --repeats 0: expected at least 1; see `lapgs bench raster --help`"),
+        ("view run --nothing 1", "lapgs: no such option: --nothing; see `lapgs view --help`"),
+        ("nothing", "lapgs: no such command 'nothing'; see `lapgs --help`"),
+        ("--nothing", "lapgs: no such option: --nothing; see `lapgs --help`"),
+        ("patch nothing", "lapgs: no such command 'nothing'; see `lapgs patch --help`"),
+    ],
+)
+def test_usage_errors_are_one_line_with_exit_code_2(
+    words: str, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["lapgs", *words.split(" ")])
+    with pytest.raises(SystemExit) as ended:
+        run()
+    assert ended.value.code == 2
+    assert tuple(capsys.readouterr()) == ("", f"{line}\n")
+
+
+@pytest.mark.parametrize("words", [[], ["bench"], ["patch"]])
+def test_a_group_without_arguments_shows_its_help(words: list[str]) -> None:
+    result = CliRunner().invoke(app, words)
+    assert "Usage:" in result.output
+    assert "Commands" in result.output

@@ -41,7 +41,7 @@ def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.Monkey
     assert "!!" in result.stdout
     assert "[libfoo] is gone" in result.stdout  # not taken for markup
     assert "python -m pip install --force-reinstall torch" in result.stdout
-    assert "nothing until this is mended" in result.stdout
+    assert "nothing until this is fixed" in result.stdout
 
 
 TORCH = {"version": "2.11.0", "cuda": "13.0", "gpus": [], "complaint": ""}
@@ -52,10 +52,10 @@ GPU = "NVIDIA H200, 140 GiB"
     ("facts", "driver", "built", "hidden", "status", "detail"),
     [
         ({"gpus": [GPU]}, "580.1", True, None, "ok", f"gsplat on the GPU, {GPU}"),
-        ({"gpus": [GPU]}, "580.1", None, None, "problem", "nothing until this is mended: gsplat CUDA part"),
-        ({"gpus": [GPU]}, "580.1", False, None, "problem", "nothing until this is mended: gsplat CUDA part"),
-        ({"complaint": "too old"}, "470.1", True, None, "problem", "nothing until this is mended: GPU"),
-        ({"cuda": None}, "580.1", True, None, "problem", "nothing until this is mended: GPU"),
+        ({"gpus": [GPU]}, "580.1", None, None, "problem", "nothing until this is fixed: gsplat CUDA part"),
+        ({"gpus": [GPU]}, "580.1", False, None, "problem", "nothing until this is fixed: gsplat CUDA part"),
+        ({"complaint": "too old"}, "470.1", True, None, "problem", "nothing until this is fixed: GPU"),
+        ({"cuda": None}, "580.1", True, None, "problem", "nothing until this is fixed: GPU"),
         ({"complaint": "no device"}, "580.1", True, "", "ok", "the CPU rasterizer"),
         ({}, "", True, None, "ok", "the CPU rasterizer"),
     ],

@@ -88,7 +88,7 @@ def test_options_that_off_has_no_use_for(scene: Path, tmp_path: Path, given: tup
     words = ["run", "--off", *map(str, given), "--device", "cpu", str(stub.script)]
     error = CliRunner().invoke(app, [*words, *arguments(stub, scene, tmp_path / "out")]).exception
     assert isinstance(error, UserInputError)
-    assert str(error).startswith(f"{named} with --off: nothing is replaced")
+    assert str(error).startswith(f"{named} has no effect with --off")
     assert not (tmp_path / "out").exists()
 
 
@@ -97,4 +97,4 @@ def test_record_without_off(scene: Path, tmp_path: Path) -> None:
     words = ["run", "--record", "--device", "cpu", str(stub.script), *arguments(stub, scene, tmp_path / "out")]
     error = CliRunner().invoke(app, words).exception
     assert isinstance(error, UserInputError)
-    assert "--record is for --off" in str(error)
+    assert "--record needs --off" in str(error)

@@ -88,7 +88,7 @@ def test_damaged_and_missing_images_are_named(tmp_path: Path, photo: Image.Image
     path = tmp_path / "photo.png"
     photo.save(path)
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(SceneError, match=r"photo\.png: Pillow, which .* cannot read it"):
+    with pytest.raises(SceneError, match=r"photo\.png: Pillow, with which .* cannot read it"):
         read_as_3dgs(path, (61, 43), None)
     with pytest.raises(SceneError, match=r"none\.png: no such image"):
         read_as_3dgs(tmp_path / "none.png", (61, 43), None)

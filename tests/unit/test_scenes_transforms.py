@@ -416,7 +416,7 @@ def test_points_announced_that_cannot_be_there(tmp_path: Path, count: str, form:
         (RGB.format("float"), "1 2 3 nan .5 .5", "colours of the sparse points hold NaN or inf, expected 0 to 255"),
         (RGB.format("float"), "1 2 3 .5 inf .5", "colours of the sparse points hold NaN or inf"),
         (RGB.format("double"), "1 2 3 .5 .5 nan", "colours of the sparse points hold NaN or inf"),
-        ("", "1 nan 3", "the sparse points are none or hold NaN or inf"),
+        ("", "1 nan 3", "there are no sparse points, or they hold NaN or inf"),
         ("", "1e20 2 3", r"a sparse point lies at 1e\+20, expected at most 1e\+12"),
     ],
 )

@@ -1,1 +1,1 @@
-"""COLMAP's long steps as a program of their own; see `__main__.py`."""
+"""Run the long steps of COLMAP in a separate process; see `__main__.py`."""

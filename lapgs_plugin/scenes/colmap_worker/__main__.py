@@ -1,8 +1,8 @@
-"""One step of COLMAP in a process of its own: `python colmap_worker`, one line of JSON on its input.
+"""Run a step of COLMAP: `python colmap_worker`, with one line of JSON on its input.
 
-In a process of its own because COLMAP aborts when the disk is full or memory runs out, because an interrupted step can
-then be stopped at once, and because its SQLite and Python's must not open the same database in one process (closing one
-connection drops the other's locks). It is started by its path, so that it does not wait for torch to be imported.
+It is a separate process for three reasons. COLMAP aborts when the disk is full or memory runs out. An interrupted step
+can be killed. And COLMAP's SQLite and Python's must not open a database in one process, because closing one connection
+drops the locks of the other. The worker is started by its path, so that it does not import torch.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import pycolmap
 SEED = 0
 
 PAIR_BLOCK = 10
-"""Photos whose features are in memory together while all pairs are matched; results are saved pair by pair."""
+"""Photos whose features are in memory at a time in exhaustive matching."""
 
 
 def main() -> None:
-    """Run the step that the first line of the input asks for; end when the input does, because the parent has died."""
+    """Run the step in the first line of the input. Exit when the input closes, because then the parent has died."""
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     {"features": _find_features, "pairs": _match_pairs, "map": _map}[job["step"]](job)
@@ -35,7 +35,7 @@ def _end_with_parent() -> None:
 
 
 def _find_features(job: dict[str, Any]) -> None:
-    """Keys: database, photos, names, camera_model, single_camera, max_size (or None)."""
+    """Extract features. Keys: database, photos, names, camera_model, single_camera, max_size (or None)."""
     mode = pycolmap.CameraMode.SINGLE if job["single_camera"] else pycolmap.CameraMode.AUTO
     reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
     options = pycolmap.FeatureExtractionOptions(use_gpu=pycolmap.has_cuda)
@@ -44,8 +44,8 @@ def _find_features(job: dict[str, Any]) -> None:
     with pycolmap.Database.open(job["database"]) as database:
         known = database.num_images()
     if known != len(job["names"]):
-        # Extraction numbers photos in the order in which its threads finish. Imported first, they are numbered by name,
-        # and the same photos give the same scene.
+        # Extraction numbers photos in the order in which its threads finish. Importing them first numbers them by name,
+        # so that the same photos give the same scene.
         for suffix in ("", "-wal", "-shm"):
             Path(job["database"] + suffix).unlink(missing_ok=True)
         pycolmap.Database.open(job["database"]).close()
@@ -54,7 +54,7 @@ def _find_features(job: dict[str, Any]) -> None:
 
 
 def _match_pairs(job: dict[str, Any]) -> None:
-    """Keys: database, matcher."""
+    """Match features. Keys: database, matcher."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
@@ -66,15 +66,15 @@ def _match_pairs(job: dict[str, Any]) -> None:
 
 
 def _map(job: dict[str, Any]) -> None:
-    """Keys: database, photos, models (an empty folder), placed (a file that grows by a byte for each photo)."""
+    """Recover models. Keys: database, photos, models (an empty folder), placed (a file that grows a byte per photo)."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.mapper.random_seed = options.triangulation.random_seed = SEED
     with pycolmap.Database.open(job["database"]) as database:
         residuals = 2 * database.num_keypoints()  # at most
     if residuals < options.ba_min_num_residuals_for_cpu_multi_threading:
-        # COLMAP's threads race for the pair that it starts from, and another pair gives another scene. For so few
-        # features bundle adjustment takes one thread anyway, so one for all costs nothing. For more it takes several,
-        # whose sums have no fixed order: the same photos then give scenes that differ a little.
+        # COLMAP's threads race for the initial pair, and another pair gives another scene. With so few features bundle
+        # adjustment uses one thread anyway. With more it uses several, which sum in no fixed order, so that the same
+        # photos give slightly different scenes.
         options.num_threads = 1
     with Path(job["placed"]).open("wb", buffering=0) as placed:
 

@@ -1,0 +1,26 @@
+"""Declare what a training run can measure about itself. Imports no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lapgs_plugin.options import option
+
+PANEL = "Run"
+
+
+@dataclass(frozen=True)
+class MeasuringOptions:
+    """Choose what a run measures while it trains. None of it counts as training time."""
+
+    test_every: int | None = option(
+        None,
+        "Measure held-out PSNR every so many iterations, for the curves of `lapgs report`. Default: at the end.",
+        panel=PANEL,
+        least=1,
+    )
+    breakdown: bool = option(
+        False,
+        "Measure the time of each part of an iteration: forward, loss, backward, densification, optimizer, other.",
+        panel=PANEL,
+    )

@@ -1,0 +1,58 @@
+"""Undistort photos: resample them and their features from the recovered camera to a pinhole camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A recovered camera, the same at the size of the scene's images, and the pinhole camera that replaces it."""
+
+    recovered: pycolmap.Camera
+    resized: pycolmap.Camera
+    pinhole: pycolmap.Camera
+
+
+def lens_of(camera: pycolmap.Camera, max_size: int | None) -> Lens:
+    """Return the lens of a camera, with images of at most `max_size` pixels a side."""
+    resized = pycolmap.Camera(camera.todict())
+    longest = max(camera.width, camera.height)
+    if max_size is not None and max_size < longest:
+        resized.rescale(*(max(1, round(side * max_size / longest)) for side in (camera.width, camera.height)))
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), resized)
+    return Lens(pycolmap.Camera(camera.todict()), resized, pinhole)
+
+
+def undistort(photo: Tensor, lens: Lens) -> Tensor:
+    """Resample a photo (3, h, w) of the resized camera to the pinhole camera, (3, h', w')."""
+    width, height = lens.pinhole.width, lens.pinhole.height
+    rows, columns = np.mgrid[:height, :width] + 0.5  # pixel centres
+    source = _through(lens.pinhole, lens.resized, np.stack([columns.ravel(), rows.ravel()], axis=1))  # (h' w', 2)
+    grid = torch.from_numpy(source / (lens.resized.width, lens.resized.height) * 2.0 - 1.0).float()
+    # pycolmap's own warp works in 8 bits and leaves border pixels black.
+    straight = torch.nn.functional.grid_sample(
+        photo[None], grid.reshape(1, height, width, 2), "bicubic", "border", align_corners=False
+    )[0]
+    return straight.clamp(0.0, 1.0)
+
+
+def _through(seen_by: pycolmap.Camera, other: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map pixels (n, 2) of one camera to those of another at the same place, (n, 2)."""
+    plane = np.asarray(seen_by.cam_from_img(pixels))  # (n, 2)
+    return np.asarray(other.img_from_cam(np.column_stack([plane, np.ones(len(plane))])))
+
+
+def move_observations(image: pycolmap.Image, lens: Lens) -> None:
+    """Move the features of an image to their positions in the undistorted image."""
+    if image.num_points2D() == 0:
+        return
+    moved = _through(lens.recovered, lens.pinhole, np.array([point.xy for point in image.points2D]))
+    for point, xy in zip(image.points2D, moved, strict=True):
+        point.xy = xy

@@ -1,0 +1,64 @@
+"""`--help` of every command: fast to load, and readable."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from lapgs_plugin.cli.app import app
+
+HEAVY = ("torch", "numba", "numpy", "pycolmap", "OpenImageIO", "gsplat", "cv2", "viser")
+
+
+def _commands() -> list[list[str]]:
+    """Words of every command, groups included."""
+    found: list[list[str]] = [[]]
+
+    def visit(command: Any, words: list[str]) -> None:
+        for name, each in getattr(command, "commands", {}).items():
+            found.append([*words, name])
+            visit(each, [*words, name])
+
+    visit(typer.main.get_command(app), [])
+    return found
+
+
+COMMANDS = _commands()
+
+SCRIPT = """
+import json, sys
+from typer.testing import CliRunner
+from lapgs_plugin.cli.app import app
+codes = [CliRunner().invoke(app, [*words, "--help"]).exit_code for words in json.loads(sys.argv[1])]
+print(json.dumps({"codes": codes, "modules": sorted(sys.modules)}))
+"""
+
+
+def test_help_of_all_commands_imports_nothing_heavy() -> None:
+    arguments = [sys.executable, "-c", SCRIPT, json.dumps(COMMANDS)]
+    found = json.loads(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+    assert len(COMMANDS) >= 20
+    assert found["codes"] == [0] * len(COMMANDS)
+    assert "typer" in found["modules"]
+    assert not set(HEAVY) & set(found["modules"])
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_first_line_is_a_sentence_and_every_option_is_described(words: list[str]) -> None:
+    command: Any = typer.main.get_command(app)
+    for word in words:
+        command = command.commands[word]
+    first = command.help.split("\n\n")[0].replace("\n", " ")
+    assert first[0].isupper()
+    assert first.endswith(".")
+    assert len(first) <= 110
+    described = [each for each in command.params if each.name not in ("help", "install_completion")]
+    assert [each.name for each in described if not each.help] == []
+    shown = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*words, "--help"]).output
+    assert first in " ".join(shown.split())
