@@ -2,8 +2,8 @@
 
     python examples/gsplat_after.py SCENE -o RUN --resolution 1/4 --iterations 3000
 
-lapgs_plugin reads the scene and gives the loss, as any loader and any L1 + SSIM would. `lapgs eval RUN` works.
-Where there is no CUDA device, `--rasterizer cpu` takes gsplat's two functions from a stand-in.
+lapgs_plugin reads the scene and computes the loss; any loader and any L1 + SSIM would do. `lapgs eval RUN` works.
+Without a CUDA device, `--rasterizer cpu` takes gsplat's two functions from a stand-in.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class View:
 
 
 class Runner:
-    """A scene, the splats that are fitted to it, and how they are rendered."""
+    """Fit splats to a scene."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.device = torch.device("cpu" if args.rasterizer == "cpu" else "cuda")
@@ -64,7 +64,7 @@ class Runner:
         }
 
     def render(self, view: View, sh_degree: int = SH_DEGREE) -> tuple[Tensor, dict]:
-        """(3, h, w) image, and what gsplat knows of it."""
+        """Return the image (3, h, w) and gsplat's information about it."""
         colors = torch.cat([self.splats["sh0"], self.splats["shN"]], 1)
         directions = self.splats["means"] + view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         colors = self.gsplat.spherical_harmonics(sh_degree, directions, colors)
@@ -98,7 +98,7 @@ class Runner:
             self.set_splats(lapgs.splats_from_field(lapgs.inherit(field).field))
 
     def train(self, views: list[View], iterations: int) -> list[float]:
-        """Fit the splats to the views; the loss of every iteration."""
+        """Fit the splats to the views and return the loss of every iteration."""
         shrink = min(1.0, self.args.iterations / 30_000)
         strategy = gsplat.DefaultStrategy(
             refine_start_iter=round(500 * shrink),
@@ -125,7 +125,7 @@ class Runner:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Mean over the held-out views, in dB."""
+        """Return the mean PSNR of the held-out views in dB."""
         errors = [(self.render(view)[0].clamp(0, 1) - view.image).square().mean() for view in self.test_views]
         return float((-10 * torch.stack(errors).log10()).mean())
 

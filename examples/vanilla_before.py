@@ -2,7 +2,8 @@
 
     python examples/vanilla_before.py SCENE --resolution 1/2 --iterations 500
 
-No densification, no schedules: the least that trains. lapgs_plugin reads the scene, renders and gives the loss.
+The shortest loop that trains, without densification and schedules. lapgs_plugin reads the scene, renders and computes
+the loss.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ RATES = {"means": 2e-4, "quaternions": 1e-3, "log_scales": 5e-3, "opacity_logits
 
 
 def train(field: lapgs.GaussianField, views: list[View], iterations: int) -> tuple[lapgs.GaussianField, list[float]]:
-    """The fitted field and the loss of every iteration."""
+    """Return the fitted field and the loss of every iteration."""
     rasterizer, background, losses = CpuRasterizer(), torch.zeros(3), []
     field = field.with_parameters({k: torch.nn.Parameter(v.detach()) for k, v in field.parameters.items()})
     optimizer = torch.optim.Adam([{"params": [v], "lr": RATES[k]} for k, v in field.parameters.items()], eps=1e-15)
@@ -37,7 +38,7 @@ def train(field: lapgs.GaussianField, views: list[View], iterations: int) -> tup
 
 @torch.no_grad()
 def predict(field: lapgs.GaussianField, view: View) -> Tensor:
-    """(3, h, w)"""
+    """Return the image (3, h, w)."""
     return CpuRasterizer()(field, view.camera, background=torch.zeros(3)).image
 
 

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from lapgs_plugin.hierarchy.pyramid import Pyramid
     from lapgs_plugin.ops.photometric_loss import photometric_loss
     from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-    from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
+    from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.image_store import ImageStore
+    from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 
 __version__ = "0.1.0"
 
@@ -46,7 +47,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "runs.archive": ("LevelRecord", "Manifest", "RunArchive", "SceneReference"),
+    "runs.archive": ("RunArchive",),
+    "runs.manifest": ("LevelRecord", "Manifest", "SceneReference"),
     "fields.camera": ("Camera",),
     "hierarchy.cameras": ("level_camera", "level_intrinsics"),
     "fields.gaussian_field": ("GaussianField", "field_from_splats", "splats_from_field"),

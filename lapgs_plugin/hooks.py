@@ -1,16 +1,16 @@
-"""Where code can step into a stage: the hooks, what they are told, and the order in which they run.
+"""Let users' code take part in a stage: hooks, their context, and the order in which they run.
 
-Order, the same for every method: composition, supervision, then users' hooks - those registered by entry point in the
-order of their names, then those given as arguments in the order they were given. One iteration calls
+Every method is called in the same order of hooks: composition, supervision, hooks registered by entry point (by name),
+hooks given as arguments. One iteration calls
 
     before_render  ->  (render)  ->  compose  ->  loss  ->  (backward)  ->  after_backward  ->  (step)  ->  on_densify
 
-Where several views make a step, `before_render`, `compose` and `loss` are called for each of them, with its own image
-and iteration, and the losses are added up. `after_backward` and `on_densify` are called once a step, with the context
-of its last view, when the gradients of all its views are there. A step that runs out of memory begins again.
+If a step accumulates several views, `before_render`, `compose` and `loss` are called for each of them with its own
+image and iteration, and the losses are summed. `after_backward` and `on_densify` are called once a step, with the
+context of its last view, after the gradients of all its views. A step that runs out of memory begins again.
 
-`compose` is a chain: each hook gets what the one before it returned, the first one the rendered image. `loss` is a sum:
-each hook sees the composed image and may add a term.
+`compose` is a chain: the first hook gets the rendered image, each other one the image of the hook before it. `loss` is
+a sum: each hook gets the composed image and may add a term.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ ENTRY_POINT_GROUP = "lapgs_plugin.hooks"
 
 @dataclass(frozen=True)
 class StageContext:
-    """What a hook may know of the iteration it runs in.
+    """Describe the iteration that a hook runs in.
 
     Attributes:
         stage: level, size, length and colour map of the stage.
-        iteration: counts from 1 within the stage.
+        iteration: number of the iteration in the stage, from 1.
         view: name of the training view.
         target: (3, h, w) ground truth I^l of the view at the stage's level.
         accumulated: (3, h, w) Up(I_hat^(l+1)) of the view, unclamped; None for the base.
-        coarse_target: (3, h, w) Up(I^(l+1)), the ground truth's counterpart; None unless the supervision needs it.
+        coarse_target: (3, h, w) Up(I^(l+1)) of the ground truth; None unless the supervision needs it.
     """
 
     stage: Stage
@@ -56,24 +56,24 @@ class StageContext:
 
 
 class StageHook:
-    """Base of every hook. Each method does nothing; override those of interest, with the same arguments."""
+    """Do nothing in every method. Derive hooks from this class and override methods with the same arguments."""
 
     def on_stage_start(self, stage: Stage) -> None:
-        """A stage begins or is resumed."""
+        """Run before a stage, new or resumed."""
 
     def before_render(self, context: StageContext) -> None:
-        """An iteration begins."""
+        """Run at the start of an iteration."""
 
     def compose(self, context: StageContext, image: Tensor) -> Tensor:
-        """Make the prediction of the iteration.
+        """Change the predicted image.
 
         Args:
-            context: of the iteration.
-            image: (3, h, w) what the hook before returned; for the first hook the rendered image, a residual where
+            context: the iteration.
+            image: (3, h, w) result of the hook before; for the first hook the rendered image, a residual if
                 `context.stage.signed`.
 
         Returns:
-            (3, h, w) the image for the next hook or, from the last one, for the loss; differentiable, not clamped.
+            (3, h, w) image for the next hook and finally the loss; differentiable, not clamped.
         """
         return image
 
@@ -81,8 +81,8 @@ class StageHook:
         """Add a term to the loss.
 
         Args:
-            context: of the iteration.
-            image: (3, h, w) the composed prediction.
+            context: the iteration.
+            image: (3, h, w) composed prediction.
 
         Returns:
             A scalar, or None to add nothing.
@@ -90,27 +90,27 @@ class StageHook:
         return None
 
     def after_backward(self, context: StageContext) -> None:
-        """Gradients are there, of all views of the step, and the optimizer has not stepped yet."""
+        """Run after the backward passes of all views of a step, before the optimizer steps."""
 
     def on_densify(self, context: StageContext) -> None:
-        """Density control has just added, removed or reset Gaussians."""
+        """Run after density control has added, removed or reset Gaussians."""
 
     def on_stage_end(self, stage: Stage) -> None:
-        """A stage's iterations are done; its field is about to be archived."""
+        """Run after a stage's last iteration, before its field is archived."""
 
 
 class Composition(StageHook):
-    """I_hat^l = Up(I_hat^(l+1)) + R_hat^l: adds what the finished levels predict to a rendered residual."""
+    """Add the upsampled coarser prediction to a rendered residual: I_hat^l = Up(I_hat^(l+1)) + R_hat^l."""
 
     def compose(self, context: StageContext, image: Tensor) -> Tensor:
         return add_prediction(image, context.accumulated)
 
 
 class SupervisionLoss(StageHook):
-    """Compare what a supervision says with the photometric loss.
+    """Compute the photometric loss of the two images that a supervision chooses.
 
     Args:
-        supervision: which one.
+        supervision: the supervision.
         ssim_weight: lambda of the photometric loss, in [0, 1].
     """
 
@@ -126,10 +126,10 @@ class SupervisionLoss(StageHook):
 
 
 class HookDispatcher:
-    """Calls the hooks of a run, in the order this module's docstring pins.
+    """Call the hooks of a run.
 
     Args:
-        hooks: in the order they run.
+        hooks: hooks in the order in which they run.
 
     Raises:
         UserInputError: an object is not a usable hook (see `verify_hook`).
@@ -147,7 +147,7 @@ class HookDispatcher:
         ssim_weight: float = DEFAULT_SSIM_WEIGHT,
         user_hooks: Sequence[StageHook] = (),
     ) -> HookDispatcher:
-        """The stock hooks, the hooks installed as entry points, and `user_hooks`.
+        """Return a dispatcher of composition, supervision, the hooks registered by entry point, and `user_hooks`.
 
         Raises:
             UserInputError: a user's hook is not usable; the line names it.
@@ -157,7 +157,7 @@ class HookDispatcher:
 
     @property
     def takes_batches(self) -> bool:
-        """Whether `compose` and `loss` may get images of several views, (b, 3, h, w), where the context has such, too.
+        """Whether `compose` and `loss` take images of several views, (b, 3, h, w), with a context of such images.
 
         Users' hooks are written for one view.
         """
@@ -172,7 +172,7 @@ class HookDispatcher:
             hook.before_render(context)
 
     def compose(self, context: StageContext, rendered: Tensor) -> Tensor:
-        """The iteration's prediction, (3, h, w), from the rendered image."""
+        """Return the iteration's prediction (3, h, w), given the rendered image."""
         image = rendered
         for hook in self._hooks:
             composed = hook.compose(context, image)
@@ -185,13 +185,13 @@ class HookDispatcher:
         return image
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
-        """The sum of all hooks' terms, a scalar."""
+        """Return the sum of all hooks' terms, a scalar."""
         total = self.extra_loss(context, image)
         assert total is not None, "no hook supervises"
         return total
 
     def extra_loss(self, context: StageContext, image: Tensor) -> Tensor | None:
-        """The sum of all hooks' terms, a scalar; None if none has one."""
+        """Return the sum of all hooks' terms, a scalar; None without any."""
         total: Tensor | None = None
         for hook in self._hooks:
             term = hook.loss(context, image)
@@ -218,7 +218,7 @@ class HookDispatcher:
 
 
 def entry_point_hooks() -> tuple[StageHook, ...]:
-    """The hooks that installed packages register in the group `ENTRY_POINT_GROUP`, by name.
+    """Return the hooks that installed packages register in the group `ENTRY_POINT_GROUP`, sorted by name.
 
     Raises:
         UserInputError: one cannot be imported or created, or is not a usable hook; the line names it.
@@ -228,7 +228,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
         source = f"entry point {entry.name} ({entry.value})"
         try:
             hook = entry.load()()
-        except Exception as error:  # whatever a plugin's import does wrong, the user must learn which plugin it was
+        except Exception as error:  # any error of a plugin's code must name the plugin
             raise UserInputError(
                 f"hook {source} cannot be created: {type(error).__name__}: {error}; "
                 "expected a StageHook class without arguments, fix or uninstall the package that brings it"
@@ -243,14 +243,14 @@ HOOK_NAMES = tuple(name for name in vars(StageHook) if not name.startswith("_"))
 
 
 def verify_hook(hook: object, source: str) -> None:
-    """Check that `hook` overrides StageHook's methods with StageHook's arguments and misspells none.
+    """Check that an object is a hook whose methods have StageHook's names and arguments.
 
     Args:
         hook: any object.
-        source: where it comes from, for the message.
+        source: name of the hook for the message.
 
     Raises:
-        UserInputError: names the source, the method and the argument.
+        UserInputError: it is not; the line names the source, the method and the argument.
     """
     if not isinstance(hook, StageHook):
         raise UserInputError(

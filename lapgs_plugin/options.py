@@ -6,12 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import UserInputError
 
-KEY = "option"
+if TYPE_CHECKING:
+    from lapgs_plugin.registry import Registry
+
+KEY, CHOSEN = "option", "chosen"
+"""Keys of a field's metadata: its `Option`; the registry and the field that says which object of it is chosen."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,24 @@ def option(
     return field(default=default, metadata={KEY: Option(help, panel, names, least, most)})
 
 
+def options_of(registry: Registry[Any], by: str) -> Any:
+    """Declare a dataclass field for the settings object of a registry that the field `by` names.
+
+    Every object of the registry is a settings dataclass, and commands have the options of all of them; those of an
+    object that is not chosen are refused.
+    """
+    return field(default=None, metadata={CHOSEN: (registry, by)})
+
+
 def parameter_name(name: str, declared: Option) -> str:
     """Return the name of a field's command parameter: the option's name as an identifier."""
     shown = declared.names[0].split("/")[0] if declared.names else name
     return shown.lstrip("-").replace("-", "_")
+
+
+def option_name(declared: Field[Any]) -> str:
+    """Return the option of a field as a user writes it."""
+    return "--" + parameter_name(declared.name, declared.metadata[KEY]).replace("_", "-")
 
 
 def option_values(settings: Any) -> Mapping[str, Any]:
@@ -73,7 +91,7 @@ def check_bounds(settings: Any) -> None:
         declared, value = each.metadata.get(KEY), getattr(settings, each.name)
         if declared is None or value is None or isinstance(value, str):
             continue
-        name = "--" + parameter_name(each.name, declared).replace("_", "-")
+        name = option_name(each)
         if declared.least is not None and not value >= declared.least:
             raise UserInputError(f"{name} {value}: expected at least {declared.least:g}")
         if declared.most is not None and not value <= declared.most:

@@ -2,65 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Hold what goes by a name on the command line.
+    """Hold the implementations that a user chooses from by name.
 
     Args:
-        option: that names it, such as "--supervision", for messages.
+        option: option that chooses one, such as "--supervision", for messages.
         group: entry point group through which other packages add theirs.
-        kind: class that every entry must be an instance of, or a subclass of where `kind` is a metaclass.
-        own: what this package brings, by name, in the order of help texts.
+        kind: class that every entry must be an instance of, or a subclass of with `classes`.
+        own: this package's implementations by name, in the order of help texts; a text "module:name" is imported when
+            it is looked up. Other packages cannot take these names.
+        classes: whether entries are classes.
     """
 
-    def __init__(self, option: str, group: str, kind: Any, own: Mapping[str, T]) -> None:
-        self._option, self.group, self._kind = option, group, kind
+    def __init__(
+        self, option: str, group: str, kind: type[Any], own: Mapping[str, T | str], *, classes: bool = False
+    ) -> None:
+        self._option, self.group, self._kind, self._classes = option, group, kind, classes
         self._own = dict(own)
 
     @cached_property
-    def _found(self) -> Mapping[str, Any]:
-        """Entry points by name; names of this package cannot be taken."""
+    def _found(self) -> Mapping[str, EntryPoint]:
+        """Entry points of other packages by name."""
         from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
 
         entries = sorted(entry_points(group=self.group), key=lambda entry: (entry.name, entry.value))
         return {entry.name: entry for entry in entries if entry.name not in self._own}
 
     def __iter__(self) -> Iterator[str]:
-        """Names, this package's first."""
+        """Iterate over all names, this package's first."""
         return iter((*self._own, *self._found))
 
     def __getitem__(self, name: str) -> T:
-        """Return what is called `name`.
+        """Return the implementation called `name`.
 
         Raises:
             UserInputError: there is none, or an installed package's cannot be loaded; the line names it.
         """
         if name in self._own:
-            return self._own[name]
+            own = self._own[name]
+            return self._loaded(name, own, lambda: resolve_name(own)) if isinstance(own, str) else own
         if name not in self._found:
             known = list(self)
             expected = " or ".join(known) if len(known) == 2 else ", ".join(known)
             raise UserInputError(f"{self._option} {name}: expected {expected}")
-        entry = self._found[name]
+        return self._loaded(name, self._found[name].value, self._found[name].load)
+
+    def _loaded(self, name: str, source: str, load: Callable[[], Any]) -> T:
+        label, advice = f"{self._option} {name}: {source}", "fix or uninstall the package that brings it"
         try:
-            loaded = entry.load()
+            loaded = load()
         except Exception as error:  # whatever an import does wrong, the user must learn which package it was
-            raise UserInputError(
-                f"{self._option} {name}: {entry.value} cannot be loaded: {type(error).__name__}: {error}; fix or "
-                "uninstall the package that brings it"
-            ) from error
-        if not isinstance(loaded, self._kind):
-            raise UserInputError(
-                f"{self._option} {name}: {entry.value} is a {type(loaded).__name__}, expected a {self._kind.__name__}; "
-                "fix or uninstall the package that brings it"
-            )
+            raise UserInputError(f"{label} cannot be loaded: {type(error).__name__}: {error}; {advice}") from error
+        is_class = isinstance(loaded, type)
+        if self._classes and not (is_class and issubclass(loaded, self._kind)):
+            found = loaded.__name__ if is_class else f"a {type(loaded).__name__}"
+            raise UserInputError(f"{label} is {found}, expected a subclass of {self._kind.__name__}; {advice}")
+        if not self._classes and not isinstance(loaded, self._kind):
+            raise UserInputError(f"{label} is a {type(loaded).__name__}, expected a {self._kind.__name__}; {advice}")
         result: T = loaded
         return result

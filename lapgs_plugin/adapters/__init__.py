@@ -1,1 +1,1 @@
-"""One file a backbone."""
+"""Hold one file for each backbone that `lapgs run` drives, their base class and their registry."""

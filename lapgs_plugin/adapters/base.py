@@ -1,7 +1,9 @@
-"""What every backbone of the 3DGS family has in common, and what an adapter has to say about one of them.
+"""Describe a backbone of the 3DGS family to the runner, which drives all of them and knows none by name.
 
-An adapter answers for one code base: how to recognise it, which of its symbols are wrapped and who uses them, what a
-stage's arguments are, how a field gets in and out. `driver.py` does the rest and knows no backbone by name.
+An adapter says how a checkout is recognised, which of its symbols are replaced besides the common ones, how a stage's
+arguments differ from the run's, and how a field gets in and out of its model.
+
+Imports no torch before a method needs it, so that checkouts are recognised quickly.
 """
 
 from __future__ import annotations
@@ -15,25 +17,33 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
-
-import torch
-from torch import Tensor, nn
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.checkouts.level_views import make_level_view
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, continues_field, nested_densify_until
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from lapgs_plugin.fields.gaussian_field import GaussianField
+    from lapgs_plugin.fields.rasterizer import Semantics
 
 logger = logging.getLogger(__name__)
 
 LARGEST_OPACITY = 1 - 1e-6
-"""Opacities are archived as logits; an activation without an upper limit is cut here."""
+"""Opacity above which a field's opacities are cut: they are archived as logits."""
 
 SPARSE_ADAM = "SparseGaussianAdam"
-"""What the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
+"""Name that the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
+
+FAMILY_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
+"""Files of every checkout of the family, relative to its root."""
+
+FAMILY_EXTENSIONS = {"simple_knn._C": "nearest neighbours", "fused_ssim": "fast SSIM"}
+"""Compiled modules besides the rasterizer that training scripts of the family import, each with its purpose."""
 
 PARAMETERS: dict[str, Callable[[GaussianField], Tensor]] = {
     "_xyz": lambda field: field.means,
@@ -43,7 +53,7 @@ PARAMETERS: dict[str, Callable[[GaussianField], Tensor]] = {
     "_features_dc": lambda field: field.sh[:, :1],
     "_features_rest": lambda field: field.sh[:, 1:],
 }
-"""Attributes of the family's GaussianModel that hold parameters, and what they are of a GaussianField."""
+"""Parameters of the family's GaussianModel by attribute, each as a GaussianField has it."""
 
 GROUPS = {
     "xyz": "_xyz",
@@ -53,12 +63,12 @@ GROUPS = {
     "scaling": "_scaling",
     "rotation": "_rotation",
 }
-"""The same attributes by the names of their groups in the family's optimizers."""
+"""The same attributes by the names of their parameter groups in the family's optimizers."""
 
 
 @dataclass(frozen=True)
 class BackboneInfo:
-    """What identifies a backbone.
+    """Hold the facts about a backbone.
 
     Attributes:
         name: for `--backbone` and the manifest.
@@ -66,12 +76,14 @@ class BackboneInfo:
         rasterizer: the CUDA module it renders with.
         stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU.
         density_control: methods of its GaussianModel that add, remove or reset Gaussians.
-        density_scores: functions of its script or utilities by whose scores density control decides.
         color_rates: its options that are learning rates of SH coefficients.
         densify_thresholds: its options that are thresholds on screen-space gradients for densification.
-        raster_defaults: what its options set in the rasterizer unless a user says otherwise, where that changes the
-            image and is not in `extensions.CONSTANTS`.
-        telling_options: of the model, in the `cfg_args` that it writes and no other backbone does.
+        own_files: files of its checkout that tell it from other code bases, relative to the checkout's root.
+        fork_of: names of backbones that may recognise its checkout, too, because it has files of theirs.
+        density_scores: functions of its script or utilities whose scores density control uses.
+        raster_defaults: settings of the rasterizer that its options have by default, where these change the image and
+            differ from `extensions.CONSTANTS`.
+        telling_options: options in the `cfg_args` file that no other backbone writes.
     """
 
     name: str
@@ -81,20 +93,41 @@ class BackboneInfo:
     density_control: tuple[str, ...]
     color_rates: tuple[str, ...]
     densify_thresholds: tuple[str, ...]
+    own_files: tuple[str, ...] = ()
+    fork_of: tuple[str, ...] = ()
     density_scores: tuple[str, ...] = ()
     raster_defaults: Mapping[str, Any] = field(default_factory=dict)
     telling_options: tuple[str, ...] = ()
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files that a checkout must have to be recognised."""
+        return (*FAMILY_FILES, *self.own_files)
+
+    @property
+    def extensions(self) -> Mapping[str, str]:
+        """Compiled modules that its training script imports, each with its purpose."""
+        return {self.rasterizer: "rasterizer", **FAMILY_EXTENSIONS}
+
+    def recognises(self, folder: Path) -> bool:
+        """Return whether `folder` has all files of a checkout."""
+        return all((folder / name).is_file() for name in self.files)
+
+    def is_fork_of(self, other: BackboneInfo) -> bool:
+        """Return whether a checkout that both recognise is this one's."""
+        return other.name in self.fork_of or set(other.files) < set(self.files)
+
 
 @dataclass(frozen=True)
 class TrainingCall:
-    """A call of the script's `training`, by parameter name."""
+    """Hold a call of the script's `training` with its arguments by parameter name."""
 
     function: Callable[..., Any]
     values: Mapping[str, Any]
 
     @classmethod
     def bind(cls, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> TrainingCall:
+        """Return the call `function(*args, **kwargs)`, defaults included."""
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
         return cls(function, dict(bound.arguments))
@@ -112,21 +145,23 @@ class TrainingCall:
         return self.values["pipe"]
 
     def changed(self, **values: Any) -> TrainingCall:
+        """Return the call with other values of some arguments."""
         return replace(self, values={**self.values, **values})
 
     def run(self) -> None:
+        """Make the call."""
         self.function(**self.values)
 
 
 @dataclass(frozen=True)
 class StageWindow:
-    """A stage and its place in the whole run.
+    """Place a stage in the whole run.
 
     Attributes:
-        stage: what is trained.
-        start: iterations of the stages before it.
-        total: iterations of the whole run, as the user asked for.
-        levels: of the whole run.
+        stage: the stage.
+        start: number of iterations before it.
+        total: number of iterations of the whole run, as the user asked for.
+        levels: number of levels of the whole run.
         residual_color_rate: factor on the SH learning rates of residual stages.
         threshold_factor: factor on densification thresholds in this stage.
     """
@@ -140,23 +175,23 @@ class StageWindow:
 
     @property
     def continues_field(self) -> bool:
-        """Whether the field of the level before is trained on."""
+        """Whether this stage continues training the previous level's field."""
         return continues_field(self.stage, self.levels)
 
     def scaled(self, iterations: int) -> int:
-        """A constant of the whole run's schedule, as the same share of this stage."""
+        """Return a number of iterations of the whole run's schedule as the same share of this stage."""
         return round(iterations * self.stage.iterations / self.total)
 
     def local(self, iterations: Iterable[int]) -> list[int]:
-        """Those iterations of the whole run that fall into this stage, counted from its beginning."""
+        """Return the iterations of the whole run that fall into this stage, counted from its beginning."""
         return [i - self.start for i in iterations if self.start < i <= self.start + self.stage.iterations]
 
 
 class BackboneAdapter(ABC):
-    """One backbone, driven through the definitions of its training script.
+    """Adapt one backbone, given the definitions of its training script.
 
     Args:
-        script: its train.py, definitions executed.
+        script: its train.py, whose definitions have been executed.
     """
 
     info: ClassVar[BackboneInfo]
@@ -166,17 +201,22 @@ class BackboneAdapter(ABC):
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        """The variant of `reference_raster.standins` that a checkout wants.
+        """Return the variant of `reference_raster.standins` for a checkout's rasterizer.
 
         Args:
-            checkout: its folder.
-            arguments: of its script.
+            checkout: the checkout's folder.
+            arguments: arguments of its script.
         """
         return cls.info.stand_in
 
+    @classmethod
+    def rasterizer_semantics(cls) -> Semantics | None:
+        """Return where the CUDA module departs from the oracle by design; None if another backbone describes it."""
+        return None
+
     @staticmethod
     def saved_logits(stored: Tensor) -> Tensor:
-        """(n,) logits of opacities from what a PLY that the backbone wrote calls opacity, (n,)."""
+        """Return the logits of opacities (n,), given the property "opacity" (n,) of a PLY that the backbone wrote."""
         return stored
 
     @property
@@ -186,21 +226,21 @@ class BackboneAdapter(ABC):
 
     @abstractmethod
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
-        """Render a view as the script's training loop does; the image is picked up at the rasterizer."""
+        """Render a view as the script's training loop does. The runner takes the image at the rasterizer."""
 
     @abstractmethod
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        """Settings of the rasterizer that the images depend on, for whoever renders the run later."""
+        """Return the settings of the rasterizer that change images, to render the run later."""
 
     @abstractmethod
     def passes_dc_apart(self, call: TrainingCall) -> bool:
-        """Whether the checkout's render gives its rasterizer the first SH coefficient by itself."""
+        """Return whether the checkout's render passes the first SH coefficient (DC) as an argument of its own."""
 
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
-        """Check that a hierarchy can honour the options of this call.
+        """Refuse options of this call that a hierarchy cannot honour.
 
         Raises:
-            UserInputError: it cannot; names the option, why, and what to do.
+            UserInputError: there is one; the line says why, and what to do.
         """
         if call.values.get("checkpoint"):
             raise UserInputError(
@@ -226,7 +266,7 @@ class BackboneAdapter(ABC):
             )
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
-        """The arguments of one stage: the schedule scaled to its length, its own output folder, its color rates."""
+        """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
         dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
@@ -251,17 +291,17 @@ class BackboneAdapter(ABC):
         return call.changed(**values)
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
-        """Symbols to replace besides those that the driver replaces in every backbone.
+        """Return the symbols to replace besides those that the runner replaces in every backbone.
 
         Args:
-            window_of: gives the running stage, None between stages.
+            window_of: returns the running stage, None between stages.
         """
         return []
 
     def level_view(  # noqa: B027 - most backbones have nothing else in a view
         self, view: Any, original: Any, size: tuple[int, int], signed: bool
     ) -> None:
-        """Bring everything of a view besides its image to a level's size.
+        """Bring everything of a view but its image to a level's size.
 
         Args:
             view: a copy of `original` with the level's width and height, to be changed.
@@ -271,89 +311,96 @@ class BackboneAdapter(ABC):
         """
 
     def first_points(self, count: int) -> None:  # noqa: B027 - few need it
-        """Told how many points the scene comes with, before the first stage."""
+        """Receive the number of points of the scene, before the first stage."""
 
     def stage_scene(self, scene: Any) -> None:  # noqa: B027 - few need it
-        """Told of the scene that a stage trains on, before its first iteration."""
+        """Receive the scene that a stage trains on, before its first iteration."""
 
     def new_model(self, call: TrainingCall) -> Any:
-        """A GaussianModel without Gaussians, as the script makes it."""
+        """Return a GaussianModel without Gaussians, made as the script makes it."""
         return self.train.GaussianModel(call.dataset.sh_degree, *self.model_options(call))
 
     def model_of(self, call: TrainingCall, field: GaussianField) -> Any:
-        """A GaussianModel of an archived field, to be rendered; its optimizer is not set up."""
+        """Return a GaussianModel of a field for rendering; its optimizer is not set up."""
         gaussians = self.new_model(call)
         self.import_field(gaussians, field)
         gaussians.active_sh_degree = field.sh_degree
         return gaussians
 
     def view_at(self, camera: Any, size: tuple[int, int], signed: bool, image: Callable[[], Tensor]) -> Any:
-        """A camera of the checkout at a level's size.
+        """Return a copy of a checkout's camera at a level's size.
 
         Args:
-            camera: of the full-size image; left as it is.
+            camera: the camera of the full-size image.
             size: (width, height) of the level.
             signed: whether a residual is trained.
-            image: gives the level's (3, height, width).
+            image: returns the level's image (3, height, width).
         """
+        from lapgs_plugin.checkouts.level_views import make_level_view
+
         view = make_level_view(camera, size, image)
         self.level_view(view, camera, size, signed)
         return view
 
     def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
-        """What the script gives its GaussianModel after the SH degree."""
+        """Return the arguments of the script's GaussianModel after the SH degree."""
         return (call.opt.optimizer_type,)
 
-    @torch.no_grad()
     def export_field(self, gaussians: Any, signed: bool) -> GaussianField:
-        """The model's parameters as `snapshot` gives them, to be archived: says how many a PLY cannot hold."""
-        if gaussians.opacity_activation is not torch.sigmoid:
-            opacity = gaussians.get_opacity
-            if cut := int((opacity > LARGEST_OPACITY).sum()):
-                logger.warning(
-                    "%d of %d Gaussians have opacities above 1, which a 3DGS PLY cannot hold: archived as 1",
-                    cut,
-                    len(opacity),
-                )
-        return self.snapshot(gaussians, signed)
+        """Return the model's parameters as `snapshot` does, and warn of opacities that a PLY cannot hold."""
+        import torch
 
-    @torch.no_grad()
+        with torch.no_grad():
+            if gaussians.opacity_activation is not torch.sigmoid:
+                opacity = gaussians.get_opacity
+                if cut := int((opacity > LARGEST_OPACITY).sum()):
+                    logger.warning(
+                        "%d of %d Gaussians have opacities above 1, which a 3DGS PLY cannot hold: archived as 1",
+                        cut,
+                        len(opacity),
+                    )
+            return self.snapshot(gaussians, signed)
+
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
-        """The model's parameters as a field on their device; shares no memory with the model."""
-        if gaussians.opacity_activation is torch.sigmoid:
-            logits = gaussians._opacity
-        else:
-            logits = torch.logit(gaussians.get_opacity.clamp(1e-6, LARGEST_OPACITY))
-        return GaussianField(
-            means=gaussians._xyz.detach().clone(),
-            quaternions=gaussians._rotation.detach().clone(),
-            log_scales=gaussians._scaling.detach().clone(),
-            opacity_logits=logits.detach().clone().squeeze(-1),
-            sh=torch.cat([gaussians._features_dc, gaussians._features_rest], dim=1),
-            signed=signed,
-        )
+        """Return a copy of the model's parameters as a field on their device."""
+        import torch
 
-    @torch.no_grad()
+        from lapgs_plugin.fields.gaussian_field import GaussianField
+
+        with torch.no_grad():
+            if gaussians.opacity_activation is torch.sigmoid:
+                logits = gaussians._opacity
+            else:
+                logits = torch.logit(gaussians.get_opacity.clamp(1e-6, LARGEST_OPACITY))
+            return GaussianField(
+                means=gaussians._xyz.detach().clone(),
+                quaternions=gaussians._rotation.detach().clone(),
+                log_scales=gaussians._scaling.detach().clone(),
+                opacity_logits=logits.detach().clone().squeeze(-1),
+                sh=torch.cat([gaussians._features_dc, gaussians._features_rest], dim=1),
+                signed=signed,
+            )
+
     def import_field(self, gaussians: Any, field: GaussianField, attributes: Iterable[str] = tuple(PARAMETERS)) -> None:
-        """Make parameters of the model those of a field.
+        """Set parameters of the model to those of a field.
 
         Args:
-            gaussians: its optimizer is not set up yet.
-            attributes: which, of `PARAMETERS`.
+            gaussians: the model, whose optimizer is not set up yet.
+            field: the field.
+            attributes: parameters to set, of `PARAMETERS`.
         """
+        import torch
+
         for name in attributes:
-            setattr(
-                gaussians,
-                name,
-                nn.Parameter(PARAMETERS[name](field).detach().clone().contiguous().requires_grad_(True)),
-            )
+            value = PARAMETERS[name](field).detach().clone().contiguous()
+            setattr(gaussians, name, torch.nn.Parameter(value))
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
-        """Parameters that the next stage's model takes over besides its Gaussians."""
+        """Return parameters besides its Gaussians that the next stage's model takes over, by attribute."""
         return {}
 
     def optimizers(self, gaussians: Any) -> list[torch.optim.Optimizer]:
-        """The optimizers that step Gaussians."""
+        """Return the optimizers that step Gaussians."""
         found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
         return [optimizer for optimizer in found if optimizer is not None]

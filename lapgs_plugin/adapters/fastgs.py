@@ -1,31 +1,34 @@
-"""FastGS: multi-view scores for densification and pruning, a compact box, an optimizer that steps ever more rarely.
+"""Drive FastGS: multi-view scores for densification and pruning, compact boxes, an optimizer that skips steps.
 
-It hard-codes two schedules by iteration. Late pruning is rescaled to a stage, which would never reach it. When the
-optimizer steps is left alone: it counts from 1 in each stage, as in the paper authors' release.
+FastGS hard-codes two schedules by iteration. Late pruning is rescaled to a stage, which would never reach it. The
+optimizer's schedule is left as it is: it counts from 1 in each stage, as in the paper authors' release.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Replacement
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from lapgs_plugin.fields.rasterizer import Semantics
+
 LATE_PRUNING_FROM, LATE_PRUNING_EVERY = 1 / 2, 1 / 10
-"""When FastGS prunes late, as shares of the iterations: hard-coded there for 30,000."""
+"""First late pruning and interval as shares of the iterations; FastGS hard-codes them for 30,000."""
 
 LATE_MIN_OPACITY = 0.1
-"""Opacity below which its late pruning removes Gaussians."""
+"""Opacity below which late pruning removes Gaussians."""
 
 
-class FastGSAdapter(BackboneAdapter):
-    """Drives a FastGS checkout. Its score functions see composed images and each level's ground truth by themselves,
-    because both are put in place below them; what is adapted here is its late pruning.
+class Adapter(BackboneAdapter):
+    """Drive a FastGS checkout; only its late pruning needs adapting.
+
+    Its score functions get composed images and the level's ground truth, because both are replaced below them.
     """
 
     info = BackboneInfo(
@@ -37,8 +40,21 @@ class FastGSAdapter(BackboneAdapter):
         density_scores=("compute_gaussian_score_fastgs",),
         color_rates=("lowfeature_lr", "highfeature_lr"),
         densify_thresholds=("grad_thresh", "grad_abs_thresh"),
+        own_files=("utils/fast_utils.py",),
+        fork_of=("taming",),
         raster_defaults={"mult": 0.5},
     )
+
+    @classmethod
+    def rasterizer_semantics(cls) -> Semantics:
+        from lapgs_plugin.fields.rasterizer import Semantics
+
+        return Semantics(
+            three_sigma_cut=False,
+            expanded_conic_gradient=True,
+            note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are right to "
+            "a few hundredths",
+        )
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
         self.train.render_fastgs(view, gaussians, call.pipe, background, call.opt.mult)
@@ -85,8 +101,9 @@ class FastGSAdapter(BackboneAdapter):
     def _with_late_pruning(
         self, original: Callable[[Any, int], Any], window_of: Callable[[], StageWindow | None]
     ) -> Callable[[Any, int], Any]:
-        """Before an iteration begins, prune if the one that just ended is due. There the optimizer has stepped, so
-        that no gradient or radius of an iteration is left that belongs to the Gaussians before the pruning.
+        """Prune before an iteration if the one before it was due.
+
+        By then the optimizer has stepped: no gradient or radius of the pruned Gaussians is used any more.
         """
 
         def update_learning_rate(gaussians: Any, iteration: int) -> Any:
@@ -97,19 +114,21 @@ class FastGSAdapter(BackboneAdapter):
 
         return update_learning_rate
 
-    @torch.no_grad()
     def _prune_late(self, gaussians: Any) -> None:
-        """What the training loop does at its hard-coded iterations."""
+        """Prune as the training loop does at its hard-coded iterations."""
+        import torch
+
         utils, opt, pipe = sys.modules["utils.fast_utils"], self._stage.opt, self._stage.pipe
         cameras = utils.sampling_cameras(self._scene.getTrainCameras().copy())
         background = torch.full((3,), float(self._stage.dataset.white_background), device=gaussians._xyz.device)
-        _, score = utils.compute_gaussian_score_fastgs(cameras, gaussians, pipe, background, opt)
-        gaussians.tmp_radii = None  # pruning reads what only a densification before it would have set
-        gaussians.final_prune_fastgs(min_opacity=LATE_MIN_OPACITY, pruning_score=score)
+        with torch.no_grad():
+            _, score = utils.compute_gaussian_score_fastgs(cameras, gaussians, pipe, background, opt)
+            gaussians.tmp_radii = None  # pruning reads it, and only densification sets it
+            gaussians.final_prune_fastgs(min_opacity=LATE_MIN_OPACITY, pruning_score=score)
 
 
 def late_pruning_due(iteration: int, iterations: int) -> bool:
-    """Whether FastGS's late pruning follows this iteration of a stage of so many.
+    """Return whether late pruning follows an iteration of a stage of `iterations`.
 
     >>> [i for i in range(1, 30_001) if late_pruning_due(i, 30_000)]
     [18000, 21000, 24000, 27000]
@@ -121,7 +140,7 @@ def late_pruning_due(iteration: int, iterations: int) -> bool:
 def _scores_for_densification_only(
     original: Callable[..., Any], window_of: Callable[[], StageWindow | None]
 ) -> Callable[..., Any]:
-    """The training loop asks for scores without DENSIFY only at its hard-coded iterations, where nothing is pruned."""
+    """Skip scores for late pruning: the loop asks for them, without DENSIFY, at its hard-coded iterations."""
 
     def compute_gaussian_score_fastgs(
         camlist: Any, gaussians: Any, pipe: Any, bg: Any, args: Any, DENSIFY: bool = False
@@ -134,6 +153,8 @@ def _scores_for_densification_only(
 
 
 def _unless_unscored(original: Callable[..., None]) -> Callable[..., None]:
+    """Skip late pruning without scores."""
+
     def final_prune_fastgs(gaussians: Any, min_opacity: float, pruning_score: Any = None) -> None:
         if pruning_score is not None:
             original(gaussians, min_opacity=min_opacity, pruning_score=pruning_score)

@@ -1,25 +1,27 @@
-"""The graphdeco 3DGS repository, with any of its rasterizers: exposure, depth supervision, masks, sparse Adam.
+"""Drive the graphdeco 3DGS repository with any of its rasterizers: exposure, depth supervision, masks, sparse Adam.
 
-All of these came in October 2024, in one piece; a checkout from before has none of them.
+All of these came together in October 2024; an older checkout has none of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 
+if TYPE_CHECKING:
+    from torch import Tensor
 
-class GraphdecoAdapter(BackboneAdapter):
-    """Drives a checkout of the graphdeco repository.
+    from lapgs_plugin.fields.rasterizer import Semantics
 
-    Its render applies the exposure of a view and clamps to [0, 1] after the rasterizer, so both act on the composed
-    image. Depth supervises no residual: a residual's opacity says where detail is missing, not where surfaces are.
+
+class Adapter(BackboneAdapter):
+    """Drive a checkout of the graphdeco repository, or a fork that no other adapter recognises.
+
+    Its render applies a view's exposure and clamps to [0, 1] after the rasterizer, so both act on the composed image.
+    Residuals are trained without depth supervision: their opacity says where detail is missing, not where surfaces are.
     """
 
     info = BackboneInfo(
@@ -34,6 +36,16 @@ class GraphdecoAdapter(BackboneAdapter):
     )
 
     @classmethod
+    def rasterizer_semantics(cls) -> Semantics:
+        from lapgs_plugin.fields.rasterizer import Semantics
+
+        return Semantics(
+            expanded_conic_gradient=True,
+            note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of "
+            "needles are right to a few hundredths",
+        )
+
+    @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
         renderer = checkout / "gaussian_renderer" / "__init__.py"
         if "antialiasing" not in renderer.read_text(encoding="utf-8", errors="replace"):
@@ -43,6 +55,7 @@ class GraphdecoAdapter(BackboneAdapter):
 
     @property
     def _of_2023(self) -> bool:
+        """Whether the checkout is older than October 2024."""
         return not hasattr(self.train, "SPARSE_ADAM_AVAILABLE")
 
     def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
@@ -52,7 +65,7 @@ class GraphdecoAdapter(BackboneAdapter):
         return not self._of_2023 and bool(self.train.SPARSE_ADAM_AVAILABLE)
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
-        # Without exposure: predictions of finished levels lie before it.
+        # Exposure is left out: predictions of finished levels are taken before it is applied.
         options = {} if self._of_2023 else {"separate_sh": self.passes_dc_apart(call), "use_trained_exp": False}
         self.train.render(view, gaussians, call.pipe, background, **options)
 
@@ -69,7 +82,7 @@ class GraphdecoAdapter(BackboneAdapter):
         if self._of_2023:
             return
         if original.alpha_mask is not None:
-            # Most photos have no mask; without one the training loop saves a pass over the image.
+            # Most masks are opaque; without one the training loop saves a pass over the image.
             opaque = bool((original.alpha_mask == 1).all())
             view.alpha_mask = None if opaque else _shrunk(original.alpha_mask, size)
         if original.invdepthmap is not None:
@@ -80,12 +93,16 @@ class GraphdecoAdapter(BackboneAdapter):
                 view.depth_mask = _shrunk(original.depth_mask, size)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
-        """Exposures, which belong to the photos and not to a level."""
+        """Return the exposures, which belong to the photos and not to a level."""
+        import torch
+
         return {} if self._of_2023 else {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
 
 
 def _shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """(..., h, w) averaged down to (width, height) `size`, float32."""
+    """Return an image (..., h, w) averaged down to `size` (width, height), float32."""
+    import torch
+
     width, height = size
     result: Tensor = torch.nn.functional.interpolate(image[None].float(), (height, width), mode="area")[0]
     return result

@@ -1,89 +1,100 @@
-"""The backbones this project knows, by the traces they leave: files of a checkout, names of their extensions."""
+"""Find the backbone of a checkout: every file beside this one defines a backbone, and other packages add theirs.
+
+Imports no torch, and neither does any adapter here when it is imported.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib import import_module
+import pkgutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from lapgs_plugin import adapters
+from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.registry import Registry
 
-if TYPE_CHECKING:
-    from lapgs_plugin.adapters.base import BackboneAdapter
+GROUP = "lapgs_plugin.backbones"
+"""Entry point group whose members are subclasses of `BackboneAdapter`; an entry's name is the adapter's `info.name`."""
 
-
-@dataclass(frozen=True)
-class KnownCheckout:
-    """A code base that trains 3DGS.
-
-    Attributes:
-        name: as its authors write it.
-        files: what its checkout has, relative to its root; all of them must be there.
-        key: what `--backbone` calls it; None where `lapgs run` does not drive it.
-        adapter: module and class that drive it.
-    """
-
-    name: str
-    files: tuple[str, ...]
-    key: str | None = None
-    adapter: str = ""
-
-
-GRAPHDECO_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
-
-KNOWN_CHECKOUTS = (
-    KnownCheckout("FastGS", (*GRAPHDECO_FILES, "utils/fast_utils.py"), "fastgs", "fastgs:FastGSAdapter"),
-    KnownCheckout("Taming-3DGS", (*GRAPHDECO_FILES, "utils/taming_utils.py"), "taming", "taming:TamingAdapter"),
-    KnownCheckout("graphdeco 3DGS or a fork of it", GRAPHDECO_FILES, "graphdeco", "graphdeco:GraphdecoAdapter"),
-    KnownCheckout("gsplat", ("gsplat/rendering.py", "examples/simple_trainer.py")),
+OWN = tuple(
+    module.name for module in pkgutil.iter_modules(adapters.__path__) if module.name not in ("base", "registry")
 )
-"""Most specific first: FastGS and Taming-3DGS are forks of graphdeco's code, and FastGS took over files of Taming's."""
+"""Names of the backbones in this package: `adapters/<name>.py` defines `Adapter`."""
 
-DRIVABLE = {checkout.key: checkout for checkout in KNOWN_CHECKOUTS if checkout.key is not None}
-"""Those that `lapgs run` drives, by what `--backbone` calls them."""
-
-KNOWN_EXTENSIONS = {
-    "diff_gaussian_rasterization": "rasterizer of graphdeco 3DGS and Taming-3DGS",
-    "diff_gaussian_rasterization_fastgs": "rasterizer of FastGS",
-    "simple_knn._C": "nearest neighbours of graphdeco 3DGS and its forks",
-    "fused_ssim": "fast SSIM of several of them",
-}
-"""Compiled modules that their training scripts import, and what for."""
+BACKBONES: Registry[type[BackboneAdapter]] = Registry(
+    "--backbone",
+    GROUP,
+    BackboneAdapter,
+    {name: f"{adapters.__name__}.{name}:Adapter" for name in OWN},
+    classes=True,
+)
+"""Backbones by name."""
 
 
-def recognise_checkout(folder: Path) -> KnownCheckout | None:
-    """The code base whose checkout `folder` is the root of, None when it is none that is known."""
-    for checkout in KNOWN_CHECKOUTS:
-        if all((folder / name).is_file() for name in checkout.files):
-            return checkout
-    return None
-
-
-def adapter_class(folder: Path, key: str | None = None) -> type[BackboneAdapter]:
-    """The adapter for the checkout whose root is `folder`, or the one called `key`.
+def all_adapters() -> tuple[type[BackboneAdapter], ...]:
+    """Return the adapters of all backbones, this package's first.
 
     Raises:
-        UserInputError: the checkout is none that is known, or no adapter is called that.
+        UserInputError: an installed package's cannot be loaded, or has another name; the line names it.
     """
-    if key is not None and key not in DRIVABLE:
-        raise UserInputError(f"--backbone {key}: expected {', '.join(DRIVABLE)}")
-    found = recognise_checkout(folder) if key is None else DRIVABLE[key]
-    if found is None or found.key is None:
-        names = ", ".join(checkout.name for checkout in DRIVABLE.values())
+    found = {name: BACKBONES[name] for name in BACKBONES}
+    for name, adapter in found.items():
+        if adapter.info.name != name:
+            raise UserInputError(
+                f"--backbone {name}: the info of {adapter.__module__}.{adapter.__qualname__} has the name "
+                f"{adapter.info.name}, expected {name}; fix or uninstall the package that brings it"
+            )
+    return tuple(found.values())
+
+
+def recognise(folder: Path) -> type[BackboneAdapter] | None:
+    """Return the adapter of the checkout whose root is `folder`, None if no backbone recognises it.
+
+    A fork has the files of the code that it was forked from. So of several backbones that recognise a folder, one loses
+    against those that ask for all of its files and more, and against those that say that they are forks of it.
+
+    Raises:
+        UserInputError: several are left, or an installed package's cannot be loaded.
+    """
+    found = [each for each in all_adapters() if each.info.recognises(folder)]
+    left = [each for each in found if not any(other.info.is_fork_of(each.info) for other in found)]
+    if len(left) > 1:
+        names = " and ".join(each.info.name for each in left)
+        raise UserInputError(f"{folder} is recognised as a checkout of {names}; choose one with --backbone")
+    return left[0] if left else None
+
+
+def adapter_class(folder: Path, name: str | None = None) -> type[BackboneAdapter]:
+    """Return the adapter called `name`, or the one that recognises the checkout whose root is `folder`.
+
+    Raises:
+        UserInputError: no backbone recognises the checkout, or none is called that.
+    """
+    if name is not None:
+        return BACKBONES[name]
+    found = recognise(folder)
+    if found is None:
+        known = "; ".join(f"{each.info.title}: {', '.join(each.info.files)}" for each in all_adapters())
         raise UserInputError(
-            f"{folder} is not the root of a checkout that `lapgs run` knows ({names}), which have "
-            f"{', '.join(GRAPHDECO_FILES)}; name it with --backbone, or use `lapgs train` without a checkout"
+            f"{folder} is not the root of a checkout that `lapgs run` knows, by the files that it has ({known}); name "
+            "its backbone with --backbone, or use `lapgs train` without a checkout"
         )
-    return _adapter(found)
+    return found
 
 
-def adapters() -> dict[str, type[BackboneAdapter]]:
-    """All adapters by what `--backbone` calls them."""
-    return {name: _adapter(checkout) for name, checkout in DRIVABLE.items()}
+def known_extensions() -> dict[str, str]:
+    """Return the compiled modules that the backbones' training scripts import, each with its purpose."""
+    users: dict[tuple[str, str], list[str]] = {}
+    for each in all_adapters():
+        for module, purpose in each.info.extensions.items():
+            users.setdefault((module, purpose), []).append(each.info.title)
+    return {module: f"{purpose} of {', '.join(titles)}" for (module, purpose), titles in users.items()}
 
 
-def _adapter(checkout: KnownCheckout) -> type[BackboneAdapter]:
-    module, name = checkout.adapter.split(":")
-    adapter: Any = getattr(import_module(f"lapgs_plugin.adapters.{module}"), name)
-    return adapter  # type: ignore[no-any-return]  # found by name
+def rasterizer_owners() -> dict[str, type[BackboneAdapter]]:
+    """Return the adapter that describes each CUDA rasterizer, by the name of the rasterizer's module."""
+    owners: dict[str, type[BackboneAdapter]] = {}
+    for each in all_adapters():
+        if each.rasterizer_semantics() is not None:
+            owners.setdefault(each.info.rasterizer, each)
+    return owners

@@ -1,37 +1,37 @@
-"""Taming-3DGS: densification to a budget of Gaussians, opacities without an upper limit towards the end."""
+"""Drive Taming-3DGS: densification to a budget of Gaussians, opacities without an upper limit towards the end."""
 
 from __future__ import annotations
 
 import copy
 import logging
 from collections.abc import Callable
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 logger = logging.getLogger(__name__)
 
 BASE_SHARE, FINEST_SHARE = 0.5, 1.0
-"""Share of the budget that the coarsest and the finest level end with; stages between lie between.
+"""Share of the budget that the coarsest and the finest level end with; levels between are interpolated.
 
-The base, at a fraction of the pixels, ends with half of it, so that the total work falls. With shares of 0.4 and 0.6
-and opacities frozen half way through each stage, bonsai lost 1.4 dB.
+The base has a fraction of the pixels and ends with half of the budget, which reduces the total work.
 """
 
 LOW_LOGIT = -1.0
-"""Logits of a trained field go down to about -5.3, opacity 0.005, where training prunes; opacities kept as they are
-hover above 0."""
+"""Value that tells logits from opacities in a PLY: a trained field has logits down to about -5.3 (opacity 0.005, where
+training prunes), and opacities are hardly below 0."""
 
 
-class TamingAdapter(BackboneAdapter):
-    """Drives a Taming-3DGS checkout. Its budget counts from a stage's first number of Gaussians in one of two modes;
-    both are turned into a final count for each stage.
+class Adapter(BackboneAdapter):
+    """Drive a Taming-3DGS checkout.
+
+    Both modes of its budget, one of which counts from a stage's first Gaussians, become a final count for each stage.
     """
 
     info = BackboneInfo(
@@ -43,13 +43,16 @@ class TamingAdapter(BackboneAdapter):
         density_scores=("compute_gaussian_score",),
         color_rates=("feature_lr", "shfeature_lr"),
         densify_thresholds=("densify_grad_threshold",),
+        own_files=("utils/taming_utils.py",),
     )
 
     @staticmethod
     def saved_logits(stored: Tensor) -> Tensor:
         if not bool((stored > LOW_LOGIT).all()):
             return stored
-        # Half way through it replaces the sigmoid by the absolute value, and saves what that is taken of.
+        import torch
+
+        # Half way through training it replaces the sigmoid by the absolute value, and saves the value before that.
         return torch.logit(stored.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
@@ -84,15 +87,17 @@ class TamingAdapter(BackboneAdapter):
             )
 
     def _try_lpips(self, call: TrainingCall) -> None:
-        """Compute an LPIPS if reports will: its networks are downloaded at the first, hours into the training."""
+        """Compute an LPIPS if reports will: the first one downloads networks, and would do so hours into training."""
+        import torch
+
         due = [i for i in call.values["testing_iterations"] if 0 < i <= call.opt.iterations]
         if not due or not hasattr(self.train, "lpips"):
             return
         image = torch.zeros(1, 3, 64, 64)
         try:
-            with torch.no_grad(), torch.random.fork_rng():  # drawing their first weights is not to change the training
+            with torch.no_grad(), torch.random.fork_rng():  # initial weights are random
                 self.train.lpips(image, image, net_type="vgg")
-        except Exception as error:  # a package, a download, a damaged file: training would stop at any of them
+        except Exception as error:  # a missing package, a failed download, a damaged file: any would stop training
             raise UserInputError(
                 f"--test_iterations {' '.join(map(str, due))}: the checkout computes LPIPS then, which fails now "
                 f"already ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}); "
@@ -102,8 +107,8 @@ class TamingAdapter(BackboneAdapter):
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
         args, opt = copy.copy(call.values["args"]), changed.opt
-        # Its table of counts has one entry an interval, and is looked up beyond its end unless densification starts and
-        # stops at whole intervals.
+        # Its table of counts has one entry an interval; a lookup is past its end unless densification starts and stops
+        # at whole intervals.
         opt.densify_from_iter = -(-opt.densify_from_iter // opt.densification_interval) * opt.densification_interval
         intervals = (opt.densify_until_iter - opt.densify_from_iter) // opt.densification_interval
         if intervals < 1:
@@ -119,7 +124,7 @@ class TamingAdapter(BackboneAdapter):
         return changed.changed(args=args)
 
     def _budget(self, call: TrainingCall, window: StageWindow) -> int:
-        """Number of Gaussians that a stage may grow to."""
+        """Return the number of Gaussians that a stage may grow to."""
         given = call.values["args"]
         whole = given.budget * self._points if given.mode == "multiplier" else given.budget
         if window.levels == 1:
@@ -132,7 +137,7 @@ class TamingAdapter(BackboneAdapter):
 
 
 def _unless_nothing(original: Callable[..., None]) -> Callable[..., None]:
-    """Leave out what would add no Gaussian: a field that inherits can be at its budget, or have none that qualifies."""
+    """Skip densification without a budget, where an inherited field has as many Gaussians as it may."""
 
     def densify(gaussians: Any, grads: Tensor, budget: int, filter: Tensor, *others: Any) -> None:
         if budget > 0:
@@ -142,9 +147,9 @@ def _unless_nothing(original: Callable[..., None]) -> Callable[..., None]:
 
 
 def _unless_none_qualifies(original: Callable[..., None]) -> Callable[..., None]:
-    """Leave out a densification for which no Gaussian qualifies: the checkout divides by how many do.
+    """Skip densification if no Gaussian qualifies: the checkout divides by their number.
 
-    A residual's gradients begin near zero, because its colours do.
+    Gradients of a residual are near zero at first, as its colours are.
     """
 
     def densify_with_score(gaussians: Any, *args: Any, **kwargs: Any) -> None:

@@ -1,7 +1,7 @@
-"""What the checkouts' `train.py` needs of packages that they import and that are not installed here.
+"""Stand in for packages that checkouts import and that are not installed.
 
-Their import lines run through, and so do the few functions that training calls. Anything else of these packages raises
-`MissingExtraError`, which names the package, when it is first used. An installed package is always preferred.
+Imports succeed, and so do the few functions that training calls. Any other name of these packages raises
+`MissingExtraError` at its first use. An installed package is always preferred.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 
 
 def absent_modules() -> dict[str, ModuleType]:
-    """Stand-ins, by their full names, for those of the known packages that cannot be imported here."""
+    """Return stand-ins for the known packages that are not installed, by full module name."""
     found: dict[str, ModuleType] = {}
     for package, (distribution, modules) in _PACKAGES.items():
         if package in sys.modules or find_spec(package) is not None:
@@ -40,7 +40,7 @@ def absent_modules() -> dict[str, ModuleType]:
 
 
 class _AbsentModule(ModuleType):
-    """A module with some contents, whose other names ask for the package."""
+    """Offer some names of a package that is not installed; any other raises an error that names the package."""
 
     def __init__(self, name: str, distribution: str, contents: Mapping[str, object]) -> None:
         super().__init__(name, f"Stands in for {name}, which is not installed.")
@@ -50,7 +50,7 @@ class _AbsentModule(ModuleType):
         vars(self).update(contents)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # Python itself looks for these in every module
+        if name.startswith("__"):  # Python looks them up in every module
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
         raise MissingExtraError(
             f"{self.__name__}.{name} is used by the checkout, and {self.__name__.partition('.')[0]} is not installed: "
@@ -59,7 +59,7 @@ class _AbsentModule(ModuleType):
 
 
 class _ToTensor:
-    """An 8-bit picture, grey or RGB, as a float tensor (c, h, w) in [0, 1]."""
+    """Convert an 8-bit picture, grey or RGB, to a float tensor (c, h, w) in [0, 1]."""
 
     def __call__(self, picture: Image.Image) -> Tensor:
         pixels = np.asarray(picture)
@@ -72,7 +72,7 @@ class _ToTensor:
 
 
 class _ToPILImage:
-    """A float tensor (1, h, w) or (3, h, w) in [0, 1] as an 8-bit picture; what is between two steps is cut off."""
+    """Convert a float tensor (1, h, w) or (3, h, w) in [0, 1] to an 8-bit picture, rounding down."""
 
     def __call__(self, tensor: Tensor) -> Image.Image:
         if not (
@@ -93,7 +93,7 @@ def _described(value: object) -> str:
 
 
 class _Progress(Generic[Item]):
-    """A progress bar in one line of the terminal: `tqdm.tqdm` for training loops."""
+    """Print progress in one line of the terminal, with the methods of `tqdm.tqdm` that training loops call."""
 
     def __init__(self, iterable: Iterable[Item] = (), desc: str = "", **_: object) -> None:
         self._items = iterable
@@ -121,7 +121,7 @@ class _Progress(Generic[Item]):
 
 
 _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
-    # Taming-3DGS finds edges with the two transforms; the networks are those of LPIPS, which no training step asks for.
+    # Taming-3DGS finds edges with the two transforms; only LPIPS uses the networks.
     "torchvision": (
         "torchvision",
         {
@@ -130,10 +130,10 @@ _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
             "torchvision.models": {},
         },
     ),
-    # graphdeco reads depth maps with it; scenes without depths call nothing.
+    # graphdeco reads depth maps with it.
     "cv2": ("opencv-python-headless", {"cv2": {}}),
-    # The viewers of FastGS and Taming-3DGS, which are off unless asked for.
+    # The viewers of FastGS and Taming-3DGS use it; they are off by default.
     "websockets": ("websockets", {"websockets": {}}),
     "tqdm": ("tqdm", {"tqdm": {"tqdm": _Progress}}),
 }
-"""For each package: what to install, and its modules with what they have here."""
+"""For each package, the distribution to install and the names that its modules offer here."""

@@ -1,4 +1,4 @@
-"""Replacing symbols of somebody else's modules for a while: checked before, logged, restored by identity."""
+"""Replace symbols of other modules for a while: checked first, logged, and restored by identity."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Replacement:
-    """One symbol to replace.
+    """Describe one symbol to replace.
 
     Attributes:
-        owner: the module or class that holds it.
-        name: of the attribute.
-        make: from the original to what takes its place.
-        parameters: names that the original's first parameters must have; None checks nothing but that it is there.
-        consumed_by: who looks it up there, for the log.
+        owner: module or class that holds it.
+        name: name of the attribute.
+        make: returns the replacement, given the original.
+        parameters: names of the original's first parameters; None checks only that it exists.
+        consumed_by: code that uses it, for the log.
     """
 
     owner: Any
@@ -34,19 +34,20 @@ class Replacement:
 
     @property
     def label(self) -> str:
+        """Full name of the symbol."""
         owner = self.owner
         place = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
         return f"{place}.{self.name}"
 
 
 class Attachment:
-    """Context manager over replacements: all are verified before the first is made, all are undone on leaving.
+    """Replace symbols inside a `with` block. All are verified before the first is replaced, and restored at the end.
 
     Args:
-        replacements: in the order they are made; undone in reverse.
+        replacements: replacements in order; they are undone in reverse.
 
     Raises:
-        UserInputError: on entering, a symbol is missing or takes other parameters; names it.
+        UserInputError: on entering, a symbol is missing or takes other parameters; the line names it.
     """
 
     def __init__(self, replacements: Sequence[Replacement]) -> None:
@@ -56,10 +57,10 @@ class Attachment:
     def __enter__(self) -> Attachment:
         for replacement in self._replacements:
             _verify(replacement)
-        logged: set[str] = set()  # a symbol may be replaced by the driver and, around that, by an adapter
+        logged: set[str] = set()  # the runner and an adapter may both replace a symbol
         try:
             for replacement in self._replacements:
-                # The class's own entry, not what attribute access makes of it: only that restores by identity.
+                # The class's own entry: attribute access may return a bound object, which would not restore it.
                 original = vars(replacement.owner)[replacement.name]
                 self._originals.append(original)
                 setattr(replacement.owner, replacement.name, replacement.make(original))
@@ -85,7 +86,7 @@ def _verify(replacement: Replacement) -> None:
     changed = "this checkout differs from the versions that this adapter was written for"
     if replacement.name not in vars(replacement.owner):
         raise UserInputError(
-            f"{replacement.label} is missing, expected what {replacement.consumed_by} uses; {changed}: "
+            f"{replacement.label} is missing, expected the symbol that {replacement.consumed_by} uses; {changed}: "
             "choose another with --backbone, or train with `lapgs run --off`"
         )
     if replacement.parameters is None:

@@ -1,10 +1,10 @@
-"""An unmodified checkout on a machine without CUDA: inside of `cuda_on_cpu`, its "cuda" is the CPU.
+"""Run an unmodified checkout on a machine without CUDA: "cuda" means the CPU inside `cuda_on_cpu`.
 
-    with cuda_on_cpu("fastgs"):
+    with cuda_on_cpu(variant):
         runpy.run_path("train.py", run_name="__main__")
 
-Two things differ from a GPU that a checkout could notice: `Tensor.cuda()` and `.cpu()` give the tensor itself, no copy
-(as they do on a GPU for a tensor that is there already), and tensors say that they are on "cpu".
+A checkout can notice two differences from a GPU: `Tensor.cuda()` and `.cpu()` return the tensor itself, not a copy, and
+tensors say that they are on "cpu".
 """
 
 from __future__ import annotations
@@ -29,19 +29,18 @@ __all__ = ["cuda_on_cpu"]
 
 @contextmanager
 def cuda_on_cpu(variant: str) -> Iterator[None]:
-    """Let a checkout run without CUDA while inside; afterwards, everything that was replaced is what it was.
+    """Let a checkout run without CUDA inside a `with` block, and restore everything at its end.
 
-    Holds for the whole process, but devices named in torch functions are redirected in this thread only.
+    Symbols are replaced in the whole process; devices in calls of torch functions are redirected in this thread only.
 
     Args:
-        variant: the rasterizer that the checkout wants, a key of `standins.VARIANTS`.
+        variant: stand-in for the checkout's rasterizer, a key of `standins.VARIANTS`.
 
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
-        MissingExtraError: from inside, when the checkout calls into a package that is not installed; that it imports
-            the package is no error.
+        MissingExtraError: inside, when the checkout calls a package that is not installed.
     """
-    import_module("torch._dynamo")  # keeps tables of torch.cuda's functions; optimizers import it
+    import_module("torch._dynamo")  # it has tables of torch.cuda's functions, and optimizers import it later
     with ExitStack() as stack:
         stack.enter_context(install(variant))
         stack.enter_context(_replaced(sys.modules, absent_modules()))
@@ -54,7 +53,7 @@ def cuda_on_cpu(variant: str) -> Iterator[None]:
 
 
 class _CudaMeansCpu(TorchFunctionMode):
-    """Torch functions see the CPU where "cuda" was said. About a microsecond a call."""
+    """Redirect CUDA devices in the arguments of torch functions to the CPU."""
 
     def __torch_function__(
         self,
@@ -74,7 +73,7 @@ class _CudaMeansCpu(TorchFunctionMode):
 
 
 def _redirected(device: Any) -> Any:
-    """The CPU for a device that is a CUDA one, as `torch.device`, name or number; anything else as it is."""
+    """Return the CPU for a CUDA device (`torch.device`, name or number), and any other value unchanged."""
     if isinstance(device, torch.device):
         return _CPU if device.type == "cuda" else device
     is_cuda = device.startswith("cuda") if isinstance(device, str) else type(device) is int
@@ -82,10 +81,10 @@ def _redirected(device: Any) -> Any:
 
 
 def _engine_within(mode: _CudaMeansCpu) -> dict[str, Callable[..., Any]]:
-    """torch's way into its autograd engine, with the mode.
+    """Return a replacement of torch's entry to its autograd engine that keeps the mode.
 
-    torch leaves a mode for as long as `backward` or `grad` runs, but hooks and the backward passes of a checkout's own
-    functions name devices too.
+    torch disables modes during `backward` and `grad`, but hooks and backward passes of a checkout's functions name
+    devices, too.
     """
     run_backward = torch.autograd.graph._engine_run_backward
 
@@ -114,7 +113,7 @@ def _itself(tensor: Tensor, *_: object) -> Tensor:
 
 
 def _loading_to_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
-    """`torch.load`, for checkpoints that were written on a GPU too."""
+    """Return a replacement of `torch.load` that also reads checkpoints written on a GPU."""
 
     @wraps(load)
     def loading(file: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
@@ -124,7 +123,7 @@ def _loading_to_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Event:
-    """`torch.cuda.Event`: on the CPU all work before an event is done when it is recorded."""
+    """Stand in for `torch.cuda.Event`: on the CPU all work before an event is done when it is recorded."""
 
     def __init__(self, enable_timing: bool = False, blocking: bool = False, interprocess: bool = False) -> None:
         self._recorded: float | None = None
@@ -133,7 +132,7 @@ class _Event:
         self._recorded = time.perf_counter()
 
     def elapsed_time(self, end_event: _Event) -> float:
-        """Milliseconds from this event to the other."""
+        """Return the milliseconds from this event to the other."""
         if self._recorded is None or end_event._recorded is None:
             raise RuntimeError("elapsed_time: both events must be recorded first")  # as torch
         return (end_event._recorded - self._recorded) * 1e3
@@ -141,24 +140,23 @@ class _Event:
     def query(self) -> bool:
         return True
 
-    def synchronize(self) -> None:
-        """Nothing to wait for."""
-
     def wait(self, stream: object = None) -> None:
-        """Nothing to wait for."""
+        """Do nothing."""
+
+    synchronize = wait
 
 
 class _Stream:
-    """`torch.cuda.Stream`, also as a context: there is one order of work on the CPU."""
+    """Stand in for `torch.cuda.Stream`, also as a context manager: work on the CPU is done in order."""
 
     def __init__(self, device: object = None, priority: int = 0) -> None:
-        """Arguments as of the CUDA class."""
+        """Take the arguments of the CUDA class."""
 
     def __enter__(self) -> _Stream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Back to the one order."""
+        """Do nothing."""
 
     def record_event(self, event: _Event | None = None) -> _Event:
         event = _Event() if event is None else event
@@ -169,17 +167,16 @@ class _Stream:
         return True
 
     def synchronize(self) -> None:
-        """Nothing to wait for."""
+        """Do nothing."""
 
     def wait_event(self, event: object) -> None:
-        """Nothing to wait for."""
+        """Do nothing."""
 
-    def wait_stream(self, stream: object) -> None:
-        """Nothing to wait for."""
+    wait_stream = wait_event
 
 
 def _returns(value: object) -> Callable[..., Any]:
-    """A function of anything that gives `value`; one for each name, as torch tells functions apart by identity."""
+    """Return a new function of any arguments that returns `value`; torch tells functions apart by identity."""
     return lambda *_, **__: value
 
 
@@ -200,7 +197,7 @@ _WITHOUT_CUDA: dict[str, object] = {
     "device": nullcontext,
     "device_count": _returns(0),
     "empty_cache": _returns(None),
-    "is_available": _returns(False),  # LPIPS asks, to know where its weights go
+    "is_available": _returns(False),  # LPIPS chooses the device of its weights by it
     "ipc_collect": _returns(None),
     "manual_seed": _returns(None),
     "manual_seed_all": _returns(None),
@@ -213,14 +210,14 @@ _WITHOUT_CUDA: dict[str, object] = {
     "stream": nullcontext,
     "synchronize": _returns(None),
 }
-"""Names in `torch.cuda`; on a machine that has CUDA, it is not used either."""
+"""Replacements of names in `torch.cuda`, also on a machine with CUDA."""
 
 _NOT_THERE = object()
 
 
 @contextmanager
 def _replaced(namespace: dict[str, Any], values: Mapping[str, object]) -> Iterator[None]:
-    """Other values under some names while inside; afterwards the former ones, or none."""
+    """Set names to other values inside a `with` block, and restore them at its end."""
     former = {name: namespace.get(name, _NOT_THERE) for name in values}
     namespace.update(values)
     try:

@@ -1,4 +1,4 @@
-"""The views of a checkout's scene at the size of a level, their images in an ImageStore instead of in the cameras."""
+"""Make views of a checkout's scene at a level's size, with images from a store instead of from the cameras."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-
-BYTE_TOLERANCE = 1e-3
-"""How far 255 times a value may be from a whole number to count as a pixel of an 8-bit image: float32 gives 2e-5."""
+from lapgs_plugin.runs.image_store import eight_bit_levels
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A full-size image on the CPU: (3, h, w) uint8 where its values are k/255, float16 where not."""
+class FullSizeImage:
+    """Hold a full-size image (3, h, w) on the CPU: uint8 if all values are k/255, otherwise float16."""
 
     stored: Tensor  # (3, h, w)
 
     @classmethod
-    def of(cls, image: Tensor) -> Photo:
-        levels = image * 255
-        rounded = levels.round()
-        if bool(((levels - rounded).abs() <= BYTE_TOLERANCE).all()):
-            return cls(rounded.to("cpu", torch.uint8))
+    def of(cls, image: Tensor) -> FullSizeImage:
+        """Return the image for values (3, h, w) in [0, 1]."""
+        if (levels := eight_bit_levels(image)) is not None:
+            return cls(levels.cpu())
         return cls(image.to("cpu", torch.float16))
 
     @property
     def exact(self) -> bool:
+        """Whether it is an 8-bit image, stored without rounding."""
         return self.stored.dtype == torch.uint8
 
     @property
@@ -40,29 +38,28 @@ class Photo:
         """(width, height)"""
         return self.stored.shape[2], self.stored.shape[1]
 
-    def image(self, device: torch.device) -> Tensor:
-        """(3, h, w) float32."""
+    def load(self, device: torch.device) -> Tensor:
+        """Return the image (3, h, w) in [0, 1] on a device, float32."""
         moved = self.stored.to(device)
         return moved / 255 if self.exact else moved.float()
 
 
-class PhotoAlbum:
-    """The images of a scene, taken out of its cameras while those are made.
+class SceneImages:
+    """Take a scene's images out of its cameras when these are made, and look them up by key.
 
-    A camera keeps everything but its image; `key` says which image was its. Keys are unique where names need not be:
-    Blender scenes have an r_0 for training and another for testing.
+    Keys are unique even if names are not: Blender scenes have an r_0 for training and another for testing.
     """
 
     def __init__(self) -> None:
-        self._photos: dict[str, Photo] = {}
+        self._images: dict[str, FullSizeImage] = {}
         self._keys: dict[int, str] = {}
-        self._cameras: list[Any] = []  # keeps the identities in `_keys` from being given to other objects
+        self._cameras: list[Any] = []  # objects that live keep their ids, which `_keys` has
 
     def adopting(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """A replacement of the checkout's Camera class, under the name that its loader calls."""
+        """Return a replacement of the checkout's Camera class that takes the image out of every camera it makes."""
 
         def make_camera(*args: Any, **kwargs: Any) -> Any:
-            # The image would be copied to the GPU only to be taken from there.
+            # Avoids a copy of the image to the GPU and back.
             camera = original(*args, **{**kwargs, "data_device": "cpu"})
             channels = len(camera.original_image)
             if channels != 3:
@@ -70,8 +67,8 @@ class PhotoAlbum:
                     f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
                     "scene's images as RGB"
                 )
-            key = f"{len(self._photos):05d}-{camera.image_name}"
-            self._photos[key] = Photo.of(camera.original_image)
+            key = f"{len(self._images):05d}-{camera.image_name}"
+            self._images[key] = FullSizeImage.of(camera.original_image)
             del camera.original_image
             self._keys[id(camera)] = key
             self._cameras.append(camera)
@@ -79,15 +76,17 @@ class PhotoAlbum:
 
         return make_camera
 
-    def __len__(self) -> int:
-        return len(self._photos)
-
     @property
     def exact(self) -> bool:
-        """Whether all images are 8-bit ones."""
-        return all(photo.exact for photo in self._photos.values())
+        """Whether all images are 8-bit images."""
+        return all(image.exact for image in self._images.values())
 
     def key(self, camera: Any) -> str:
+        """Return the key of a camera's image.
+
+        Raises:
+            UserInputError: the camera was not made by the replaced class.
+        """
         try:
             return self._keys[id(camera)]
         except KeyError:
@@ -97,27 +96,27 @@ class PhotoAlbum:
                 "in another way: use `lapgs run --off`"
             ) from None
 
-    def photo(self, key: str) -> Photo:
-        return self._photos[key]
+    def __getitem__(self, key: str) -> FullSizeImage:
+        return self._images[key]
 
     def smallest_size(self) -> tuple[int, int]:
-        """Smallest width and smallest height over all images, as `Scene.smallest_size` has it."""
-        sizes = [photo.size for photo in self._photos.values()]
+        """Return the smallest width and the smallest height over all images, as `Scene.smallest_size` does."""
+        sizes = [image.size for image in self._images.values()]
         return min(width for width, _ in sizes), min(height for _, height in sizes)
 
 
 def view_name(key: str) -> str:
-    """The checkout's name of the image that an album calls `key`."""
+    """Return the checkout's name of the image with a key of `SceneImages`."""
     return key.partition("-")[2]
 
 
 def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tensor]) -> Any:
-    """A camera with another size whose `original_image` is asked for whenever it is looked at.
+    """Return a copy of a camera with another size, whose `original_image` is loaded on every access.
 
     Args:
-        camera: the checkout's; shared with the copy is everything but the size.
+        camera: the checkout's camera; the copy shares all attributes but the size.
         size: (width, height).
-        image: gives (3, height, width).
+        image: returns the image (3, height, width).
     """
     view = copy.copy(camera)
     view.__class__ = _level_class(type(camera))
@@ -127,14 +126,15 @@ def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tens
 
 
 class PrefetchingViews(list[Any]):
-    """Views from which a training loop draws: `stack = views.copy()`, then `stack.pop(randint(0, len(stack) - 1))`.
+    """Prefetch the next view that a training loop draws.
 
-    With every draw the next one is announced. It is known: the loop will ask Python's generator, whose state can be
-    looked at without changing it. Where somebody else draws in between, an announcement is in vain, nothing more.
+    The loop draws by `stack = views.copy()`, then `stack.pop(randint(0, len(stack) - 1))`. The next index follows from
+    the state of Python's generator, which can be read without changing it. If other code draws random numbers in
+    between, another view is drawn, and the prefetch was useless.
 
     Args:
-        views: in the scene's order.
-        prefetch: told of the view that will be drawn next.
+        views: views in the scene's order.
+        prefetch: called with the next view.
     """
 
     def __init__(self, views: Iterable[Any], prefetch: Callable[[Any], None]) -> None:
@@ -142,9 +142,11 @@ class PrefetchingViews(list[Any]):
         self._prefetch = prefetch
 
     def copy(self) -> PrefetchingViews:
+        """Return a copy that prefetches, too."""
         return PrefetchingViews(self, self._prefetch)
 
     def pop(self, index: SupportsIndex = -1, /) -> Any:
+        """Remove and return a view, and prefetch the next one."""
         drawn = super().pop(index)
         if self:
             _PEEK.setstate(random.getstate())
@@ -153,7 +155,7 @@ class PrefetchingViews(list[Any]):
 
 
 _PEEK = random.Random()
-"""Generator that takes the state of Python's own to see what that one will say."""
+"""Generator that takes on the state of Python's own to compute its next number."""
 
 _LEVEL_CLASSES: dict[type, type] = {}
 

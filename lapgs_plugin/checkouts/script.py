@@ -1,6 +1,6 @@
-"""A checkout's training script as Python would run it, with a pause between its definitions and its main block.
+"""Run a checkout's training script as Python would, in two steps: definitions, then main block.
 
-The pause is where symbols are wrapped: everything the script defines and imports is there, nothing has run yet.
+Symbols are replaced between the two, when everything that the script defines and imports exists.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from lapgs_plugin.errors import UserInputError
 
 @dataclass(frozen=True)
 class Script:
-    """A script whose definitions have been executed.
+    """Hold a script whose definitions have been executed.
 
     Attributes:
-        path: the script, absolute; its folder is the checkout.
-        module: what `__main__` is while the script is loaded.
+        path: absolute path of the script; its folder is the checkout.
+        module: the script's namespace, `__main__` while it is loaded.
     """
 
     path: Path
@@ -31,15 +31,16 @@ class Script:
 
     @property
     def checkout(self) -> Path:
+        """Folder of the checkout."""
         return self.path.parent
 
     def run_main(self) -> None:
-        """Execute the main block. Whatever it raises, SystemExit and KeyboardInterrupt included, comes out as it is."""
+        """Execute the main block. Its exceptions, including SystemExit and KeyboardInterrupt, are passed on."""
         exec(self._main, self.module.__dict__)
 
 
 def require_script(path: Path) -> Path:
-    """The absolute path of a script.
+    """Return the absolute path of a script.
 
     Raises:
         UserInputError: it is not a file.
@@ -55,8 +56,8 @@ def require_script(path: Path) -> Path:
 def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     """Execute the definitions of a script in a fresh `__main__`, with its arguments in `sys.argv`.
 
-    On leaving, `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are as before,
-    and the checkout's modules are forgotten, so that another checkout with modules of the same names can follow.
+    At the end `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are restored.
+    The checkout's modules are removed from `sys.modules`: another checkout may have modules of the same names.
 
     Raises:
         UserInputError: it is not Python, or has no main block.
@@ -74,13 +75,13 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         yield Script(path, module, main)
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
-        # Found first, forgotten afterwards: a package without an __init__ asks for its parent when looked at.
+        # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
         for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
             del sys.modules[name]
 
 
 def _split(path: Path) -> tuple[CodeType, CodeType]:
-    """The script without its main block, and the main block, both with the script's line numbers."""
+    """Return the script without its main block, and the main block, both with the script's line numbers."""
     try:
         tree = ast.parse(path.read_bytes(), str(path))
     except (SyntaxError, ValueError) as error:
@@ -92,7 +93,7 @@ def _split(path: Path) -> tuple[CodeType, CodeType]:
         )
     main = ast.Module(body=list(blocks), type_ignores=[])
     tree.body = [node for node in tree.body if node not in blocks]
-    # dont_inherit: this file's future statements are not the script's.
+    # dont_inherit: the script must not get this file's future statements.
     return compile(tree, str(path), "exec", dont_inherit=True), compile(main, str(path), "exec", dont_inherit=True)
 
 
@@ -106,7 +107,7 @@ def _is_main_block(node: ast.stmt) -> bool:
 
 
 def _is_under(module: ModuleType | None, folder: Path) -> bool:
-    # What lies in `sys.modules` need not be a module: there are objects that answer to any name, `__path__` included.
+    # Entries of `sys.modules` may be objects that have any attribute, including `__path__`.
     known = getattr(module, "__dict__", {})
     package = known.get("__path__")
     places = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]

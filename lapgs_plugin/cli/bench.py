@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -23,6 +23,47 @@ class _ExperimentByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
+def ops(
+    width: Annotated[int, typer.Option(min=2, max=16384, help="Width of the images in pixels.")] = 800,
+    height: Annotated[int, typer.Option(min=2, max=16384, help="Height of the images in pixels.")] = 532,
+    gaussians: Annotated[int, typer.Option(min=1, max=10_000_000, help="Number of Gaussians in the field.")] = 100_000,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Turns; the table has medians over them.")] = 7,
+    device: Annotated[
+        str, typer.Option(metavar="auto|cpu|cuda", help="Where to run; auto takes a GPU if there is one.")
+    ] = "auto",
+) -> None:
+    """Time each operation of a training iteration in every version that this machine has.
+
+    Speed-ups and differences are against PyTorch's operations. Other libraries have their own names.
+    """
+    from lapgs_plugin.errors import UserInputError
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise UserInputError(f"--device {device}: expected auto, cpu or cuda")
+    import torch
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from lapgs_plugin.ops.benchmark import benchmark
+
+    has_gpu = torch.cuda.is_available()
+    if device == "cuda" and not has_gpu:
+        raise UserInputError("--device cuda: PyTorch finds no CUDA device; `lapgs doctor` says why")
+    where = torch.device("cuda" if has_gpu and device != "cpu" else "cpu")
+    table = Table(title=f"Operations at {width}x{height} with {gaussians} Gaussians on {where}", box=box.SIMPLE)
+    for heading in ("operation", "version"):
+        table.add_column(heading)
+    for heading in ("ms", "speed-up", "difference"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    shown = ""
+    for found in benchmark(where, width, height, gaussians, repeats):
+        name = "" if found.op == shown else found.op
+        table.add_row(name, found.version, f"{found.milliseconds:.2f}", f"{found.ratio:.2f}", f"{found.difference:.0e}")
+        shown = found.op
+    Console().print(table)
+
+
 bench_app = typer.Typer(
     name="bench",
     cls=_ExperimentByDefault,
@@ -32,3 +73,4 @@ bench_app = typer.Typer(
 )
 bench_app.command(EXPERIMENT)(bench_experiment)
 bench_app.command("raster")(raster)
+bench_app.command("ops")(ops)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec
     from lapgs_plugin.experiments.store import Job
     from lapgs_plugin.runner.settings import RunSettings
-    from lapgs_plugin.runs.archive import SceneReference
+    from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.training.settings import TrainSettings
 
 READS_SCENES = ("OpenImageIO", "pycolmap")

@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from lapgs_plugin.adapters.registry import KnownCheckout
+    from pathlib import Path
+
     from lapgs_plugin.environment.findings import Finding
     from lapgs_plugin.environment.probes import Probe
+
 
 IMPORTED = ("OpenImageIO", "pycolmap")
 """Packages with compiled code that no other probe imports."""
 NOT_NEEDED = ("Kernel cache",)
 """Findings that do not prevent training."""
 ON_THE_CPU = "`lapgs train --rasterizer cpu` works without it"
+GSPLAT_FILES = ("gsplat/rendering.py", "examples/simple_trainer.py")
+"""Files of a checkout of gsplat, which `lapgs run` does not drive."""
 MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold red]!![/bold red]"}
 
 
@@ -46,17 +50,22 @@ def examine() -> dict[str, list[Finding]]:
     from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
-    from lapgs_plugin.adapters.registry import KNOWN_EXTENSIONS, recognise_checkout
+    from lapgs_plugin.adapters.registry import known_extensions
     from lapgs_plugin.environment import driver_version, findings
     from lapgs_plugin.environment.probes import run_probe
+    from lapgs_plugin.errors import UserInputError
 
     requirements = findings.own_requirements()
+    try:
+        modules, adapters = known_extensions(), []
+    except UserInputError as error:  # of an installed package
+        modules, adapters = {}, [findings.Finding("Backbones", "problem", str(error))]
     with ThreadPoolExecutor() as pool:
         torch_probe = pool.submit(run_probe, "torch")
         raster_probe = pool.submit(run_probe, "rasterizer")
         driver = pool.submit(driver_version)
         imports = {name: pool.submit(run_probe, "import", name) for name in IMPORTED}
-        extensions = [pool.submit(findings.extension_finding, *known) for known in KNOWN_EXTENSIONS.items()]
+        extensions = [pool.submit(findings.extension_finding, *known) for known in modules.items()]
     torch = torch_probe.result()
     compilers = findings.compiler_findings(torch.facts.get("cuda"))
     sections = {
@@ -69,23 +78,29 @@ def examine() -> dict[str, list[Finding]]:
         "Backbones": [
             findings.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
             *(extension.result() for extension in extensions),
-            _current_folder(recognise_checkout(Path.cwd()), bool(torch.facts.get("gpus"))),
+            *(adapters or [current_folder(Path.cwd(), bool(torch.facts.get("gpus")))]),
         ],
     }
     return {**{title: found for title, found in sections.items() if found}, "lapgs train": _conclusion(sections, torch)}
 
 
-def _current_folder(checkout: KnownCheckout | None, has_gpu: bool) -> Finding:
-    """Say whether the current folder is a checkout, and where `lapgs run` would train it."""
+def current_folder(folder: Path, has_gpu: bool) -> Finding:
+    """Return whether a folder is a checkout, and on which device `lapgs run` would train it."""
+    from lapgs_plugin.adapters.registry import recognise
     from lapgs_plugin.environment.findings import Finding
+    from lapgs_plugin.errors import UserInputError
 
-    if checkout is None:
-        return Finding("Current folder", "absent", "not a known 3DGS checkout")
-    detail = f"a checkout of {checkout.name}"
-    if checkout.key is not None:
+    try:
+        adapter = recognise(folder)
+    except UserInputError as error:
+        return Finding("Current folder", "problem", str(error))
+    if adapter is not None:
         place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
-        detail += f"; `lapgs run train.py ...` trains it on {place}"
-    return Finding("Current folder", "ok", detail)
+        detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run train.py ...` trains it on {place}"
+        return Finding("Current folder", "ok", detail)
+    if all((folder / file).is_file() for file in GSPLAT_FILES):
+        return Finding("Current folder", "ok", "a checkout of gsplat")
+    return Finding("Current folder", "absent", "not a known 3DGS checkout")
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lapgs_plugin.adapters.registry import OWN
 from lapgs_plugin.errors import UserInputError
 
 
@@ -21,7 +22,7 @@ def import_run(
     ] = None,
     backbone: Annotated[
         str | None,
-        typer.Option(help="Codebase that trained it, if the folder does not tell: fastgs, taming or graphdeco."),
+        typer.Option(help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}."),
     ] = None,
     iteration: Annotated[
         int | None, typer.Option(help="Import the model saved at this iteration. Default: the last one.")

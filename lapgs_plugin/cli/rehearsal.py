@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lapgs_plugin.runner.settings import RunSettings
-    from lapgs_plugin.runs.archive import SceneReference
+    from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.training.settings import TrainSettings
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.adapters.registry import OWN, adapter_class
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
@@ -43,7 +44,10 @@ def run(
         ),
     ] = False,
     backbone: Annotated[
-        str | None, typer.Option(help="fastgs, taming or graphdeco. Default: recognised from the checkout's files.")
+        str | None,
+        typer.Option(
+            help=f"{', '.join(OWN)}, or a backbone of an installed package. Default: recognised from the checkout."
+        ),
     ] = None,
     device: Annotated[
         str,
@@ -69,19 +73,18 @@ def run(
 
         lapgs run train.py -s data/garden -i images --eval
 
-    FastGS, Taming-3DGS and the graphdeco 3DGS repository are recognised. Everything after the script is passed to it.
-    The run is written to the script's output folder (-m) with one folder per level; `lapgs render`, `lapgs eval` and
-    `lapgs report` read it. After Ctrl-C, repeat the command with --resume to continue after the last finished level.
+    --backbone lists the recognised codebases. Everything after the script is passed to it. The run is written to the
+    script's output folder (-m) with one folder per level; `lapgs render`, `lapgs eval` and `lapgs report` read it.
+    After Ctrl-C, repeat the command with --resume to continue after the last finished level.
     """
     import logging
 
     import torch
 
-    from lapgs_plugin.adapters.registry import adapter_class
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script, require_script
     from lapgs_plugin.runner.driver import HierarchyDriver
-    from lapgs_plugin.runner.installed_rasterizer import explained
+    from lapgs_plugin.runner.installed_rasterizer import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
 
     if off and (idle := sorted(given_options(context) - OF_OFF)):
@@ -99,21 +102,24 @@ def run(
     chosen = device if device != "auto" else "cuda" if available else "cpu"
     checkout, words = require_script(script).parent, arguments or []
     watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
-    kind: type[BackboneAdapter] = adapter_class(checkout, backbone)
+    plain = off and not record
+    # On a GPU a script that runs as it is needs no adapter.
+    recognised = not plain or chosen == "cpu" or backbone is not None
+    kind: type[BackboneAdapter] | None = adapter_class(checkout, backbone) if recognised else None
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
-    on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if chosen == "cpu" else nullcontext()
+    on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if kind and chosen == "cpu" else nullcontext()
     try:
         with on_device, loaded_script(script, words) as loaded:
-            if off and record:
-                BareRunRecorder(kind(loaded), chosen).run()
+            if kind is None or plain:
+                loaded.run_main()
                 return
             if off:
-                loaded.run_main()
+                BareRunRecorder(kind(loaded), chosen).run()
                 return
             driver = HierarchyDriver(
                 kind(loaded),
@@ -129,7 +135,7 @@ def run(
         if driver.folder is not None:
             keep_preview(driver.folder, chosen)
     except ImportError as error:
-        line = None if off else explained(error, str(script))
+        line = None if off else explain_import_error(error, str(script))
         if line is None:
             raise
         raise line from error

@@ -22,8 +22,9 @@ from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lapgs_plugin.runs.archive import RunArchive, SceneReference
-    from lapgs_plugin.runs.watching import Watcher
+    from lapgs_plugin.runs.archive import RunArchive
+    from lapgs_plugin.runs.manifest import SceneReference
+    from lapgs_plugin.runs.watcher import Watcher
     from lapgs_plugin.scenes import Scene
 
 MAY_CHANGE = ("images_on", "prediction_precision")
@@ -60,7 +61,7 @@ def train(
     from rich.console import Console
     from rich.markup import escape
 
-    from lapgs_plugin.runs.archive import SceneReference
+    from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.training.backend import choose_rasterizer
 
     if resume and overwrite:
@@ -172,7 +173,8 @@ def _create(
     out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
 ) -> tuple[RunArchive, Scene]:
     """Read the scene and check the settings before the run folder is made."""
-    from lapgs_plugin.runs.archive import Manifest, RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
+    from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.trainer import check_storage, make_plan
 

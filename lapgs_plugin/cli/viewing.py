@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -26,9 +26,8 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.reference_raster.oracle import MIN_ALPHA, MIN_TRANSMITTANCE, NEAR_DEPTH
+from lapgs_plugin.reference_raster.layout import MIN_ALPHA, MIN_TRANSMITTANCE, NEAR_DEPTH, TILE
 
-TILE = 16
 MAX_ALPHA = 0.999
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.reference_raster import oracle
+from lapgs_plugin.reference_raster import layout, oracle
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def blended_per_pixel(scene: BenchScene, pixels: int = 256) -> float:
     for point in points:
         dx, dy = (means2d - point).unbind(-1)  # (v,) each
         power = 0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) + conics[:, 1] * dx * dy  # (v,)
-        alphas = (opacities * torch.exp(-power)).clamp(max=oracle.MAX_ALPHA)  # (v,)
-        visible = alphas >= oracle.MIN_ALPHA
+        alphas = (opacities * torch.exp(-power)).clamp(max=layout.MAX_ALPHA)  # (v,)
+        visible = alphas >= layout.MIN_ALPHA
         behind = torch.cumprod(1 - alphas[visible], dim=0)
-        count += int((behind >= oracle.MIN_TRANSMITTANCE).sum())
+        count += int((behind >= layout.MIN_TRANSMITTANCE).sum())
     return count / pixels

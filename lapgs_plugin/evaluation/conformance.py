@@ -69,7 +69,7 @@ EXPANDED_CONIC: dict[str, dict[str, dict[str, float]]] = {
 
 CUDA code of the 3DGS family multiplies out -C G C, the gradient by the 2D covariance, entry by entry. Terms then cancel
 to a part l2/l1 as large, where l1 > l2 are the covariance's eigenvalues, and needles lose most of the digits of their
-long scale. Derivation: docs/notes/from_code_evaluation.md.
+long scale. Derivation: docs/notes/2026-11-conformance.md.
 """
 REBUILT_TRANSMITTANCE: dict[str, dict[str, dict[str, float]]] = {
     # Worst seen on an H200, and in the emulation of tests/unit/test_conformance.py: both 1.0e-2.
@@ -78,7 +78,7 @@ REBUILT_TRANSMITTANCE: dict[str, dict[str, dict[str, float]]] = {
 """The same where `Semantics.rebuilt_transmittance` holds.
 
 The backward pass takes the last transmittance T from a float32 opacity 1 - T. Near the end of blending T is small, so
-all gradients through that pixel share a relative error. Derivation: docs/notes/from_code_evaluation.md.
+all gradients through that pixel share a relative error. Derivation: docs/notes/2026-11-conformance.md.
 """
 MAX_BAND = 0.4
 """Largest share of pixels in the band; only `near_plane` reaches a third."""

@@ -11,5 +11,5 @@
     rows.py         a run's folder -> one flat row
     aggregate.py    rows -> a table of means, spreads, ratios and the paper's figures; tables.py writes it
 
-The command is `lapgs bench EXPERIMENT.toml`; docs/bench.md says how to write one.
+The command is `lapgs bench EXPERIMENT.toml`; docs/measuring.md says how to write one.
 """

@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lapgs_plugin.adapters.registry import recognise_checkout
+from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
@@ -184,8 +184,8 @@ def _schedule(iterations: int) -> tuple[str, ...]:
 
 
 def _import(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:
-    known = recognise_checkout(checkout)
-    named = () if known is None or known.key is None else ("--backbone", known.key)
+    adapter = recognise(checkout)
+    named = () if adapter is None else ("--backbone", adapter.info.name)
     return (
         *(*LAPGS, "import-run", str(folder), "--out", str(folder / IMPORTED), "--scene", str(scene), "--overwrite"),
         *(*named, *_raster_options(spec.arguments)),

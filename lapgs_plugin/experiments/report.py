@@ -32,7 +32,7 @@ from lapgs_plugin.reports.report import (
     write_page,
 )
 from lapgs_plugin.runs.archive import REPORT, RunArchive
-from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.untrusted import read_text, shortened
 
 TEMPLATE = "experiment.html.jinja"

@@ -25,7 +25,9 @@ from lapgs_plugin.experiments.commands import measured_folder
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
-from lapgs_plugin.runs.archive import LevelRecord, RunArchive, read_bare_record
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.runs.training_figures import training_figures
 
 LOGGED_METRICS = ("psnr", "ssim")

@@ -1,7 +1,7 @@
-"""Memory that is used again: with a million pixels, touching fresh memory costs as much as a kernel.
+"""Reuse the memory of large arrays, because the first write to fresh memory costs as much as a kernel.
 
-`empty` hands out arrays that find their way back by themselves, when the array, all its views and all tensors made of
-it are gone: gradients that PyTorch owns as `.grad` come back when the optimizer drops them.
+The memory of an array from `empty` is free again when the array, all its views and all tensors made of it are gone. If
+PyTorch holds the array as a `.grad`, this is when the optimizer drops it.
 """
 
 from __future__ import annotations
@@ -14,41 +14,41 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 ALIGNMENT = 64
-"""Bytes: a line of the cache, and the widest vector."""
+"""Bytes of a cache line, and of the widest vector."""
 SMALL = 2**20
-"""Bytes: less than this, the system's allocator gets from what it has at hand, faster than is possible here."""
+"""Bytes; smaller arrays come from the system's allocator, which reuses memory of this size itself."""
 PATIENCE = 100
-"""Blocks that were not taken during this many requests are given back to the system: some six iterations."""
+"""Blocks not taken during this many requests, some six iterations, are returned to the system."""
 
 
 class _Block:
-    """Some bytes, and when they came back."""
+    """Hold some bytes, and the number of the request after which they were returned."""
 
     def __init__(self, size: int) -> None:
         self.size = size
         memory = np.empty(size + ALIGNMENT, np.uint8)
         self.start = -memory.ctypes.data % ALIGNMENT
-        # A memoryview, so that views of an array made of it keep that array alive and not this one.
+        # A memoryview, because views of an array made of it keep that array alive, and not this one.
         self.memory = memory.data
         self.returned = 0
 
 
 class _Store:
-    """Free blocks."""
+    """Keep free blocks."""
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()  # an array may be collected, and come back, while its thread is in `take`
+        self._lock = threading.RLock()  # an array may be collected while its own thread is in `take`
         self._free: list[_Block] = []
         self._requests = 0
 
     def take(self, size: int) -> _Block:
-        # Rounded up to one of four sizes between powers of two, since what is asked for varies from view to view.
+        # Rounded up to one of four sizes between powers of two, since sizes vary from view to view.
         step = 2 ** (size.bit_length() - 3)
         size = -(-size // step) * step
         with self._lock:
             self._requests += 1
             self._free = [block for block in self._free if self._requests - block.returned < PATIENCE]
-            for i in range(len(self._free) - 1, -1, -1):  # the latest first: it may still be in the cache
+            for i in range(len(self._free) - 1, -1, -1):  # the latest may still be in the cache
                 if self._free[i].size == size:
                     return self._free.pop(i)
             return _Block(size)
@@ -63,7 +63,7 @@ _store = _Store()
 
 
 def empty(size: int, dtype: DTypeLike) -> NDArray[Any]:
-    """A writable array of `size` elements, aligned for vectors, with anything in it."""
+    """Return a writable array of `size` uninitialised elements, aligned for vectors."""
     kind = np.dtype(dtype)
     needed = size * kind.itemsize
     if needed < SMALL:

@@ -1,4 +1,4 @@
-"""The one way kernels are compiled: Numba's njit with types kept, a cache on disk, and a word to who waits for it."""
+"""Compile kernels with Numba, keep their machine code on disk, and say when compilation makes the user wait."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 import numba.core.caching
 import numba.core.event
 
-from lapgs_plugin.jit import lowering as _lowering  # noqa: F401  # teaches Numba the functions of `lanes`
+from lapgs_plugin.jit import lowering as _lowering  # noqa: F401  # registers the functions of `lanes` with Numba
 
-# Versions of Numba differ in how much of this is annotated, so nothing is taken to be.
+# Versions of Numba differ in how much they annotate.
 njit: Any = numba.njit
 caching: Any = numba.core.caching
 event: Any = numba.core.event
@@ -32,9 +32,9 @@ def jit(function: _F) -> _F:
 
     The GIL is released while it runs. Division by zero gives inf or nan as in NumPy.
 
-    The machine code is cached on disk: beside the module, where that folder is read-only in the user's cache folder, or
-    not at all where neither can be written. It is kept until its own file, `lanes`, a `layout` or a `*_kernels`
-    module in the module's folder or the one above changes, so helpers that kernels call must live in one of these.
+    The machine code is cached on disk beside the module, or in the user's cache folder if that folder is read-only, or
+    nowhere if neither can be written. The cache is valid until the function's file, `lanes`, or a `layout` or
+    `*_kernels` module in the same folder or the one above changes. Helpers that kernels call must live in one of these.
     """
     compiled: Any = njit(nogil=True, error_model="numpy")(function)
     with suppress(RuntimeError):  # Numba found no folder to write to
@@ -44,13 +44,13 @@ def jit(function: _F) -> _F:
 
 
 def inline(function: _F) -> _F:
-    """Compile a helper that is always merged into the kernels that call it; it has no cache of its own."""
+    """Compile a helper that is always inlined into the kernels that call it; it has no cache of its own."""
     compiled: _F = njit(nogil=True, error_model="numpy", forceinline=True)(function)
     return compiled
 
 
 class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
-    """Numba's cache, which looks at the file of the function alone, made to notice changes of the helpers it calls."""
+    """Extend Numba's cache, which checks the function's file alone, to the files of helpers."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -58,7 +58,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
         self._cache_file = caching.IndexDataCacheFile(self._cache_path, self._impl.filename_base, stamp)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save machine code; on a full disk the next process compiles again, and this one goes on."""
+        """Save machine code; on a full disk this process continues and the next one compiles again."""
         with suppress(OSError):
             super().save_overload(sig, data)
 
@@ -71,20 +71,20 @@ def _helpers_stamp(folder: Path) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in (*_SHARED, *layouts, *nearby))).hexdigest()
 
 
-class _Announcement(event.Listener):  # type: ignore[misc]  # see above
-    """Says once in a process that kernels are being compiled. Loading them from the cache is silent."""
+class _CompilationNotice(event.Listener):  # type: ignore[misc]  # see above
+    """Tell the user once in a process that kernels are being compiled; loading them from the cache is silent."""
 
     def __init__(self) -> None:
-        self.made = False
+        self._printed = False
 
     def on_start(self, event: Any) -> None:
         ours = event.data["dispatcher"].py_func.__module__.startswith("lapgs_plugin.")
-        if ours and not self.made:
-            self.made = True
-            print("compiling the CPU rasterizer, once, for half a minute ...", file=sys.stderr, flush=True)
+        if ours and not self._printed:
+            self._printed = True
+            print("compiling CPU kernels; later runs load them from a cache ...", file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
         pass
 
 
-event.register("numba:compile", _Announcement())
+event.register("numba:compile", _CompilationNotice())

@@ -1,14 +1,13 @@
-"""Explicit 16-lane vectors for compiled kernels: `Lanes` of floats and `Mask` of booleans.
+"""Provide explicit 16-lane vectors for compiled kernels: `Lanes` of floats and `Mask` of booleans.
 
-Left to itself LLVM vectorises a loop only while nothing in it looks suspicious, and gives up in silence at three to
-four times the cost. Kernels written with the functions below say what is a vector: each call is one LLVM vector
-instruction or a few, and each of these becomes one AVX-512, two AVX2 or four SSE or NEON instructions in float32, twice
-as many in float64.
+LLVM vectorises only loops that it fully understands, and skips others silently. These functions make vectors explicit:
+a call is one LLVM vector instruction or a few. In float32 such an instruction becomes one AVX-512, two AVX2 or four SSE
+or NEON instructions, in float64 twice as many.
 
-The functions work in code compiled by `_jit.jit`, which `_lowering` teaches Numba. In Python they only carry the types,
-and calling them is a bug. No fast-math flag is set anywhere, so equal expressions give equal bits in different kernels.
+The functions work in code compiled by `compiler.jit`; `lowering` registers them with Numba. In Python they only carry
+types, and calling them is a bug. No fast-math flag is set, so equal expressions give equal bits in different kernels.
 
-Where an index is asked for, it must be in range: nothing is checked, and negative ones do not count from the end.
+An index must be in range: nothing is checked, and a negative one does not count from the end.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ WIDTH = 16
 
 
 class Mask(Protocol):
-    """One boolean for each lane."""
+    """Hold one boolean for each lane."""
 
     def __and__(self, other: Mask) -> Mask: ...
     def __or__(self, other: Mask) -> Mask: ...
 
 
 class Lanes(Protocol):
-    """One float for each lane; a float beside it is taken for every lane."""
+    """Hold one float for each lane; a float operand stands for all lanes."""
 
     def __add__(self, other: Lanes | float) -> Lanes: ...
     def __radd__(self, other: float) -> Lanes: ...
@@ -58,122 +57,122 @@ def _compiled_only() -> NoReturn:
 
 
 def borrowed(array: _Array) -> _Array:
-    """The array as a bare pointer, for the functions of this module: without bounds, indexing or a reference count.
+    """Return the array as a bare pointer for the functions of this module: no bounds, indexing or reference count.
 
-    Numba counts references atomically, and where it fails to see that it need not, that costs more in an inner loop
-    than the arithmetic, most of all when several threads count the same array. Arguments of a kernel outlive it; an
-    array that a kernel makes must be named in `keep_alive` after the last use of the pointer.
+    Numba counts references atomically. In an inner loop this can cost more than the arithmetic, most of all when
+    several threads count references to the same array. Arguments of a kernel outlive it; an array that a kernel makes
+    must be passed to `keep_alive` after the last use of the pointer.
     """
     _compiled_only()
 
 
 def keep_alive(array: NDArray[Any]) -> None:
-    """Keep an array until here."""
+    """Keep an array alive until here."""
     _compiled_only()
 
 
 def load(array: Floats, start: int) -> Lanes:
-    """array[start : start + 16] of a contiguous array."""
+    """Load array[start : start + 16] of a contiguous array."""
     _compiled_only()
 
 
 def broadcast(array: Floats, index: int) -> Lanes:
-    """array[index] in each lane."""
+    """Load array[index] into each lane."""
     _compiled_only()
 
 
 def at(array: NDArray[Any], index: int) -> Any:
-    """array[index]; integers are widened to 64 bits."""
+    """Return array[index]; integers are widened to 64 bits."""
     _compiled_only()
 
 
 def put(array: NDArray[Any], index: int, value: Any) -> None:
-    """array[index] = value."""
+    """Set array[index] = value."""
     _compiled_only()
 
 
 def prefetch(array: NDArray[Any], index: int) -> None:
-    """Ask the cache for the line of array[index], which may be out of range."""
+    """Prefetch the cache line of array[index], which may be out of range."""
     _compiled_only()
 
 
 def store(array: Floats, start: int, value: Lanes) -> None:
-    """array[start : start + 16] = value."""
+    """Store array[start : start + 16] = value."""
     _compiled_only()
 
 
 def splat(like: Floats, value: float) -> Lanes:
-    """The same value in each lane, of the type of the array's elements."""
+    """Return the same value in each lane, of the type of the array's elements."""
     _compiled_only()
 
 
 def fma(a: Lanes | float, b: Lanes | float, c: Lanes | float) -> Lanes:
-    """a * b + c, rounded once where the machine can; at least one operand is a vector."""
+    """Return a * b + c, rounded once where the machine can; at least one operand is a vector."""
     _compiled_only()
 
 
 def minimum(a: Lanes | float, b: Lanes | float) -> Lanes:
-    """The smaller of both, b where a is NaN."""
+    """Return the smaller of both, b where a is NaN."""
     _compiled_only()
 
 
 def maximum(a: Lanes | float, b: Lanes | float) -> Lanes:
-    """The larger of both, b where a is NaN."""
+    """Return the larger of both, b where a is NaN."""
     _compiled_only()
 
 
 def absolute(a: Lanes) -> Lanes:
-    """|a|."""
+    """Return |a|."""
     _compiled_only()
 
 
 def sqrt(a: Lanes) -> Lanes:
-    """Square root."""
+    """Return the square root."""
     _compiled_only()
 
 
 def floor(a: Lanes) -> Lanes:
-    """Largest whole number not above a."""
+    """Return the largest whole number not above a."""
     _compiled_only()
 
 
 def ceil(a: Lanes) -> Lanes:
-    """Smallest whole number not below a."""
+    """Return the smallest whole number not below a."""
     _compiled_only()
 
 
 def log2(a: Lanes) -> Lanes:
-    """Logarithm to base 2, lane by lane from the C library: not for inner loops."""
+    """Return the logarithm to base 2, lane by lane from the C library: not for inner loops."""
     _compiled_only()
 
 
 def exp(a: Lanes) -> Lanes:
-    """e^a as accurate as `exp2`; outside of +-87 (float32) or +-708 (float64), and for NaN, that of the upper bound."""
+    """Return e^a as accurate as `exp2`, with a clamped to +-87 (float32) or +-708 (float64); NaN is the upper bound."""
     _compiled_only()
 
 
 def select(mask: Mask, a: Lanes | float, b: Lanes | float) -> Lanes:
-    """a where the mask is set, b elsewhere; one of the two is a vector."""
+    """Return a where the mask is set, b elsewhere; one of the two is a vector."""
     _compiled_only()
 
 
 def exp2(a: Lanes) -> Lanes:
-    """2^a to a relative error of 3e-7 (float32) or 2e-16 (float64); garbage where that leaves the type's range."""
+    """Return 2^a to a relative error of 3e-7 (float32) or 2e-16 (float64); undefined outside of the type's range."""
     _compiled_only()
 
 
 def bits(mask: Mask) -> int:
-    """The mask as an integer, lane i in bit i."""
+    """Return the mask as an integer, lane i in bit i."""
     _compiled_only()
 
 
 def any_lane(mask: Mask) -> bool:
-    """Whether the mask is set in any lane."""
+    """Return whether the mask is set in any lane."""
     _compiled_only()
 
 
 def store_sums(array: Floats, start: int, *values: Lanes) -> None:
-    """array[start + i] = sum of the lanes of values[i], for up to 16 vectors, always added in the same order.
+    """Set array[start + i] to the sum of the lanes of values[i], added in a fixed order, for up to 16 vectors.
 
     16 elements are written: those beyond the number of vectors become zero.
     """
@@ -185,35 +184,35 @@ def load_columns(array: Floats, start: int, columns: Literal[3]) -> Lanes3: ...
 @overload
 def load_columns(array: Floats, start: int, columns: Literal[4]) -> Lanes4: ...
 def load_columns(array: Floats, start: int, columns: Literal[3, 4]) -> tuple[Lanes, ...]:
-    """The columns of 16 rows that follow each other: vector c holds array[start + c + columns * lane]."""
+    """Load the columns of 16 consecutive rows: vector c holds array[start + c + columns * lane]."""
     _compiled_only()
 
 
 def store_columns(array: Floats, start: int, *values: Lanes) -> None:
-    """The inverse of `load_columns`: one vector for each of 2 to 4 columns."""
+    """Invert `load_columns`: store one vector for each of 2 to 4 columns."""
     _compiled_only()
 
 
 def load_rows(array: Floats, start: int, stride: int) -> tuple[Lanes, ...]:
-    """A 16x16 matrix, transposed: vector c holds array[start + c + stride * lane]."""
+    """Load a 16x16 matrix, transposed: vector c holds array[start + c + stride * lane]."""
     _compiled_only()
 
 
 def store_rows(array: Floats, start: int, stride: int, *values: Lanes) -> None:
-    """The inverse of `load_rows` for up to 16 vectors. 16 elements a row are written: the others become zero."""
+    """Invert `load_rows` for up to 16 vectors; all 16 elements of a row are written, the others as zero."""
     _compiled_only()
 
 
 def store_whole(array: NDArray[np.int32], start: int, *values: Lanes) -> None:
-    """`store_columns` of 1 to 4 vectors of whole numbers into integers."""
+    """Store 1 to 4 vectors of whole numbers as integers, arranged as by `store_columns`."""
     _compiled_only()
 
 
 def lowest_bit(value: int) -> int:
-    """Position of the lowest set bit of a positive integer."""
+    """Return the position of the lowest set bit of a positive integer."""
     _compiled_only()
 
 
 def fetch_add(counter: NDArray[np.int64], amount: int) -> int:
-    """counter[0] before `amount` is added to it, as one atomic step."""
+    """Add `amount` to counter[0] atomically and return its value before."""
     _compiled_only()

@@ -1,4 +1,4 @@
-"""How Numba compiles the functions of `lanes`: their types, and the LLVM instructions they stand for."""
+"""Register the functions of `lanes` with Numba: their types and the LLVM instructions that they become."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numba.extending
 from lapgs_plugin.jit import lanes
 from lapgs_plugin.jit.lanes import WIDTH
 
-# Versions of Numba differ in how much of this is annotated, so nothing is taken to be.
+# Versions of Numba differ in how much they annotate.
 ir: Any = llvmlite.ir
 types: Any = numba.core.types
 cgutils: Any = numba.core.cgutils
@@ -25,7 +25,7 @@ extending: Any = numba.extending
 
 
 class LanesType(types.Type):  # type: ignore[misc]  # see above
-    """A vector of floats."""
+    """Type a vector of floats."""
 
     def __init__(self, element: Any) -> None:
         self.element = element
@@ -33,7 +33,7 @@ class LanesType(types.Type):  # type: ignore[misc]  # see above
 
 
 class MaskType(types.Type):  # type: ignore[misc]  # see above
-    """A vector of booleans."""
+    """Type a vector of booleans."""
 
     def __init__(self) -> None:
         super().__init__(name="Mask")
@@ -60,8 +60,8 @@ _Typing = Callable[..., Any]  # argument types -> type of the result, or None if
 _Lowering = Callable[[Any, Any, Any, Any], Any]  # (context, builder, signature, arguments) -> value
 
 
-def _teach(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tuple[Any, ...]) -> None:
-    """Make a function known to Numba.
+def _register(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tuple[Any, ...]) -> None:
+    """Register a function with Numba.
 
     Args:
         shapes: classes of the argument types that `lowering` takes; one tuple for each combination.
@@ -77,7 +77,7 @@ def _teach(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tuple[A
         extending.lower_builtin(function, *shape)(lowering)
 
 
-def _nothing(context: Any) -> Any:
+def _no_value(context: Any) -> Any:
     return context.get_dummy_value()
 
 
@@ -85,7 +85,7 @@ def _nothing(context: Any) -> Any:
 
 
 def _element(*args: Any) -> Any:
-    """The float type of the vectors among the arguments; None if there is none, or a stranger beside them."""
+    """Return the float type of the vectors among the arguments; None without one, or with other than numbers beside."""
     elements = {arg.element for arg in args if isinstance(arg, LanesType)}
     if len(elements) != 1 or not all(isinstance(arg, (LanesType, types.Number)) for arg in args):
         return None
@@ -93,17 +93,17 @@ def _element(*args: Any) -> Any:
 
 
 def _widen(context: Any, builder: Any, value: Any, source: Any, element: Any) -> Any:
-    """The operand as a vector: unchanged, or a number in each lane."""
+    """Return the operand as a vector: a number goes into each lane."""
     if isinstance(source, LanesType):
         return value
     vector = ir.VectorType(context.get_value_type(element), WIDTH)
-    nothing = ir.Constant(vector, ir.Undefined)
-    first = builder.insert_element(nothing, context.cast(builder, value, source, element), _INT32(0))
-    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_INT32, WIDTH), [0] * WIDTH))
+    undefined = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(undefined, context.cast(builder, value, source, element), _INT32(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT32, WIDTH), [0] * WIDTH))
 
 
-def _mathematics(function: Any, arity: int, emit: Callable[..., Any], result: Any = None) -> None:
-    """Teach a function of vectors and numbers, one at least a vector, that returns a vector (or `result`).
+def _register_elementwise(function: Any, arity: int, emit: Callable[..., Any], result: Any = None) -> None:
+    """Register a function of vectors and numbers, at least one a vector, that returns a vector (or `result`).
 
     Args:
         emit: (builder, LLVM type of the vectors, *operands) -> value.
@@ -120,7 +120,7 @@ def _mathematics(function: Any, arity: int, emit: Callable[..., Any], result: An
 
     # A bit for each operand, set where it is a vector.
     shapes = [tuple(LanesType if bit >> i & 1 else types.Number for i in range(arity)) for bit in range(1, 2**arity)]
-    _teach(function, typing, lowering, *shapes)
+    _register(function, typing, lowering, *shapes)
 
 
 def _is_single(vector: Any) -> bool:
@@ -132,7 +132,7 @@ def _constant(vector: Any, value: float) -> Any:
 
 
 def _call(builder: Any, name: str, vector: Any, *operands: Any) -> Any:
-    """An LLVM intrinsic that takes and returns one type of vector."""
+    """Call an LLVM intrinsic that takes and returns one type of vector."""
     function_type = ir.FunctionType(vector, [vector] * len(operands))
     suffix = f"v{WIDTH}f{32 if _is_single(vector) else 64}"
     return builder.call(
@@ -148,8 +148,8 @@ def _comparison(predicate: str) -> Callable[..., Any]:
     return lambda builder, vector, a, b: builder.fcmp_ordered(predicate, a, b)
 
 
-def _chosen(predicate: str) -> Callable[..., Any]:
-    """a where it compares to b as asked for, else b: what the machines' own minimum and maximum do."""
+def _select_by(predicate: str) -> Callable[..., Any]:
+    """Select a where the comparison with b holds, else b, as the machine's minimum and maximum do."""
     return lambda builder, vector, a, b: builder.select(builder.fcmp_ordered(predicate, a, b), a, b)
 
 
@@ -159,19 +159,19 @@ for _operator, _emit in (
     (operator.mul, lambda builder, vector, a, b: builder.fmul(a, b)),
     (operator.truediv, lambda builder, vector, a, b: builder.fdiv(a, b)),
 ):
-    _mathematics(_operator, 2, _emit)
-    _mathematics(getattr(operator, f"i{_operator.__name__}"), 2, _emit)
+    _register_elementwise(_operator, 2, _emit)
+    _register_elementwise(getattr(operator, f"i{_operator.__name__}"), 2, _emit)
 for _operator, _predicate in ((operator.ge, ">="), (operator.le, "<="), (operator.gt, ">"), (operator.lt, "<")):
-    _mathematics(_operator, 2, _comparison(_predicate), _MASK)
-_mathematics(operator.neg, 1, lambda builder, vector, a: builder.fneg(a))
-_mathematics(lanes.fma, 3, _intrinsic("fmuladd"))
-_mathematics(lanes.minimum, 2, _chosen("<"))
-_mathematics(lanes.maximum, 2, _chosen(">"))
-_mathematics(lanes.absolute, 1, _intrinsic("fabs"))
-_mathematics(lanes.sqrt, 1, _intrinsic("sqrt"))
-_mathematics(lanes.floor, 1, _intrinsic("floor"))
-_mathematics(lanes.ceil, 1, _intrinsic("ceil"))
-_mathematics(lanes.log2, 1, _intrinsic("log2"))
+    _register_elementwise(_operator, 2, _comparison(_predicate), _MASK)
+_register_elementwise(operator.neg, 1, lambda builder, vector, a: builder.fneg(a))
+_register_elementwise(lanes.fma, 3, _intrinsic("fmuladd"))
+_register_elementwise(lanes.minimum, 2, _select_by("<"))
+_register_elementwise(lanes.maximum, 2, _select_by(">"))
+_register_elementwise(lanes.absolute, 1, _intrinsic("fabs"))
+_register_elementwise(lanes.sqrt, 1, _intrinsic("sqrt"))
+_register_elementwise(lanes.floor, 1, _intrinsic("floor"))
+_register_elementwise(lanes.ceil, 1, _intrinsic("ceil"))
+_register_elementwise(lanes.log2, 1, _intrinsic("log2"))
 
 # ------------------------------------------------------------------------------------------------ exponentials
 
@@ -205,16 +205,15 @@ _LN2_FLOAT64 = (0.6931471803691238, 1.9082149292705877e-10)
 
 
 def _rounder(vector: Any) -> Any:
-    """1.5 * 2^mantissa bits. Adding it rounds to a whole number and leaves that in the low bits of the sum.
+    """Return 1.5 * 2^(mantissa bits). Adding it rounds to a whole number, which is in the low bits of the sum.
 
-    Conversion to an integer would do too, but is undefined for what does not fit, and far outside of a Gaussian
-    nothing fits.
+    Conversion to an integer is undefined for values that do not fit, such as exponents far outside of a Gaussian.
     """
     return _constant(vector, 1.5 * 2.0 ** (23 if _is_single(vector) else 52))
 
 
 def _scaled_power(builder: Any, vector: Any, fraction: Any, shifted: Any) -> Any:
-    """2^fraction, for a fraction in [-1/2, 1/2], times 2 to the whole number in the low bits of `shifted`."""
+    """Return 2^fraction, fraction in [-1/2, 1/2], times 2 to the whole number in the low bits of `shifted`."""
     mantissa_bits, coefficients = (23, _EXP2_FLOAT32) if _is_single(vector) else (52, _EXP2_FLOAT64)
     integers = ir.VectorType(ir.IntType(32 if _is_single(vector) else 64), WIDTH)
     value = _constant(vector, coefficients[-1])
@@ -241,8 +240,8 @@ def _emit_exp(builder: Any, vector: Any, a: Any) -> Any:
     return _scaled_power(builder, vector, builder.fmul(a, per_e), shifted)
 
 
-_mathematics(lanes.exp2, 1, _emit_exp2)
-_mathematics(lanes.exp, 1, _emit_exp)
+_register_elementwise(lanes.exp2, 1, _emit_exp2)
+_register_elementwise(lanes.exp, 1, _emit_exp)
 
 # ------------------------------------------------------------------------------------------------ masks
 
@@ -274,9 +273,9 @@ def _lower_any_lane(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.icmp_unsigned("!=", packed, packed.type(0))
 
 
-_teach(operator.and_, _both_masks, lambda context, builder, sig, args: builder.and_(*args), (MaskType, MaskType))
-_teach(operator.or_, _both_masks, lambda context, builder, sig, args: builder.or_(*args), (MaskType, MaskType))
-_teach(
+_register(operator.and_, _both_masks, lambda context, builder, sig, args: builder.and_(*args), (MaskType, MaskType))
+_register(operator.or_, _both_masks, lambda context, builder, sig, args: builder.or_(*args), (MaskType, MaskType))
+_register(
     lanes.select,
     _type_select,
     _lower_select,
@@ -284,14 +283,14 @@ _teach(
     (MaskType, LanesType, types.Number),
     (MaskType, types.Number, LanesType),
 )
-_teach(lanes.bits, _one_mask(types.int64), _lower_bits, (MaskType,))
-_teach(lanes.any_lane, _one_mask(types.boolean), _lower_any_lane, (MaskType,))
+_register(lanes.bits, _one_mask(types.int64), _lower_bits, (MaskType,))
+_register(lanes.any_lane, _one_mask(types.boolean), _lower_any_lane, (MaskType,))
 
 # ------------------------------------------------------------------------------------------------ memory
 
 
 def _is_memory(array: Any) -> bool:
-    """Whether it is a contiguous array or a borrowed one."""
+    """Return whether it is a contiguous array or a borrowed one."""
     return isinstance(array, types.CPointer) or (isinstance(array, types.Array) and array.layout == "C")
 
 
@@ -300,33 +299,33 @@ def _of_floats(array: Any) -> bool:
 
 
 def _fit(array: Any, values: Sequence[Any]) -> bool:
-    """Whether there are vectors, 16 at most, of the array's floats."""
+    """Return whether `values` are 1 to 16 vectors of the array's float type."""
     return _of_floats(array) and 0 < len(values) <= WIDTH and set(values) == {LanesType(array.dtype)}
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    """Pointer to an element."""
+    """Return a pointer to an element."""
     borrowed = isinstance(array_type, types.CPointer)
     data = array if borrowed else context.make_array(array_type)(context, builder, array).data
     return builder.gep(data, [index])
 
 
 def _place(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> Any:
-    """Pointer to array[index + offset]; sig and args begin with the array and the index."""
+    """Return a pointer to array[index + offset]; sig and args begin with the array and the index."""
     index = context.cast(builder, args[1], sig.args[1], _INDEX)
     offset = index.type(offset) if isinstance(offset, int) else offset
     return _address(context, builder, sig.args[0], args[0], builder.add(index, offset))
 
 
 def _load_part(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> Any:
-    """array[start + offset : ... + 16]; sig and args begin with the array and the start."""
+    """Load array[start + offset : ... + 16]; sig and args begin with the array and the start."""
     vector = ir.VectorType(context.get_value_type(sig.args[0].dtype), WIDTH)
     pointer = builder.bitcast(_place(context, builder, sig, args, offset), vector.as_pointer())
     return builder.load(pointer, align=sig.args[0].dtype.bitwidth // 8)
 
 
 def _store_part(context: Any, builder: Any, sig: Any, args: Any, value: Any, offset: Any = 0) -> None:
-    """array[start + offset : ... + 16] = value; sig and args begin with the array and the start."""
+    """Store array[start + offset : ... + 16] = value; sig and args begin with the array and the start."""
     pointer = builder.bitcast(_place(context, builder, sig, args, offset), value.type.as_pointer())
     builder.store(value, pointer, align=sig.args[0].dtype.bitwidth // 8)
 
@@ -337,7 +336,7 @@ def _lower_borrowed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 def _lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     _store_part(context, builder, sig, args, args[2])
-    return _nothing(context)
+    return _no_value(context)
 
 
 def _type_at(array: Any, index: Any) -> Any:
@@ -354,7 +353,7 @@ def _lower_at(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def _lower_put(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     value = context.cast(builder, args[2], sig.args[2], sig.args[0].dtype)
     builder.store(value, _place(context, builder, sig, args))
-    return _nothing(context)
+    return _no_value(context)
 
 
 def _lower_broadcast(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -368,7 +367,7 @@ def _lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0i8")
     pointer = builder.bitcast(_place(context, builder, sig, args), byte)
     builder.call(function, [pointer, _INT32(0), _INT32(3), _INT32(1)])  # for reading, into all levels, data
-    return _nothing(context)
+    return _no_value(context)
 
 
 def _lower_splat(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -379,25 +378,25 @@ def _type_vector(array: Any, number: Any) -> Any:
     return LanesType(array.dtype) if _of_floats(array) else None
 
 
-_teach(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed, (types.Array,))
-_teach(lanes.keep_alive, lambda a: types.void, lambda context, *_: _nothing(context), (types.Array,))
-_teach(lanes.load, _type_vector, _load_part, (types.Any, types.Integer))
-_teach(lanes.broadcast, _type_vector, _lower_broadcast, (types.Any, types.Integer))
-_teach(lanes.splat, _type_vector, _lower_splat, (types.Any, types.Number))
-_teach(
+_register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed, (types.Array,))
+_register(lanes.keep_alive, lambda a: types.void, lambda context, *_: _no_value(context), (types.Array,))
+_register(lanes.load, _type_vector, _load_part, (types.Any, types.Integer))
+_register(lanes.broadcast, _type_vector, _lower_broadcast, (types.Any, types.Integer))
+_register(lanes.splat, _type_vector, _lower_splat, (types.Any, types.Number))
+_register(
     lanes.store,
     lambda array, start, value: types.void if _fit(array, [value]) else None,
     _lower_store,
     (types.Any, types.Integer, LanesType),
 )
-_teach(lanes.at, _type_at, _lower_at, (types.Any, types.Integer))
-_teach(
+_register(lanes.at, _type_at, _lower_at, (types.Any, types.Integer))
+_register(
     lanes.put,
     lambda array, index, value: types.void if _is_memory(array) else None,
     _lower_put,
     (types.Any, types.Integer, types.Number),
 )
-_teach(
+_register(
     lanes.prefetch,
     lambda array, index: types.void if _is_memory(array) else None,
     _lower_prefetch,
@@ -408,12 +407,12 @@ _teach(
 
 
 def _shuffle(builder: Any, a: Any, b: Any, order: Iterable[int]) -> Any:
-    """Lanes of a (0 to 15) and b (16 to 31) in any order."""
+    """Return lanes of a (0 to 15) and b (16 to 31) in the given order."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, WIDTH), list(order)))
 
 
 def _pick(builder: Any, parts: Sequence[Any], order: Sequence[int]) -> Any:
-    """Sixteen lanes of the vectors put end to end."""
+    """Return sixteen lanes of the concatenated vectors."""
     result = parts[0]
     for number, part in enumerate(parts[1:], start=1):
         taken = [WIDTH + lane % WIDTH if lane // WIDTH == number else i for i, lane in enumerate(order)]
@@ -424,7 +423,7 @@ def _pick(builder: Any, parts: Sequence[Any], order: Sequence[int]) -> Any:
 
 
 def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
-    """The transpose of 16 vectors of 16 lanes, in four rounds of exchanges between pairs of rows."""
+    """Transpose 16 vectors of 16 lanes in four rounds of exchanges between pairs of rows."""
     rows = list(rows)
     step = 1
     while step < WIDTH:
@@ -439,7 +438,7 @@ def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
 
 
 def _padded(vectors: Sequence[Any]) -> list[Any]:
-    """Sixteen vectors, the last ones zero; LLVM drops what is computed of those."""
+    """Pad to sixteen vectors with zeros; LLVM removes computations with these."""
     return [*vectors, *[ir.Constant(vectors[0].type, None)] * (WIDTH - len(vectors))]
 
 
@@ -462,7 +461,7 @@ def _store_interleaved(context: Any, builder: Any, sig: Any, args: Any, values: 
         elements = range(WIDTH * part, WIDTH * (part + 1))
         order = [element % columns * WIDTH + element // columns for element in elements]
         _store_part(context, builder, sig, args, _pick(builder, values, order), part * WIDTH)
-    return _nothing(context)
+    return _no_value(context)
 
 
 def _lower_store_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -497,16 +496,16 @@ def _lower_store_rows(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     rows = _transposed(builder, _padded(args[3:]))
     for offset, row in zip(_row_offsets(context, builder, sig, args), rows, strict=True):
         _store_part(context, builder, sig, args, row, offset)
-    return _nothing(context)
+    return _no_value(context)
 
 
 def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    # A tree in which each step halves the lanes of two vectors and packs them into one: 15 steps for 16 sums, where
-    # 16 separate sums would take 64.
+    # A tree: each step halves the lanes of two vectors and packs them into one. It takes 15 steps for 16 sums, where
+    # separate sums would take 64.
     vectors = _padded(args[2:])
     step = 1
     while step < WIDTH:
-        # Groups of `step` lanes, from a and from b in turn, and what is to be added to them.
+        # Groups of `step` lanes, from a and from b in turn, and the lanes that are added to them.
         lanes_of = [g + side for g in range(0, WIDTH, 2 * step) for side in (0, WIDTH)]
         first = [lane + i for lane in lanes_of for i in range(step)]
         second = [lane + step for lane in first]
@@ -518,26 +517,26 @@ def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         ]
         step *= 2
     _store_part(context, builder, sig, args, vectors[0])
-    return _nothing(context)
+    return _no_value(context)
 
 
 _VECTORS = types.VarArg(LanesType)
-_teach(lanes.load_columns, _type_load_columns, _lower_load_columns, (types.Any, types.Integer, types.IntegerLiteral))
-_teach(
+_register(lanes.load_columns, _type_load_columns, _lower_load_columns, (types.Any, types.Integer, types.IntegerLiteral))
+_register(
     lanes.store_columns,
     lambda array, start, *values: types.void if _fit(array, values) else None,
     _lower_store_columns,
     (types.Any, types.Integer, _VECTORS),
 )
-_teach(lanes.store_whole, _type_store_whole, _lower_store_whole, (types.Any, types.Integer, _VECTORS))
-_teach(lanes.load_rows, _type_load_rows, _lower_load_rows, (types.Any, types.Integer, types.Integer))
-_teach(
+_register(lanes.store_whole, _type_store_whole, _lower_store_whole, (types.Any, types.Integer, _VECTORS))
+_register(lanes.load_rows, _type_load_rows, _lower_load_rows, (types.Any, types.Integer, types.Integer))
+_register(
     lanes.store_rows,
     lambda array, start, stride, *values: types.void if _fit(array, values) else None,
     _lower_store_rows,
     (types.Any, types.Integer, types.Integer, _VECTORS),
 )
-_teach(
+_register(
     lanes.store_sums,
     lambda array, start, *values: types.void if _fit(array, values) else None,
     _lower_store_sums,
@@ -558,8 +557,8 @@ def _lower_fetch_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.atomic_rmw("add", pointer, amount, "monotonic")
 
 
-_teach(lanes.lowest_bit, lambda value: types.int64, _lower_lowest_bit, (types.Integer,))
-_teach(
+_register(lanes.lowest_bit, lambda value: types.int64, _lower_lowest_bit, (types.Integer,))
+_register(
     lanes.fetch_add,
     lambda counter, amount: types.int64 if counter.dtype == types.int64 else None,
     _lower_fetch_add,

@@ -1,18 +1,15 @@
-"""Threads for kernels: a pool of our own, beside PyTorch's.
+"""Run kernels on a thread pool of our own, beside PyTorch's.
 
-`parallel(kernel, ...)` runs one kernel on several threads at once. Each draws pieces of work from a shared counter
-until none is left, so that the result depends neither on the number of threads nor on who did what. The calling thread
-works too and waits only for threads that have begun; a pool that is late, busy with another caller's kernel or gone
-after a fork costs speed, never a result. Nothing here is bound to an OpenMP or TBB library, and any number of Python
-threads may render at the same time.
+`parallel(kernel, ...)` runs one kernel on several threads at once. Each thread takes tasks from a shared counter until
+none is left, so that the result does not depend on the number of threads. The calling thread works too and waits only
+for threads that have started. If the pool is busy with another caller's kernel or gone after a fork, the kernel is
+slower and its result the same. Any number of Python threads may render at the same time.
 
-PyTorch's OpenMP threads are the trouble. GNU OpenMP, on Linux, lets them spin for about ten milliseconds after each
-operation that ran in parallel (on a tensor of 32768 elements or more), on the cores that the next kernel needs. On two
-cores, rendering 400x300 pixels, an L1 loss in PyTorch and their gradients took 12.6 ms so, 8.9 ms with the first of
-these cures and 8.3 ms with the second:
+PyTorch's OpenMP threads slow kernels down: on Linux, GNU OpenMP lets them spin for about ten milliseconds after each
+parallel operation, on the cores that the next kernel needs. There are two remedies:
 
-- before torch is imported: set OMP_WAIT_POLICY=PASSIVE in the environment, as the command line of this package does;
-- after: `with one_pool():` around the training loop. PyTorch's operations run on the calling thread alone inside, and
+- before torch is imported, set OMP_WAIT_POLICY=PASSIVE in the environment, as the command line of this package does;
+- later, put `with one_pool():` around the training loop. PyTorch's operations then run on the calling thread alone, and
   kernels on as many threads as PyTorch had.
 """
 
@@ -30,7 +27,7 @@ import torch
 
 
 class _Job:
-    """One kernel call that several threads join."""
+    """Run one kernel call that several threads join."""
 
     def __init__(self, kernel: Callable[..., None], arguments: tuple[Any, ...]) -> None:
         self._kernel = kernel
@@ -41,21 +38,21 @@ class _Job:
         self._error: BaseException | None = None
 
     def join_in(self) -> None:
-        """Work on the job unless it is over."""
+        """Work on the job unless it is finished."""
         with self._state:
             if self._closed:
                 return
             self._joined += 1
         try:
             self._kernel(*self._arguments)
-        except BaseException as error:  # handed to the thread that waits in `run`
+        except BaseException as error:  # raised by the thread that waits in `run`
             self._error = error
         with self._state:
             self._joined -= 1
             self._state.notify()
 
     def run(self) -> None:
-        """Work on the job and return when it is over on every thread."""
+        """Work on the job and return when every thread has finished."""
         try:
             self._kernel(*self._arguments)
         finally:
@@ -68,7 +65,7 @@ class _Job:
 
 
 class _Pool:
-    """Daemon threads that wait for jobs without spinning."""
+    """Keep daemon threads that wait for jobs without spinning."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
@@ -103,7 +100,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def num_threads() -> int:
-    """Threads a kernel runs on: `torch.get_num_threads()`, or inside `one_pool` what that was outside."""
+    """Return the number of threads of a kernel: `torch.get_num_threads()`, inside `one_pool` its value outside."""
     return torch.get_num_threads() if _fixed_threads is None else _fixed_threads
 
 
@@ -111,9 +108,9 @@ def parallel(kernel: Callable[..., None], *arguments: Any) -> None:
     """Run kernel(counter, *arguments) on `num_threads()` threads at once.
 
     Args:
-        kernel: compiled function that draws the numbers of its pieces of work with `lanes.fetch_add(counter, 1)` until
-            they exceed what there is to do.
-        arguments: whatever else it takes, the same for each thread.
+        kernel: compiled function that takes the numbers of its tasks from `lanes.fetch_add(counter, 1)` until they
+            exceed the number of tasks.
+        arguments: its other arguments, the same for each thread.
     """
     job = _Job(kernel, (np.zeros(1, dtype=np.int64), *arguments))
     helpers = num_threads() - 1
@@ -124,7 +121,7 @@ def parallel(kernel: Callable[..., None], *arguments: Any) -> None:
 
 @contextmanager
 def one_pool() -> Iterator[None]:
-    """Keep PyTorch's threads asleep inside the block, and kernels on as many threads as before."""
+    """Run PyTorch's operations on one thread inside the block, and kernels on as many threads as before."""
     global _fixed_threads  # noqa: PLW0603  # mirrors torch's own number of threads, which is global as well
     before, torch_threads = _fixed_threads, torch.get_num_threads()
     _fixed_threads = num_threads()

@@ -1,5 +1,4 @@
-"""Decides, on the machine itself, whether our own GPU kernels compile and agree with PyTorch; callers fall back to
-PyTorch's operations where they do not."""
+"""Compare our Triton kernels with PyTorch on this machine before their first use."""
 
 from __future__ import annotations
 
@@ -11,27 +10,59 @@ from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
+Difference = Callable[[torch.device], float]
 
-def matches_reference(otherwise: str, difference: Callable[[], float], limit: float) -> bool:
-    """Whether kernels compile here, and give what the slower way gives.
+
+class SelfCheck:
+    """Decide whether Triton kernels are used here: they have to compile and to agree with PyTorch's operations.
+
+    The comparison runs when it is first asked for, and its answer is kept. The log says when kernels fail it.
 
     Args:
-        otherwise: what is done where they don't, for the log.
-        difference: runs both; how far they are apart.
-        limit: how far still counts as rounding.
+        difference: runs both versions on a device and returns the largest difference between them.
+        fallback: operations used instead of the kernels, for the log.
+        limit: largest difference that counts as rounding.
     """
-    try:
-        with torch.inference_mode(False), torch.enable_grad():
-            found = difference()
-    except Exception as error:  # Triton asks for a C compiler, and says what it lacks in errors of many classes
-        logger.info("%s: %s", otherwise, str(error).strip().split("\n")[0])
-        return False
-    if not found <= limit:
-        logger.warning("%s, because our kernels are off by %g here", otherwise, found)
-        return False
-    return True
+
+    def __init__(self, difference: Difference, fallback: str, limit: float) -> None:
+        self.difference, self._fallback, self._limit = difference, fallback, limit
+        self._passed: bool | None = None
+
+    def __call__(self, *tensors: Tensor) -> bool:
+        """Return whether the kernels can be used, and for these tensors: float32 on a CUDA device."""
+        if any(tensor.device.type != "cuda" or tensor.dtype != torch.float32 for tensor in tensors):
+            return False
+        if self._passed is None:
+            self._passed = self.passes_on(torch.device("cuda"))
+        return self._passed
+
+    def passes_on(self, device: torch.device) -> bool:
+        """Run the comparison now."""
+        try:
+            with torch.inference_mode(False), torch.enable_grad():  # whatever mode the caller is in
+                found = self.difference(device)
+        except Exception as error:  # Triton reports a missing C compiler and the like in errors of many classes
+            logger.info("%s: %s", self._fallback, str(error).strip().split("\n")[0])
+            return False
+        if not found <= self._limit:
+            logger.warning("%s, because our kernels are off by %g here", self._fallback, found)
+            return False
+        return True
+
+    def forget(self) -> None:
+        """Compare again at the next call."""
+        self._passed = None
+
+
+def matches_reference(fallback: str, limit: float) -> Callable[[Difference], SelfCheck]:
+    """Make a `SelfCheck` of a function that returns the largest difference between kernels and PyTorch.
+
+    Args:
+        fallback, limit: as `SelfCheck` takes them.
+    """
+    return lambda difference: SelfCheck(difference, fallback, limit)
 
 
 def largest(values: Iterable[Tensor]) -> float:
-    """The largest number in tensors, of which none is empty; NaN where there is one."""
+    """Return the largest number in tensors, none of them empty; NaN if they hold one."""
     return float(torch.stack([value.detach().max() for value in values]).max())

@@ -1,9 +1,8 @@
-"""The engine behind `lapgs patch`: small anchored edits put into an extension's sources, and taken out again.
+"""Apply small anchored edits to the sources of CUDA extensions and revert them: the engine of `lapgs patch`.
 
-`recipe` reads what is known of each extension from `patches/*.toml`, `tokens` finds places by tokens instead of lines,
-`blocks` is how an edit looks in a file, `engine` plans what changes, `files` looks before it writes and then writes all
-files or none.
-Nothing here runs unless it is called: training never patches anything.
+`recipe` reads the edits of each extension from `patches/*.toml`, `tokens` finds places by tokens instead of lines,
+`blocks` marks an edit in a file, `engine` plans the changes, and `files` writes all files or none. Training never
+patches anything.
 """
 
 from __future__ import annotations

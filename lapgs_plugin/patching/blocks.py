@@ -1,16 +1,16 @@
-"""What an edit looks like in a source file: a marked block that can be taken out again to the byte.
+"""Mark an edit in a source file as a block that can be reverted to the byte.
 
-Two forms. Where the place begins a line, whole lines with its indentation and its line ending:
+A block has one of two forms. An insertion at the start of a line has whole lines with its indentation and line ending:
 
     // >>> lapgs SET/NAME CHECKSUM
     the text
     // <<< lapgs
 
-Elsewhere, and wherever text is replaced, between two comments; what was replaced is kept in the first:
+Any other insertion, and every replacement, stands between two comments, the first of which has the replaced text:
 
     /*>>> lapgs SET/NAME CHECKSUM was: the old text*/the text/*<<< lapgs*/
 
-The checksum tells a block that is as it was written (reformatting aside) from one that somebody changed since.
+The checksum, which ignores white space, tells whether the block was changed after it was written.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _INDENTATION = re.compile(r"[ \t]*\Z")
 
 
 class Block(NamedTuple):
-    """An edit found in a file.
+    """Locate an edit in a file.
 
     Attributes:
-        set, name: which edit it is.
-        start, end: the bytes it takes up.
-        original: what stood there before; empty for an insertion.
-        intact: whether it is still as it was written.
+        set, name: the edit.
+        start, end: range of its bytes.
+        original: replaced text; empty for an insertion.
+        intact: whether it is unchanged since it was written.
     """
 
     set: str
@@ -49,7 +49,7 @@ class Block(NamedTuple):
 
 
 def find_blocks(source: str) -> list[Block]:
-    """All blocks in a file, in order."""
+    """Return all blocks in a file, in order."""
     found = []
     for match in _BLOCK.finditer(source):
         form = "c_" if match["l_sum"] is None else "l_"
@@ -60,7 +60,7 @@ def find_blocks(source: str) -> list[Block]:
 
 
 def stray_marker(source: str) -> int | None:
-    """Where half a block stands (one of its two markers is gone), or None."""
+    """Return the position of a marker without its counterpart, or None."""
     whole = [range(block.start, block.end) for block in find_blocks(source)]
     for match in _MARKER.finditer(source):
         if not any(match.start() in span for span in whole):
@@ -69,7 +69,7 @@ def stray_marker(source: str) -> int | None:
 
 
 def without_blocks(source: str, sets: Collection[str]) -> str:
-    """The file as it was before the edits of these sets were made."""
+    """Return the file without the edits of these sets."""
     kept, position = [], 0
     for block in find_blocks(source):
         if block.set in sets:
@@ -79,9 +79,11 @@ def without_blocks(source: str, sets: Collection[str]) -> str:
 
 
 def insertion(source: str, at: int, label: str, text: str) -> tuple[int, str]:
-    """The block that puts `text` in front of `at`, and where it goes: there, or at the start of the line.
+    """Return the block that inserts `text` at `at`, and its position: `at`, or the start of the line.
 
     Args:
+        source: the file.
+        at: position to insert the text at.
         label: SET/NAME of the edit.
         text: one or more lines joined by "\\n".
     """
@@ -96,20 +98,20 @@ def insertion(source: str, at: int, label: str, text: str) -> tuple[int, str]:
 
 
 def replacement(source: str, start: int, end: int, label: str, text: str) -> str:
-    """The block that stands for `source[start:end]`."""
+    """Return the block that replaces `source[start:end]`."""
     newline = _newline(source, start)
     return _inline(label, text.replace("\n", newline), newline, source[start:end])
 
 
 def _inline(label: str, text: str, newline: str, original: str = "") -> str:
     if newline in text or "//" in text or text.startswith("#"):
-        text = newline + text + newline  # directives need a line of their own, a comment must not reach the marker
+        text = newline + text + newline  # directives need their own line, and a comment must not hide the marker
     was = f" was: {_escape(original)}" if original else ""
     return f"/*>>> lapgs {label} {_checksum(text, original)}{was}*/{text}/*<<< lapgs*/"
 
 
 def _newline(source: str, at: int) -> str:
-    """The line ending of the line at `at`, or of the one before if it is the file's last."""
+    """Return the line ending of the line at `at`, or of the line before if it is the last."""
     end = source.find("\n", at)
     end = source.rfind("\n", 0, at) if end < 0 else end
     return "\r\n" if end > 0 and source[end - 1] == "\r" else "\n"

@@ -1,7 +1,7 @@
-"""Plans what a patch changes: pure functions from the files of an extension to what they would become.
+"""Plan the changes of a patch: pure functions from the files of an extension to their new contents.
 
-What a file becomes depends only on the file without any edits and on which sets are in: applying starts by taking out
-what is there, so it is idempotent and also renews the edits of an older version. Reverting only takes out.
+The new content depends only on the file without edits and on the sets of edits to apply. Applying reverts first, so it
+is idempotent and replaces edits of an older version.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recip
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
 
 ALL_SETS = "all"
-"""Stands for every set: of those to take out for all, of those to put in for all that are not opt-in."""
+"""Name for all sets: all to revert, or all that are not opt-in to apply."""
 
 _SKIPPED_FOLDERS = frozenset({"build", "dist", "third_party", "node_modules"})
 
 
 @dataclass(frozen=True)
 class Target:
-    """An extension whose sources were found in a checkout."""
+    """Locate the sources of an extension in a checkout."""
 
     recipe: Recipe
     folder: Path
@@ -33,7 +33,7 @@ class Target:
 
 @dataclass(frozen=True)
 class FileChange:
-    """What one file holds, and what it would hold."""
+    """Hold the content of a file before and after a change."""
 
     path: Path
     before: bytes
@@ -41,7 +41,7 @@ class FileChange:
 
 
 class State(Enum):
-    """Where a set of edits stands in an extension's sources."""
+    """Name the states of a set of edits in an extension's sources."""
 
     APPLIED = "applied"
     NOT_APPLIED = "not applied"
@@ -52,7 +52,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class SetStatus:
-    """The state of one set, and what stands in its way if anything does."""
+    """Hold the state of a set of edits, and the problems that prevent applying it."""
 
     set: str
     state: State
@@ -60,14 +60,14 @@ class SetStatus:
 
 
 def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tuple[Target, ...]:
-    """The known extensions in a checkout: the folder itself, or those up to two folders below it.
+    """Return the known extensions in a checkout: the folder itself, or folders up to two levels below it.
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
-        recipes: what to look for; None for all that come with the plugin.
+        recipes: recipes of the extensions to find; None for all that come with this package.
 
     Raises:
-        PatchError: `checkout` is not a folder or holds no extension that is known.
+        PatchError: `checkout` is not a folder or has no known extension.
     """
     if not os.path.isdir(checkout):  # noqa: PTH112  # Path.is_dir raises where a name is too long for the file system
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
@@ -84,10 +84,10 @@ def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tup
 
 
 def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
-    """What putting in these sets changes, those that are in already brought up to date with them.
+    """Return the changes that apply these sets and renew the sets that are applied already.
 
     Raises:
-        PatchError: an edit does not fit the sources; the message names the place and what was expected.
+        PatchError: an edit does not fit the sources; the message names the place and the expected code.
     """
     changes, problems = _try_apply(target, sets)
     _refuse(target, problems)
@@ -95,10 +95,10 @@ def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
 
 
 def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
-    """What taking out these sets changes.
+    """Return the changes that revert these sets.
 
     Raises:
-        PatchError: somebody changed a block since it was put in.
+        PatchError: a block was changed after it was written.
     """
     sources = _read(target)
     sets = frozenset(target.recipe.sets if ALL_SETS in sets else sets)
@@ -108,7 +108,7 @@ def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]
 
 
 def status(target: Target) -> tuple[SetStatus, ...]:
-    """Where each set of edits stands in the sources."""
+    """Return the state of each set of edits."""
     present = _present_sets(_read(target).values())
     found = []
     for name in target.recipe.sets:
@@ -126,7 +126,7 @@ def status(target: Target) -> tuple[SetStatus, ...]:
 
 
 def pristine(data: bytes) -> bytes:
-    """A file's content with all edits of all sets taken out."""
+    """Return a file's content without any edits."""
     source = data.decode("latin-1")
     return without_blocks(source, {block.set for block in find_blocks(source)}).encode("latin-1")
 
@@ -140,7 +140,7 @@ def _subfolders(checkout: Path) -> Iterable[Path]:
 
 
 def _read(target: Target) -> dict[str, str]:
-    """The sources that the recipe looks at, by file; files that do not exist are left out."""
+    """Return the sources that a recipe needs by file, without missing files."""
     paths = {file: target.folder / file for file in target.recipe.files}
     return {file: read_source(path) for file, path in paths.items() if path.is_file()}
 
@@ -202,7 +202,7 @@ def _damage(file: str, source: str, sets: Collection[str]) -> list[str]:
 
 
 def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tuple[str, list[str]]:
-    """The source with the edits put in, and what does not fit; the text is of use only if everything does."""
+    """Return the source with the edits applied, and the problems; with problems the text is not complete."""
     tokens = tokenize(source)
     problems = []
     for check in checks:
@@ -227,7 +227,7 @@ def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tupl
 
 
 def _assembled(source: str, pieces: list[tuple[int, int, str]]) -> str:
-    """The source with each piece in its place; pieces at the same place keep their order."""
+    """Return the source with all pieces in place; pieces at the same place keep their order."""
     out, position = [], 0
     for start, end, text in sorted(pieces, key=lambda piece: piece[:2]):
         assert start >= position, "two edits of a recipe overlap"
@@ -239,7 +239,7 @@ def _assembled(source: str, pieces: list[tuple[int, int, str]]) -> str:
 
 
 def _locate(source: str, tokens: list[Token], anchor: Anchor, times: int) -> tuple[range | None, str | None]:
-    """Where the anchor's tokens stand (the first time), and what is wrong if that is not `times` times."""
+    """Return the first place of an anchor's tokens, and the problem if there are not `times` places."""
     span = range(len(tokens))
     line = 1
     if anchor.function is not None:

@@ -1,4 +1,4 @@
-"""Looks at files before they are written, and writes several of them as one step: all or none."""
+"""Check files before they are written, and write several of them: all or none."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from lapgs_plugin.patching.engine import FileChange, Target, pristine
 
 _SUFFIX = ".lapgs"
 _RANDOM = r"[a-z0-9_]{8}"
-"""What `tempfile.mkstemp` puts between prefix and suffix."""
+"""Text that `tempfile.mkstemp` puts between prefix and suffix."""
 PATIENCE = 30.0
-"""Seconds to wait for another process that writes to the same folders, which takes it far less than one."""
+"""Seconds to wait for another process that writes to the same folders."""
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF, errno.EINVAL)
-"""What a file system without locks on folders answers."""
+"""Errors of file systems without locks on folders."""
 
 
 def read_only(changes: Iterable[FileChange]) -> list[Path]:
-    """The files, and the folders they are replaced in, that cannot be written or are marked as not to be."""
+    """Return the files, and their folders, that cannot be written or are marked read-only."""
     paths = {path.resolve() for change in changes for path in (change.path, change.path.resolve().parent)}
     return sorted(path for path in paths if not _writable(path))
 
 
 def uncommitted(paths: Iterable[Path]) -> list[Path]:
-    """The files that git has and that differ from their last commit in more than our own edits.
+    """Return the files that differ from their last commit in git in more than our own edits.
 
-    Each file is looked up in the repository it belongs to, which may be a submodule. Files that git does not have, and
-    all files where there is no git, are left out: there is nothing to compare them with.
+    Each file is looked up in the repository that it belongs to, which may be a submodule. Files that git does not
+    track, and all files without git, are left out.
     """
     return [path for path in paths if _differs_from_head(path)]
 
 
 @contextmanager
 def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
-    """Keep other `lapgs patch` processes from these extensions, and remove what a killed one left.
+    """Keep other `lapgs patch` processes from these extensions, and remove temporary files of killed ones.
 
-    A temporary file is somebody's as long as its process holds the lock of its folder; that lock ends with the process,
-    however it ends. Where folders cannot be locked (Windows, some network file systems) nothing is removed.
+    A process holds the lock of a folder while it has temporary files there; the lock ends with the process. Where
+    folders cannot be locked (Windows, some network file systems) no temporary files are removed.
 
     Returns:
-        The temporary files that could not be removed, in order.
+        Temporary files that could not be removed, sorted.
 
     Raises:
         PatchError: another process holds one of the folders for longer than `PATIENCE`.
@@ -58,24 +58,24 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
     files = {path.resolve() for target in targets for path in _present(target)}
     folders = sorted({path.parent for path in files})
     with ExitStack() as locks:
-        # In the same order everywhere, so that no two processes wait for each other.
+        # The same order in every process prevents deadlocks.
         locked = [folder for folder in folders if locks.enter_context(_folder_lock(folder))]
         stuck = []
         for path in sorted(each for file in files if file.parent in locked for each in _temporaries(file)):
             try:
                 path.unlink(missing_ok=True)
-            except OSError:  # a read-only folder: said by the caller, as the rest of the command may still work
+            except OSError:  # a read-only folder: the caller says so, and the command may still work
                 stuck.append(path)
         yield stuck
 
 
 def write_all(changes: Sequence[FileChange]) -> None:
-    """Write every file, or none: each through a temporary file beside it, those already replaced put back on failure.
+    """Write every file through a temporary file beside it; on failure restore the files written so far.
 
     Permissions are kept, links are followed.
 
     Raises:
-        PatchError: a file could not be written, or is not what it was when the change was planned.
+        PatchError: a file could not be written, or was changed after the change was planned.
     """
     staged: list[tuple[FileChange, Path]] = []
     replaced: list[FileChange] = []
@@ -98,7 +98,7 @@ def write_all(changes: Sequence[FileChange]) -> None:
 
 
 def _writable(path: Path) -> bool:
-    # The mode is asked too: root may write everything, but a file marked read-only was marked so by somebody.
+    # The mode counts, too: root may write everything, but somebody marked the file read-only.
     return os.access(path, os.W_OK) and bool(path.stat().st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH))
 
 
@@ -107,7 +107,7 @@ def _present(target: Target) -> list[Path]:
 
 
 def _temporaries(file: Path) -> list[Path]:
-    """The files beside `file` that `_beside` made."""
+    """Return the files beside `file` that `_beside` made."""
     name = re.compile(re.escape(f".{file.name}.") + _RANDOM + re.escape(_SUFFIX))
     return [
         each for each in file.parent.iterdir() if name.fullmatch(each.name) and each.is_file() and not each.is_symlink()
@@ -116,7 +116,7 @@ def _temporaries(file: Path) -> list[Path]:
 
 @contextmanager
 def _folder_lock(folder: Path) -> Iterator[bool]:
-    """Hold the operating system's lock of a folder, which leaves no file behind; False where there is no such lock."""
+    """Hold the operating system's lock of a folder, which needs no file; yield False where there is no such lock."""
     if sys.platform == "win32":
         yield False
         return
@@ -151,7 +151,7 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
 
 
 def _beside(path: Path, data: bytes) -> Path:
-    """A new file in the same folder with this content and the permissions of `path`."""
+    """Write a new file in the same folder with the permissions of `path`, and return its path."""
     target = path.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=_SUFFIX)
     temporary = Path(name)
@@ -168,7 +168,7 @@ def _beside(path: Path, data: bytes) -> Path:
 
 
 def _put_back(change: FileChange) -> bool:
-    """Restore the content from before; True if the file has it."""
+    """Restore the content from before the change, and return whether the file has it."""
     try:
         if change.path.read_bytes() != change.before:
             _beside(change.path, change.before).replace(change.path.resolve())
@@ -181,13 +181,13 @@ def _differs_from_head(path: Path) -> bool:
     committed = _git(path, "rev-parse", "--verify", "--quiet", f"HEAD:./{path.resolve().name}")
     if committed is None:
         return False
-    # hash-object applies what git would do to the file on commit, such as turning CRLF into LF.
+    # hash-object applies git's conversions on commit, such as CRLF to LF.
     current = _git(path, "hash-object", "--stdin", "--path", path.resolve().name, stdin=pristine(path.read_bytes()))
     return current is not None and current != committed
 
 
 def _git(path: Path, *arguments: str, stdin: bytes = b"") -> str | None:
-    """What git prints when asked from the file's folder, or None where it has no answer."""
+    """Return the output of a git command in the file's folder, or None if it fails."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
         result = subprocess.run(

@@ -1,4 +1,4 @@
-"""What is known of each CUDA extension: how to recognise it and which edits it takes, read from `patches/*.toml`."""
+"""Read recipes from `patches/*.toml`: how a CUDA extension is recognised, and the edits for it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class _CheckEntry(TypedDict):
 
 
 class _File(TypedDict):
-    """A whole file; patches/README.md says what its entries are."""
+    """Type the contents of a recipe's file; patches/README.md explains the entries."""
 
     __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
     name: str
@@ -63,12 +63,12 @@ class _File(TypedDict):
 
 @dataclass(frozen=True)
 class Anchor:
-    """A place in the sources of an extension.
+    """Name a place in the sources of an extension.
 
     Attributes:
         file: path below the extension's folder, with forward slashes.
-        find: the tokens that stand there; formatting and comments do not matter. Empty: the file exists.
-        function: the function whose definition is searched; None for the whole file.
+        find: tokens at the place; formatting and comments do not matter. Empty if the file only has to exist.
+        function: function whose definition is searched; None for the whole file.
     """
 
     file: str
@@ -81,12 +81,15 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Edit:
-    """One small change: `put` goes in front of the anchor's tokens, which stand exactly once, or in their place.
+    """Describe one small change at a place that must be unique.
 
     Attributes:
         set: the set of edits that it belongs to, such as "signed-color".
-        name: unique in its set.
-        unless: directives; where one of them stands in the file, outside of any condition, the edit is not needed.
+        name: unique name in its set.
+        anchor: the place.
+        put: text to insert before the anchor's tokens, or to replace them with.
+        replaces: whether the tokens are replaced.
+        unless: directives; the edit is not needed if the file has one of them outside of any condition.
     """
 
     set: str
@@ -98,16 +101,16 @@ class Edit:
 
     @property
     def label(self) -> str:
-        """How messages and the blocks in a file call it."""
+        """Name in messages and in the blocks of a file."""
         return f"{self.set}/{self.name}"
 
 
 @dataclass(frozen=True)
 class Check:
-    """Tokens that must stand exactly `times` times for the set's edits to be right: nothing is changed there.
+    """Require that tokens occur exactly `times` times, without which the set's edits would be wrong.
 
     Attributes:
-        because: what would go wrong otherwise; ends the message when the check fails.
+        because: reason, which ends the message when the check fails.
     """
 
     set: str
@@ -118,15 +121,15 @@ class Check:
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that is known of one extension.
+    """Describe one extension and the edits for it.
 
     Attributes:
-        name: the stem of its file in `patches/`.
-        title: how messages call it.
-        present, absent: what its folder must and must not contain to be recognised.
-        reinstall: the command that builds and installs it again; `{folder}` stands for its folder.
-        edits, checks: in the order of the file, inherited ones first.
-        opt_in: sets that change what ordinary calls do; "all" leaves them out when it puts edits in.
+        name: stem of its file in `patches/`.
+        title: name in messages.
+        present, absent: places that its folder must and must not have to be recognised.
+        reinstall: command that builds and installs it again; `{folder}` stands for its folder.
+        edits, checks: edits and checks in the order of the file, inherited ones first.
+        opt_in: sets that change ordinary calls; applying "all" leaves them out.
     """
 
     name: str
@@ -140,38 +143,38 @@ class Recipe:
 
     @property
     def sets(self) -> tuple[str, ...]:
-        """The sets of edits that this extension takes."""
+        """Sets of edits for this extension."""
         return tuple(dict.fromkeys(edit.set for edit in self.edits))
 
     @property
     def default_sets(self) -> tuple[str, ...]:
-        """Those that are put in when none is named."""
+        """Sets that are applied when none is named."""
         return tuple(name for name in self.sets if name not in self.opt_in)
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files that its edits and checks look at."""
+        """Files of its edits and checks."""
         anchors = [edit.anchor for edit in self.edits] + [check.anchor for check in self.checks]
         return tuple(dict.fromkeys(anchor.file for anchor in anchors))
 
     def recognises(self, folder: Path) -> bool:
-        """Whether `folder` holds the sources of this extension."""
+        """Return whether `folder` has the sources of this extension."""
         return all(_stands(anchor, folder) for anchor in self.present) and not any(
             _stands(anchor, folder) for anchor in self.absent
         )
 
 
 def patches_folder() -> Path:
-    """Where the TOML files are: inside the package when it is installed, at the top of the repository otherwise."""
+    """Return the folder of the TOML files: in the installed package, otherwise at the top of the repository."""
     installed = Path(__file__).parents[1] / "patches"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "patches"
 
 
 def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
-    """All recipes in `folder`, by name.
+    """Return all recipes in `folder`, sorted by name.
 
     Args:
-        folder: where the TOML files are; None for those that come with the plugin.
+        folder: folder of the TOML files; None for those that come with this package.
 
     Raises:
         PatchError: a file is not a recipe.
@@ -182,7 +185,7 @@ def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
 
 
 def read_source(path: Path) -> str:
-    """The text of a source file, one character a byte.
+    """Return the text of a source file, one character a byte.
 
     Raises:
         PatchError: it cannot be read.
@@ -209,7 +212,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...] = ()) -> Recipe:
-    """One recipe with what it inherits; `heirs` are those that inherit from it."""
+    """Return a recipe with its inherited edits and checks; `heirs` are the recipes that inherit from it."""
     table = tables[name]
     parent = table.get("extends")
     if parent in (name, *heirs):
@@ -236,7 +239,7 @@ def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...]
 
 
 def _inherited(base: Sequence[Edit], own: Sequence[Edit]) -> tuple[Edit, ...]:
-    """The edits of both; one of its own stands in the stead of an inherited one with the same label."""
+    """Return the edits of both; its own edit replaces an inherited one with the same label."""
     return tuple({edit.label: edit for edit in (*base, *own)}.values())
 
 

@@ -1,7 +1,7 @@
-"""Just enough of C++ and CUDA to find a place in a source file by its tokens, whatever its formatting.
+"""Find places in C++ and CUDA sources by their tokens, regardless of formatting.
 
-Text is handled as latin-1, one character a byte, so that every position is a byte position and nothing in a file, valid
-UTF-8 or not, is ever altered by decoding it.
+Text is decoded as latin-1, one character a byte: every position is a byte position, and decoding changes no byte of a
+file, valid UTF-8 or not.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CLOSING = {"(": ")", "{": "}"}
 
 
 class Token(NamedTuple):
-    """A token and where it stands; punctuation comes one character at a time, so `>>` and `> >` are the same."""
+    """Hold a token and its position. Punctuation is one character each, so `>>` and `> >` are the same."""
 
     text: str
     start: int
@@ -38,7 +38,7 @@ class Token(NamedTuple):
 
 
 def tokenize(source: str) -> list[Token]:
-    """The tokens of a source file, without white space, comments and line splices."""
+    """Return the tokens of a source file, without white space, comments and line splices."""
     tokens: list[Token] = []
     at_line_start, in_directive = True, False
     for match in _LEXER.finditer(source):
@@ -55,9 +55,9 @@ def tokenize(source: str) -> list[Token]:
 
 
 def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[range]:
-    """Where the tokens of `pattern` stand in a row inside `span`, as ranges of token indices.
+    """Return the places of a sequence of tokens inside `span`, as ranges of token indices.
 
-    Bodies of macros do not count, since no line can be put into them; a pattern that starts with `#` finds directives.
+    Bodies of macros are skipped, since no line can be inserted there. A pattern that starts with `#` finds directives.
     """
     wanted = [token.text for token in tokenize(pattern)]
     directives = wanted[:1] == ["#"]
@@ -68,7 +68,7 @@ def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[rang
 
 
 def unconditional(tokens: Sequence[Token], directive: str) -> bool:
-    """Whether a directive stands somewhere outside of every #if: then it holds for whoever compiles the file."""
+    """Return whether the file has a directive outside of every #if, so that it always applies."""
     depth = 0
     places = {place.start for place in occurrences(tokens, directive, range(len(tokens)))}
     for i, token in enumerate(tokens):
@@ -80,11 +80,11 @@ def unconditional(tokens: Sequence[Token], directive: str) -> bool:
 
 
 def definitions(tokens: Sequence[Token], name: str) -> list[range]:
-    """Where functions called `name` (qualified as it is written there) are defined: from the name to the last brace."""
+    """Return the definitions of functions called `name` (qualified as in the file), from the name to the last brace."""
     found = []
     for place in occurrences(tokens, name, range(len(tokens))):
         if place.start > 0 and tokens[place.start - 1].text == ":":
-            continue  # a function of that name in some other class or namespace
+            continue  # the same name in another class or namespace
         end = _matching(tokens, place.stop, "(")
         while end is not None and end < len(tokens) and tokens[end].text in _AFTER_PARAMETERS:
             end += 1
@@ -95,7 +95,7 @@ def definitions(tokens: Sequence[Token], name: str) -> list[range]:
 
 
 def _matching(tokens: Sequence[Token], start: int, opening: str) -> int | None:
-    """The index behind the bracket that closes the one at `start`, or None if there is none."""
+    """Return the index after the bracket that closes the one at `start`, or None without one."""
     if start >= len(tokens) or tokens[start].text != opening:
         return None
     depth = 0

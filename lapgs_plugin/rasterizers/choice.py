@@ -9,20 +9,14 @@ from typing import Any
 
 import torch
 
+from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers.extensions import (
-    CONSTANTS,
-    SEMANTICS,
-    STAND_INS,
-    CudaExtension,
-    import_extension,
-    options_of,
-)
+from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, import_extension, options_of
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
-from lapgs_plugin.runs.archive import Manifest
+from lapgs_plugin.runs.manifest import Manifest
 
 logger = logging.getLogger(__name__)
 
@@ -114,19 +108,18 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
             raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
         known, unsupported = _split(settings, {"antialiasing"})
         return PlacedRasterizer(gsplat.GsplatRasterizer(**known), torch.device("cuda"), unsupported)
-    if name in SEMANTICS:
-        return _extension(name, device, settings)
-    raise UserInputError(
-        f"--rasterizer {name}: expected auto, {', '.join([*CPU_RASTERIZERS, gsplat.NAME, *SEMANTICS])}"
-    )
+    owners = rasterizer_owners()
+    if name in owners:
+        return _extension(name, owners[name].info.stand_in, device, settings)
+    raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*CPU_RASTERIZERS, gsplat.NAME, *owners])}")
 
 
-def _extension(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
+def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
     """Return an extension, or its stand-in on a CPU."""
     if device == "cpu" or not torch.cuda.is_available():
         from lapgs_plugin.reference_raster.standins import stand_ins
 
-        place, module = "cpu", stand_ins(STAND_INS[name])[name]
+        place, module = "cpu", stand_ins(stand_in)[name]
     else:
         place, module = "cuda", import_extension(name)
     known, unsupported = _split(settings, options_of(module))
@@ -149,6 +142,6 @@ def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     if placed.unsupported:
         values = ", ".join(f"{key} = {value}" for key, value in placed.unsupported.items())
         line += f"; {name} cannot honour {values} of the training"
-        if manifest.rasterizer in STAND_INS:
+        if manifest.rasterizer in rasterizer_owners():
             line += f" (--rasterizer {manifest.rasterizer} can, slowly on a CPU)"
     logger.info("%s", line)

@@ -18,29 +18,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
-
-SEMANTICS = {
-    "diff_gaussian_rasterization": Semantics(
-        expanded_conic_gradient=True,
-        note="some builds leave out tiles where alpha stays under 1/255, which no image shows; gradients of needles "
-        "are right to a few hundredths",
-    ),
-    "diff_gaussian_rasterization_fastgs": Semantics(
-        three_sigma_cut=False,
-        expanded_conic_gradient=True,
-        note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are right to a "
-        "few hundredths",
-    ),
-}
-"""Known modules and their differences from the oracle by design."""
-
-STAND_INS = {"diff_gaussian_rasterization": "graphdeco-aa", "diff_gaussian_rasterization_fastgs": "fastgs"}
-"""Stand-in with every setting of a module's builds that changes the image."""
 
 CONSTANTS: dict[str, Any] = {
     "scale_modifier": 1.0,
@@ -75,17 +58,17 @@ POINT_DIMMING = 0.005
 
 
 def installed_extensions() -> list[str]:
-    """Return the installed modules of `SEMANTICS`, without importing them."""
-    return [name for name in SEMANTICS if importlib.util.find_spec(name) is not None]
+    """Return the modules of the backbones' rasterizers that can be imported, without importing them."""
+    return [name for name in rasterizer_owners() if importlib.util.find_spec(name) is not None]
 
 
 class CudaExtension:
     """Render with an installed extension; see `signed_color.Extension`.
 
     Args:
-        name: of its module, one of `SEMANTICS`.
-        device: that renders; the CPU for a stand-in.
-        settings: values that replace those of `CONSTANTS`, such as {"mult": 0.5}.
+        name: of its module, a rasterizer of a registered backbone.
+        device: where it renders; a stand-in for the CPU renders there.
+        settings: what to set instead of `CONSTANTS`, such as {"mult": 0.5}.
         module: the module of that name; None imports it.
 
     Raises:
@@ -129,8 +112,9 @@ class CudaExtension:
 
     @property
     def semantics(self) -> Semantics:
-        """Its differences from the oracle."""
-        return SEMANTICS[self._name]
+        """Where it departs from the oracle by design."""
+        owner = rasterizer_owners().get(self._name)
+        return (owner.rasterizer_semantics() if owner else None) or Semantics()
 
     def render(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None

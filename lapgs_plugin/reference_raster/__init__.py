@@ -1,4 +1,4 @@
-"""CPU rasterizers: an oracle to read and a fast one to train with."""
+"""Render on the CPU: with an oracle to read, or with a fast rasterizer to train with."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 __all__ = ["CPU_RASTERIZERS", "CpuRasterizer", "OracleRasterizer", "make_rasterizer"]
 
 CPU_RASTERIZERS: dict[str, type[Rasterizer]] = {"cpu": CpuRasterizer, "oracle": OracleRasterizer}
-"""By the name that manifests and the command line use."""
+"""By their names in manifests and on the command line."""
 
 
 def make_rasterizer(name: str) -> Rasterizer:
-    """The rasterizer that manifests and the command line call `name`.
+    """Return the rasterizer that manifests and the command line call `name`.
 
     Raises:
         UserInputError: there is none of that name.

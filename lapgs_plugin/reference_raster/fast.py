@@ -1,4 +1,4 @@
-"""The fast CPU rasterizer: compiled kernels behind `fields.rasterizer.Rasterizer`, with their own backward pass."""
+"""Render with compiled kernels behind `fields.rasterizer.Rasterizer`, with their own backward pass."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
 
 
 class CpuRasterizer:
-    """Renders and differentiates on the CPU, fast enough to train with.
+    """Render and differentiate on the CPU, fast enough to train with.
 
-    Semantics, and where its gradients depart from the textbook, are those of `oracle`. It runs on
-    `torch.get_num_threads()` threads (see `threads` for what that means beside PyTorch's own), gives the same bits for
-    any number of them, and may be called from several Python threads at once. The first call on a machine compiles.
+    The semantics are those of `oracle`, gradients included. It runs on `torch.get_num_threads()` threads (see
+    `jit.threads`), gives the same bits for any number of them, and may be called from several Python threads at once.
+    The first call on a machine compiles.
 
     Gaussians whose position or covariance on the image is not finite are culled: they get radius 0 and no gradient.
     """
@@ -44,11 +44,11 @@ class CpuRasterizer:
             field: float32 or float64, on the CPU.
             camera: of any precision; its pose gets no gradient.
             background: (3,) colour; may require a gradient.
-            sh_degree: see there.
+            sh_degree: highest SH degree to evaluate; None means all.
 
         Raises:
-            UserInputError: `sh_degree` is not one the field has, `background` is not a colour, or a tensor is not on
-                the CPU or not of the field's precision.
+            UserInputError: the field has no such `sh_degree`, `background` is not a colour, or a tensor is not on the
+                CPU or not of the field's precision.
         """
         degree = field.sh_degree if sh_degree is None else sh_degree
         _check(field, background, degree)
@@ -59,7 +59,7 @@ class CpuRasterizer:
         n = len(field)
         parameters = list(field.parameters.values())
         differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in (*parameters, background))
-        # PyTorch fills large tensors on several threads, which then spin; see `threads`. NumPy does not.
+        # NumPy, because PyTorch fills large tensors on several threads, which then spin; see `jit.threads`.
         means2d, absgrad2d = (torch.from_numpy(_zeros(n, 2, _numpy_type(kind))) for _ in range(2))
         call = _Call(view, field.signed, degree, differentiable, means2d.detach(), absgrad2d)
         means2d.requires_grad_(differentiable)
@@ -70,10 +70,10 @@ class CpuRasterizer:
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Images alone; see `fields.rasterizer.ImageRasterizer`.
+        """Render images without anything else; see `fields.rasterizer.ImageRasterizer`.
 
         Raises:
-            UserInputError: as a call.
+            UserInputError: as `__call__`.
         """
         _check(field, background, field.sh_degree)
         kind = field.means.dtype
@@ -85,11 +85,11 @@ class CpuRasterizer:
 
 @dataclass(frozen=True)
 class _Call:
-    """What one call hands to its autograd function beside tensors to differentiate by.
+    """Hold the arguments of a call that are not differentiated.
 
     Attributes:
-        keep: whether there may be a backward pass.
-        means2d, absgrad2d: (n, 2) filled in the forward and the backward pass.
+        keep: whether a backward pass is possible.
+        means2d, absgrad2d: (n, 2) filled in the forward and in the backward pass.
     """
 
     view: View
@@ -100,12 +100,12 @@ class _Call:
     absgrad2d: Tensor
 
     def gaussians(self, parameters: Sequence[Tensor]) -> Gaussians:
-        """The field's parameters, in its order, as arrays."""
+        """Return the field's parameters, in its order, as arrays."""
         return _gaussians(parameters, self.signed, self.sh_degree)
 
 
 class _Rasterize(torch.autograd.Function):
-    """(call, background, means2d, *parameters of the field) -> image, transmittance, radii."""
+    """Map (call, background, means2d, *parameters of the field) to image, transmittance, radii."""
 
     @staticmethod
     def forward(

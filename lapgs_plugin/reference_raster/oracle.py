@@ -1,6 +1,6 @@
-"""The oracle: a 3D Gaussian Splatting rasterizer written to be read, differentiated by PyTorch's autograd.
+"""Render 3D Gaussians in readable PyTorch, differentiated by autograd: the oracle for all other rasterizers.
 
-Everything else that renders is checked against it. It states the semantics of the CUDA rasterizers of the 3DGS family:
+It has the semantics of the CUDA rasterizers of the 3DGS family:
 
     projection   EWA splatting (Zwicker et al. 2002, eq. 29 and 31): Sigma' = J W Sigma W^T J^T, plus 0.3 px on the
                  diagonal; pixel j of a row has the coordinate j, so a centre lands at fx X/Z + cx - 0.5
@@ -9,12 +9,12 @@ Everything else that renders is checked against it. It states the semantics of t
                  alpha = min(0.99, o exp(-q)), skipped under 1/255, ended before the transmittance would fall under 1e-4
     background   blended last with the remaining transmittance
 
-Three sigma cut an opaque Gaussian at alpha = o exp(-4.5), before 1/255, in the pixels of tiles that its rectangle
-misses. That cut is part of the image.
+In tiles that its rectangle misses, an opaque Gaussian is cut at alpha = o exp(-4.5), which is above 1/255. The image
+depends on that cut.
 
-Gradients are those of the CUDA code. They differ from textbook differentiation of the image in two places, each marked
-DEPARTURE below. Two guards of the CUDA code against division by zero are left out: 1e-7 added to w, and to the squared
-determinant in the backward pass, where it shortens the gradient of the smallest Gaussians by one part in 80,000.
+Gradients are those of the CUDA code. They differ from the derivative of the image in two places, marked DEPARTURE.
+Two guards of the CUDA code against division by zero are left out: 1e-7 is not added to w, nor to the squared
+determinant in the backward pass, where it slightly shortens the gradient of the smallest Gaussians.
 """
 
 from __future__ import annotations
@@ -32,29 +32,23 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-
-TILE = 16
-"""Side of a tile in pixels."""
-NEAR_DEPTH = 0.2
-"""Gaussians whose centre is at this depth or nearer are culled."""
-PIXEL_VARIANCE = 0.3
-"""Added to the diagonal of the 2D covariance, in px^2: a Gaussian is never thinner than about a pixel."""
-JACOBIAN_LIMIT = 1.3
-"""The Jacobian is taken at most this many half image sides away from the optical axis."""
-RADIUS_SIGMAS = 3.0
-"""Radius of a footprint in standard deviations along its longer axis."""
-MIN_ROOT = 0.1
-"""Lower bound of the squared half difference of the 2D covariance's eigenvalues, in px^4."""
-MAX_RADIUS = 2**30
-"""Radii saturate here, in px, so that they fit int32."""
-MAX_ALPHA = 0.99
-MIN_ALPHA = 1 / 255
-MIN_TRANSMITTANCE = 1e-4
+from lapgs_plugin.reference_raster.layout import (
+    JACOBIAN_LIMIT,
+    MAX_ALPHA,
+    MAX_RADIUS,
+    MIN_ALPHA,
+    MIN_ROOT,
+    MIN_TRANSMITTANCE,
+    NEAR_DEPTH,
+    PIXEL_VARIANCE,
+    RADIUS_SIGMAS,
+    TILE,
+)
 
 
 @dataclass(frozen=True)
 class Projection:
-    """v Gaussians on the image plane, in the order of their index.
+    """Hold v Gaussians on the image plane, in the order of their index.
 
     Attributes:
         ids: (v,) their index in the field.
@@ -77,7 +71,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Which Gaussians each tile blends, front to back.
+    """List the Gaussians that each tile blends, front to back.
 
     Attributes:
         members: (i,) positions in the projection, tile after tile, in each tile by depth, ties by index.
@@ -92,13 +86,13 @@ class TileLists:
 
 
 class OracleRasterizer:
-    """Reference rasterizer in plain PyTorch: any device, float32 or float64, as the field's tensors are.
+    """Render in plain PyTorch, on the device and in the precision (float32 or float64) of the field's tensors.
 
-    Each tile is computed again in the backward pass, so that memory holds the intermediates of one tile at a time.
+    The backward pass computes each tile again, so that memory holds the intermediates of one tile at a time.
 
     Args:
         three_sigma_cut: False for rasterizers that blend a Gaussian wherever alpha reaches 1/255: every Gaussian in
-            front of the camera is then in every tile, and has a radius.
+            front of the camera is then in every tile and has a radius.
     """
 
     def __init__(self, *, three_sigma_cut: bool = True) -> None:
@@ -114,7 +108,7 @@ class OracleRasterizer:
         """Render `field`; see `fields.rasterizer.Rasterizer`.
 
         Raises:
-            UserInputError: `sh_degree` is not one the field has, or `background` is not a colour.
+            UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
         """
         degree = field.sh_degree if sh_degree is None else sh_degree
         if not 0 <= degree <= field.sh_degree:
@@ -152,15 +146,15 @@ class OracleRasterizer:
 
 
 def project(field: GaussianField, camera: Camera, *, three_sigma_cut: bool = True) -> Projection:
-    """EWA projection of the Gaussians that reach the image.
+    """Project the Gaussians that reach the image (EWA).
 
     Args:
         field: n Gaussians.
         camera: with its pose on the field's device and in its precision.
-        three_sigma_cut: False puts all in front of the camera in all tiles.
+        three_sigma_cut: as in `OracleRasterizer`.
     """
-    # Found without gradients first: a Gaussian divided by a depth or determinant of zero must not enter the graph,
-    # where its zero gradient times infinity would be NaN.
+    # Culled without gradients first: in the graph, the zero gradient of a Gaussian times the infinite derivative by a
+    # depth or determinant of zero would be NaN.
     with torch.no_grad():
         everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device), three_sigma_cut)
         first, last = everyone.rectangles[:, :2], everyone.rectangles[:, 2:]  # (n, 2) each
@@ -169,7 +163,7 @@ def project(field: GaussianField, camera: Camera, *, three_sigma_cut: bool = Tru
 
 
 def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_cut: bool) -> Projection:
-    """EWA projection of the Gaussians `ids`, whether they reach the image or not."""
+    """Project the Gaussians `ids`, also those that do not reach the image."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
     points = field.means[ids] @ rotation.T + translation  # (v, 3) in camera coordinates
     x, y, depths = points.unbind(-1)  # (v,) each
@@ -194,7 +188,7 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
 
 
 def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
-    """Sigma = R S S^T R^T.
+    """Compute Sigma = R S S^T R^T.
 
     Args:
         quaternions: (n, 4) wxyz, of any length.
@@ -217,7 +211,7 @@ def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
 
 
 def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
-    """Derivative of the pixel coordinates with respect to the camera-space point, taken at a point near the frustum.
+    """Compute the derivative of pixel coordinates by camera-space points, which are clamped to near the frustum.
 
     Args:
         points: (n, 3) in camera coordinates, in front of the camera.
@@ -227,8 +221,8 @@ def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
     """
     x, y, depth = points.unbind(-1)  # (n,) each
     limit_x, limit_y = (JACOBIAN_LIMIT * tangent for tangent in camera.tan_half_fov)
-    # DEPARTURE: a coordinate clamped to the limit is limit * depth, but the CUDA code differentiates the Jacobian as if
-    # it were a constant: its backward pass zeroes the derivative by x and leaves that by the depth as for a free x.
+    # DEPARTURE: a clamped coordinate is limit * depth, but the CUDA code differentiates the Jacobian as if it were a
+    # constant: its backward pass zeroes the derivative by x and keeps that by the depth as for a free x.
     x = torch.where((x / depth).abs() > limit_x, (limit_x * depth * x.sign()).detach(), x)
     y = torch.where((y / depth).abs() > limit_y, (limit_y * depth * y.sign()).detach(), y)
     zero = torch.zeros_like(depth)
@@ -242,12 +236,12 @@ def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
 
 
 def inverse_covariances(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor) -> Tensor:
-    """(n, 3) entries xx, xy, yy of the inverses of 2D covariances, from (n,) entries and determinants."""
+    """Return (n, 3) entries xx, xy, yy of the inverses of 2D covariances, from (n,) entries and determinants."""
     return torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]
 
 
 def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
-    """ceil(3 sqrt(lambda_max)) with the larger eigenvalue of the 2D covariance.
+    """Return ceil(3 sqrt(lambda_max)) with the larger eigenvalue of the 2D covariance.
 
     Args:
         xx, yy: (n,) diagonal of the covariance in px^2.
@@ -262,9 +256,9 @@ def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
 
 
 def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
-    """Tiles touched by [centre - radius, centre + radius].
+    """Return the tiles touched by [centre - radius, centre + radius].
 
-    As in the CUDA code a last tile is left out when centre + radius falls short of its second pixel.
+    As in the CUDA code, a last tile counts only if centre + radius reaches its second pixel.
 
     Args:
         means2d: (n, 2) centres in pixel coordinates.
@@ -277,16 +271,16 @@ def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
     first = torch.floor((means2d - radii[:, None]) / TILE)  # (n, 2)
     last = torch.floor((means2d + radii[:, None] + (TILE - 1)) / TILE)  # (n, 2)
     corners = torch.cat([first, last], dim=1)  # (n, 4)
-    # A centre that overflowed is not a number here; an empty rectangle culls it.
+    # A centre that overflowed is NaN here; an empty rectangle culls it.
     return corners.nan_to_num(0, math.inf, -math.inf).clamp(min=0).minimum(grid.repeat(2)).to(torch.int64)
 
 
 def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
-    """Every (tile, Gaussian) pair, sorted by tile, then depth, then index.
+    """List every (tile, Gaussian) pair, sorted by tile, then depth, then index.
 
     Args:
         depths: (v,) camera-space z.
-        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` gives them.
+        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` returns them.
     """
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     order = torch.sort(depths.detach(), stable=True).indices  # (v,) front to back
@@ -302,7 +296,7 @@ def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
 
 
 def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Blend every tile and put the tiles together.
+    """Blend every tile and assemble the image.
 
     Args:
         splats: (v, 9) centre (2), conic (3), opacity (1), colour (3).
@@ -312,7 +306,7 @@ def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tenso
     Returns:
         (3, 16 rows, 16 columns) colour over black, (16 rows, 16 columns) transmittance.
     """
-    # One gather for all tiles: a gather for each would cost a gradient as large as the field for each.
+    # One gather for all tiles: one for each tile would each have a gradient as large as the field.
     parts = torch.split(splats[lists.members], lists.counts)  # (k, 9) for each tile
     owners = torch.split(ids[lists.members], lists.counts)  # (k,) for each tile
     steps = torch.arange(TILE, dtype=splats.dtype, device=splats.device)  # (16,)
@@ -322,7 +316,7 @@ def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tenso
         row, column = divmod(index, lists.columns)
         pixels = grid + grid.new_tensor([column * TILE, row * TILE])  # (256, 2)
         blended = _decide(part, pixels)  # (256, k)
-        used = blended.any(dim=0).nonzero()[:, 0]  # (m,) the others would only cost memory for gradients of zero
+        used = blended.any(dim=0).nonzero()[:, 0]  # (m,) the others have no gradient
         blend = partial(_blend, pixels=pixels, blended=blended[:, used], ids=owner[used], absgrad2d=absgrad2d)
         tiles.append(checkpoint(blend, part[used], use_reentrant=False, preserve_rng_state=False))
     tiled = torch.stack(tiles).reshape(lists.rows, lists.columns, TILE, TILE, 4)
@@ -332,7 +326,7 @@ def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tenso
 
 @torch.no_grad()
 def _decide(splats: Tensor, pixels: Tensor) -> Tensor:
-    """(p, k) True where a pixel blends a Gaussian: it is visible there, and reached before the pixel is finished.
+    """Return (p, k) True where a pixel blends a Gaussian: visible there, and reached before the pixel is opaque.
 
     Args:
         splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
@@ -341,12 +335,12 @@ def _decide(splats: Tensor, pixels: Tensor) -> Tensor:
     centres, conics, opacities, _ = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
     alphas = _alphas(centres - pixels[:, None], conics, opacities[:, 0])  # (p, k)
     visible = alphas >= MIN_ALPHA  # (p, k)
-    behind = torch.cumprod(1 - alphas * visible, dim=1)  # (p, k) the transmittance if nothing ended a pixel
+    behind = torch.cumprod(1 - alphas * visible, dim=1)  # (p, k) the transmittance if no pixel ended early
     return visible & (behind >= MIN_TRANSMITTANCE)
 
 
 def _blend(splats: Tensor, pixels: Tensor, blended: Tensor, ids: Tensor, absgrad2d: Tensor) -> Tensor:
-    """C = sum_i c_i alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), over the Gaussians each pixel blends.
+    """Compute C = sum_i c_i alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), over the Gaussians each pixel blends.
 
     Args:
         splats: (k, 9) centre (2), conic (3), opacity (1), colour (3), front to back.
@@ -356,7 +350,7 @@ def _blend(splats: Tensor, pixels: Tensor, blended: Tensor, ids: Tensor, absgrad
         absgrad2d: (n, 2) buffer filled during the backward pass.
 
     Returns:
-        (p, 4) colour C and the transmittance that is left.
+        (p, 4) colour C and the remaining transmittance.
     """
     centres, conics, opacities, colors = torch.split(splats, [2, 3, 1, 3], dim=1)  # (k, 2), (k, 3), (k, 1), (k, 3)
     offsets = centres - pixels[:, None]  # (p, k, 2)
@@ -372,7 +366,7 @@ def _blend(splats: Tensor, pixels: Tensor, blended: Tensor, ids: Tensor, absgrad
 
 
 def _alphas(offsets: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """alpha = min(0.99, o exp(-q)) with q = d^T conic d / 2.
+    """Compute alpha = min(0.99, o exp(-q)) with q = d^T conic d / 2.
 
     Args:
         offsets: (p, k, 2) centre minus pixel.
@@ -380,7 +374,7 @@ def _alphas(offsets: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
         opacities: (k,).
 
     Returns:
-        (p, k) alphas; 0 where q < 0, which a rounded conic that is not positive definite can bring about.
+        (p, k) alphas; 0 where q < 0, which happens if rounding makes a conic indefinite.
     """
     dx, dy = offsets.unbind(-1)  # (p, k) each
     xx, xy, yy = conics.unbind(-1)  # (k,) each
@@ -389,9 +383,9 @@ def _alphas(offsets: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
 
 
 def _cap(alpha: Tensor) -> Tensor:
-    """min(alpha, 0.99).
+    """Return min(alpha, 0.99).
 
-    DEPARTURE: the CUDA code's backward pass does not look at the cap, so the gradient passes straight through it.
+    DEPARTURE: the CUDA code's backward pass ignores the cap, so the gradient passes straight through it.
     """
     return alpha - (alpha.detach() - MAX_ALPHA).clamp(min=0)
 

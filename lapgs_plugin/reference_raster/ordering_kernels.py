@@ -1,4 +1,4 @@
-"""Front to back: splats sorted by depth, then dealt to the tiles they cover."""
+"""Sort splats by depth and list them for the tiles that they cover."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import at, fetch_add, prefetch
 
 DIGIT_BITS = 11
-"""Bits that one round of the radix sort looks at."""
+"""Bits that one round of the radix sort sorts by."""
 DIGITS = 1 << DIGIT_BITS
 
-
 AHEAD = 16
-"""How many splats ahead of their use the cache is asked for them."""
+"""How many splats ahead of their use data is prefetched."""
 
 
 @inline
 def _box(boxes: NDArray[np.int32], i: int) -> tuple[int, int, int, int]:
-    """First tile across and down, one past the last across and down."""
+    """Return the first tile across and down, and one past the last across and down."""
     return (
         at(boxes, 4 * i), at(boxes, 4 * i + 1),
         at(boxes, 4 * i + 2), at(boxes, 4 * i + 3),
@@ -30,14 +29,14 @@ def _box(boxes: NDArray[np.int32], i: int) -> tuple[int, int, int, int]:
 
 @jit
 def count_pairs(n: int, boxes: NDArray[np.int32], first_pair: NDArray[np.int64]) -> int:
-    """Number the pairs of a splat and a tile, splat after splat.
+    """Number the pairs of a splat and a tile, splat by splat.
 
     Args:
         boxes: (m * 4,) tiles covered: first across, first down, one past the last across, down.
         first_pair: (n + 1,) filled with the number of each splat's first pair, then their total.
 
     Returns:
-        Splats that cover a tile.
+        The number of splats that cover a tile.
     """
     total, shown = 0, 0
     for i in range(n):
@@ -60,7 +59,7 @@ def sort_by_depth(
     sorted_keys: NDArray[Any],  # (shown,)
     spare_keys: NDArray[Any],  # (shown,)
 ) -> None:
-    """Stable radix sort, least significant digit first."""
+    """Sort splats by depth: a stable radix sort, least significant digit first."""
     rounds = (keys.itemsize * 8 + DIGIT_BITS - 1) // DIGIT_BITS
     counts = np.zeros((rounds, DIGITS), np.int64)
     shown = 0
@@ -100,7 +99,7 @@ def count_tiles(
     tiles_x: int,
     counts: NDArray[np.int64],  # (chunks, tiles) zero
 ) -> None:
-    """How many splats of each chunk of the order cover each tile."""
+    """Count the splats of each chunk of the order that cover each tile."""
     chunks = counts.shape[0]
     while True:
         chunk = fetch_add(counter, 1)
@@ -117,11 +116,11 @@ def count_tiles(
 
 @jit
 def start_tiles(counts: NDArray[np.int64], tile_start: NDArray[np.int64]) -> None:
-    """Turn counts of (chunk, tile) into where each chunk's part of each tile's list begins.
+    """Turn counts of (chunk, tile) into the start of each chunk's part of each tile's list.
 
     Args:
-        counts: (chunks, tiles), replaced by the beginnings.
-        tile_start: (tiles + 1,) filled with the beginnings of the tiles' lists, then the length of all.
+        counts: (chunks, tiles), replaced by the starts.
+        tile_start: (tiles + 1,) filled with the starts of the tiles' lists, then the length of all.
     """
     total = 0
     for tile in range(counts.shape[1]):
@@ -134,17 +133,17 @@ def start_tiles(counts: NDArray[np.int64], tile_start: NDArray[np.int64]) -> Non
 
 
 @jit
-def deal_to_tiles(
+def list_by_tile(
     counter: NDArray[np.int64],  # (1,) zero
     order: NDArray[np.int32],  # (shown,)
     boxes: NDArray[np.int32],  # (m * 4,)
     tiles_x: int,
-    starts: NDArray[np.int64],  # (chunks, tiles), used up
+    starts: NDArray[np.int64],  # (chunks, tiles), overwritten
     first_pair: NDArray[np.int64],  # (n + 1,)
     members: NDArray[np.int32],  # (pairs,) filled: splats, tile after tile, nearest first
     places: NDArray[np.int32],  # (pairs,) filled: where in `members` each splat's pairs are, splat after splat
 ) -> None:
-    """Stable counting sort of the pairs by tile."""
+    """Sort the pairs by tile: a stable counting sort."""
     chunks = starts.shape[0]
     while True:
         chunk = fetch_add(counter, 1)

@@ -1,8 +1,8 @@
-"""The CPU rasterizer on plain arrays: what `fast` wraps for autograd and stand-ins for CUDA modules can wrap otherwise.
+"""Render and differentiate plain arrays with the CPU kernels; `fast` and the stand-ins wrap this for autograd.
 
 `render` runs projection_kernels.project, then ordering_kernels, then tile_kernels.blend. `gradients` runs
-tile_kernels.blend_backward, then projection_kernels.project_backward. Gaussians come as raw or activated parameters,
-with SH coefficients or colours.
+tile_kernels.blend_backward, then projection_kernels.project_backward. Gaussians have raw or activated parameters, and
+SH coefficients or colours.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, SLOT, SPLAT, TI
 
 @dataclass(frozen=True)
 class View:
-    """An image size and a camera.
+    """Hold an image size and a camera.
 
     Attributes:
         width, height: in pixels.
-        camera: as `layout.CAMERA` says.
+        camera: (CAMERA,), see `layout.CAMERA`.
     """
 
     width: int
@@ -37,13 +37,13 @@ class View:
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """Tiles across and down."""
+        """Return the number of tiles across and down."""
         return -(-self.width // TILE), -(-self.height // TILE)
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians as contiguous arrays of one float type.
+    """Hold n Gaussians as contiguous arrays of one float type.
 
     Attributes:
         means: (n, 3) centres in world coordinates.
@@ -53,7 +53,7 @@ class Gaussians:
         sh: (n, k, 3) spherical-harmonic coefficients, k of 1, 4, 9, 16; or None if there are colours.
         colors: (n, 3) colours, or None if there are coefficients.
         raw: True for logarithms, logits and quaternions of any length; False for activated values.
-        signed: True if the colour is the SH value itself, False for max(value + 0.5, 0). Given colours are left alone.
+        signed: True if the colour is the SH value itself, False for max(value + 0.5, 0). `colors` are used as they are.
         sh_degree: highest degree evaluated, not more than k has.
     """
 
@@ -69,19 +69,20 @@ class Gaussians:
 
     @property
     def columns(self) -> int:
-        """Coefficients of a Gaussian, all channels."""
+        """Return the number of coefficients of a Gaussian, all channels."""
         return 0 if self.sh is None else self.sh.shape[1] * 3
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """An image, and what its backward pass needs.
+    """Hold an image, and the inputs of its backward pass.
 
     Attributes:
         image: (3, height, width).
         transmittance: (height, width).
         radii: (n,) int32.
         centres: (n, 2).
+        kept: None unless it was asked for.
     """
 
     image: Floats
@@ -93,7 +94,7 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Kept:
-    """What the blending kernels left for those that come after; see `tile_kernels.blend` for shapes."""
+    """Hold the intermediates of a rendering that its backward pass needs; see `tile_kernels.blend` for shapes."""
 
     splats: Floats
     background: Floats
@@ -108,12 +109,12 @@ class Kept:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Derivatives of a loss.
+    """Hold derivatives of a loss.
 
     Attributes:
         means, quats, scales, opacities, sh, colors: by the arrays of `Gaussians`, in their shapes.
         centres: (n, 2) by the centres on the image, in loss per pixel.
-        absolute_centres: (n, 2) sum over pixels of the absolute value of that.
+        absolute_centres: (n, 2) the sum of the absolute values of each pixel's part of `centres`.
     """
 
     means: Floats
@@ -142,9 +143,9 @@ def render(
 
     Args:
         background: (3,) in the Gaussians' float type.
-        keep: whether `gradients` will be asked for.
-        assign: from the splats and the radii, which it may change, to the tiles' lists; None for the tiles of the
-            three-sigma rectangle, as everywhere but in FastGS.
+        keep: whether to keep what `gradients` needs.
+        assign: from the splats and the radii, which it may change, to the tiles' lists. None takes the tiles of the
+            three-sigma rectangle, as all rasterizers but FastGS do.
     """
     n, kind = len(gaussians.means), gaussians.means.dtype
     padded = -(-n // WIDTH) * WIDTH
@@ -182,11 +183,11 @@ def render(
 def gradients(
     gaussians: Gaussians, view: View, rendering: Rendering, grad_image: Floats, grad_transmittance: Floats | None
 ) -> Gradients:
-    """Gradients of a loss of the image that `render` made of the same Gaussians, asked to keep what this needs.
+    """Differentiate a loss of the image that `render` made of the same Gaussians with `keep`.
 
     Args:
         grad_image: (3, height, width) derivative of the loss by the image.
-        grad_transmittance: (height, width) that by the transmittance, or None if the loss does not depend on it.
+        grad_transmittance: (height, width) derivative by the transmittance, or None for zero.
     """
     kept = rendering.kept
     assert kept is not None, "rendered without keep=True"
@@ -225,7 +226,7 @@ def gradients(
 def make_view(
     width: int, height: int, world_to_camera: Floats, focal: tuple[float, float], principal: tuple[float, float]
 ) -> View:
-    """A view from a camera as `lapgs_plugin.fields.camera.Camera` describes one.
+    """Make a view from a camera as `fields.camera.Camera` describes one.
 
     Args:
         world_to_camera: (4, 4), in the Gaussians' float type.
@@ -238,7 +239,7 @@ def make_view(
 
 
 def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, int]:
-    """Flat arrays as the projection kernels take them; colours or coefficients that are not there are empty."""
+    """Flatten arrays for the projection kernels; missing colours or coefficients are empty."""
     sh, colors = (
         np.empty(0, gaussians.means.dtype) if array is None else array.reshape(-1)
         for array in (gaussians.sh, gaussians.colors)
@@ -248,7 +249,7 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Float
 
 
 def _order(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int) -> TileLists:
-    """The tiles' lists of splats, front to back; see `ordering_kernels`."""
+    """List the splats of each tile, front to back; see `ordering_kernels`."""
     first_pair = empty(n + 1, np.int64)
     shown = ordering_kernels.count_pairs(n, boxes, first_pair)
     pairs = int(first_pair[n])
@@ -262,13 +263,13 @@ def _order(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles
     members, places = empty(pairs, np.int32), empty(pairs, np.int32)
     parallel(ordering_kernels.count_tiles, order, boxes, tiles_x, starts)
     ordering_kernels.start_tiles(starts, tile_start)
-    parallel(ordering_kernels.deal_to_tiles, order, boxes, tiles_x, starts, first_pair, members, places)
+    parallel(ordering_kernels.list_by_tile, order, boxes, tiles_x, starts, first_pair, members, places)
     return first_pair, places, tile_start, members
 
 
 @lru_cache
 def offsets(kind: Any) -> Floats:
-    """`tile_kernels.pixel_offsets` of a float type, aligned for vector loads."""
+    """Return `tile_kernels.pixel_offsets` of a float type, aligned for vector loads."""
     unaligned = tile_kernels.pixel_offsets(kind)
     aligned = empty(unaligned.size, kind)
     np.copyto(aligned, unaligned)

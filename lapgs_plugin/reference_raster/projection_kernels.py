@@ -1,12 +1,12 @@
-"""From Gaussians in the world to splats on the image, and back with the gradients.
+"""Project Gaussians to splats on the image, and take gradients back.
 
-Sixteen Gaussians are worked on at once, one in each lane. Kernels take the parameters that training optimizes ("raw")
+Sixteen Gaussians are processed at once, one in each lane. Kernels take the parameters that training optimizes ("raw")
 or activated ones: standard deviations, opacities in [0, 1] and quaternions used as they are, as CUDA rasterizers do.
 
-The 2D covariance is M M^T + 0.3 I with the 2x3 matrix M = J W R S. Its determinant comes from the 2x2 minors of M, sums
-of squares, where the usual difference of products loses all digits of an elongated Gaussian in float32.
+The 2D covariance is M M^T + 0.3 I with the 2x3 matrix M = J W R S. Its determinant is a sum of squares of the 2x2
+minors of M. The usual difference of products would lose all digits of an elongated Gaussian in float32.
 
-Gradients follow the CUDA code: where the Jacobian's x / z is clamped, the clamped x is taken for a constant.
+Gradients follow the CUDA code: where the Jacobian's x / z is clamped, the clamped x counts as a constant.
 """
 
 from __future__ import annotations
@@ -60,12 +60,15 @@ from lapgs_plugin.reference_raster.layout import (
     LIMIT_X,
     LIMIT_Y,
     LOG2_MIN_ALPHA,
+    MAX_RADIUS,
+    MIN_ROOT,
     NEAR_DEPTH,
     OPACITY_RATE,
     PIXEL_VARIANCE,
     POSITION,
     PRINCIPAL_X,
     PRINCIPAL_Y,
+    RADIUS_SIGMAS,
     RED_FREE,
     ROTATION,
     SLOT,
@@ -92,21 +95,16 @@ from lapgs_plugin.reference_raster.sh_kernels import (
     store_sh_gradient,
 )
 
-RADIUS_SIGMAS = 3.0
-MIN_ROOT = 0.1
-"""Lower bound of the squared half difference of the covariance's eigenvalues, in px^4, as in the CUDA code."""
-MAX_RADIUS = 2.0**30
-"""Radii saturate here, in px, so that they fit int32."""
 HUGE = 1e37
-"""Determinants in px^4 and coordinates in px from here on are taken for overflown, and the Gaussian is culled."""
+"""Gaussians with a determinant in px^4 or a coordinate in px from here on are culled as overflown."""
 REACH_SLACK, REACH_SLOPE = 1e-3, 1e-5
-"""How the ellipse that holds all alpha of 1/255 or more is widened against rounding; only speed depends on it."""
+"""Margins against rounding for the ellipse of alpha 1/255; only speed depends on their size."""
 MIN_NORM = 1e-12
-"""Shorter quaternions are divided by this instead of their length, as torch.nn.functional.normalize does."""
+"""Shorter quaternions are divided by this instead of their length, as in torch.nn.functional.normalize."""
 AHEAD = 64
-"""How many slots ahead of their use the cache is asked for them: those of the next Gaussians."""
+"""How many slots ahead of their use they are prefetched."""
 
-_UNIT = 1.0 / FACTOR_SCALE**2  # turns a product of two factors, or of two of u and v, into one without their scale
+_UNIT = 1.0 / FACTOR_SCALE**2  # removes the scale from a product of two factors, or of two of u and v
 
 _Box = Lanes4  # first tile across and down, one past the last across and down
 
@@ -116,7 +114,7 @@ _Box = Lanes4  # first tile across and down, one past the last across and down
 
 @inline
 def _columns3(array: Floats, first: int, n: int, spare: Floats) -> Lanes3:
-    """Three columns of 16 rows from `first` on; rows past the n-th are zero."""
+    """Load three columns of 16 rows from `first` on; rows past the n-th are zero."""
     if first + WIDTH <= n:
         return load_columns(array, first * 3, 3)
     for i in range(3 * WIDTH):
@@ -126,7 +124,7 @@ def _columns3(array: Floats, first: int, n: int, spare: Floats) -> Lanes3:
 
 @inline
 def _columns4(array: Floats, first: int, n: int, spare: Floats) -> Lanes4:
-    """Four columns of 16 rows from `first` on; rows past the n-th are zero."""
+    """Load four columns of 16 rows from `first` on; rows past the n-th are zero."""
     if first + WIDTH <= n:
         return load_columns(array, first * 4, 4)
     for i in range(4 * WIDTH):
@@ -136,7 +134,7 @@ def _columns4(array: Floats, first: int, n: int, spare: Floats) -> Lanes4:
 
 @inline
 def _scale(scales: Floats, first: int, n: int, raw: bool, spare: Floats) -> Lanes3:
-    """Standard deviations of 16 Gaussians."""
+    """Return the standard deviations of 16 Gaussians."""
     scale = _columns3(scales, first, n, spare)
     if raw:
         scale = (exp(scale[0]), exp(scale[1]), exp(scale[2]))
@@ -156,7 +154,7 @@ def _length(q: Lanes4) -> Lanes:
 
 @inline
 def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) -> tuple[Lanes, Lanes]:
-    """Opacities of 16 Gaussians, and the derivatives of their logarithms by what they come from."""
+    """Return the opacities of 16 Gaussians, and the derivatives of their logarithms by the parameters."""
     if first + WIDTH > n:
         for i in range(WIDTH):
             put(spare, i, at(opacities, first + i) if first + i < n else 0.0)
@@ -166,7 +164,7 @@ def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) ->
     if raw:
         odds_against = exp(-opacity)
         opacity = 1.0 / (1.0 + odds_against)
-        return opacity, odds_against * opacity  # 1 - opacity, without its rounding where that is nearly 1
+        return opacity, odds_against * opacity  # 1 - opacity, without cancellation near 1
     return opacity, 1.0 / opacity
 
 
@@ -185,13 +183,13 @@ def _each(a: Lanes3, b: Lanes3) -> Lanes3:
 
 @inline
 def _mixed(a: Lanes, u: Lanes3, b: Lanes, v: Lanes3) -> Lanes3:
-    """a u + b v."""
+    """Return a u + b v."""
     return fma(a, u[0], b * v[0]), fma(a, u[1], b * v[1]), fma(a, u[2], b * v[2])
 
 
 @inline
 def _times(row: Lanes3, matrix: tuple[Lanes3, Lanes3, Lanes3]) -> Lanes3:
-    """A row vector times a matrix given by its rows."""
+    """Multiply a row vector by a matrix given by its rows."""
     m0, m1, m2 = matrix
     return (
         fma(row[0], m0[0], fma(row[1], m1[0], row[2] * m2[0])),
@@ -206,15 +204,15 @@ def _clamped(value: Lanes, limit: float) -> Lanes:
 
 
 @inline
-def _turned(camera: Floats, row: int, vector: Lanes3) -> Lanes:
-    """A row of the camera's rotation times a vector."""
+def _rotate(camera: Floats, row: int, vector: Lanes3) -> Lanes:
+    """Multiply a row of the camera's rotation by a vector."""
     i = ROTATION + 3 * row
     return fma(vector[0], at(camera, i), fma(vector[1], at(camera, i + 1), vector[2] * at(camera, i + 2)))
 
 
 @inline
-def _turned_back(camera: Floats, vector: Lanes3) -> Lanes3:
-    """The transposed rotation times a vector."""
+def _rotate_back(camera: Floats, vector: Lanes3) -> Lanes3:
+    """Multiply the transposed rotation by a vector."""
     x, y, z = vector
     r = ROTATION
     return (
@@ -226,17 +224,17 @@ def _turned_back(camera: Floats, vector: Lanes3) -> Lanes3:
 
 @inline
 def _in_view(camera: Floats, mean: Lanes3) -> Lanes3:
-    """x / z, y / z and z of a point in camera coordinates."""
-    depth = _turned(camera, 2, mean) + at(camera, TRANSLATION + 2)
+    """Return x / z, y / z and z of a point in camera coordinates."""
+    depth = _rotate(camera, 2, mean) + at(camera, TRANSLATION + 2)
     inverse = 1.0 / depth
-    x = (_turned(camera, 0, mean) + at(camera, TRANSLATION)) * inverse
-    y = (_turned(camera, 1, mean) + at(camera, TRANSLATION + 1)) * inverse
+    x = (_rotate(camera, 0, mean) + at(camera, TRANSLATION)) * inverse
+    y = (_rotate(camera, 1, mean) + at(camera, TRANSLATION + 1)) * inverse
     return x, y, depth
 
 
 @inline
 def _screen_rows(camera: Floats, x_scale: Lanes, y_scale: Lanes, x: Lanes, y: Lanes) -> tuple[Lanes3, Lanes3]:
-    """Rows of J W: the derivative of the pixel coordinates by the position in the world.
+    """Return the rows of J W, the derivative of the pixel coordinates by the position in the world.
 
     Args:
         x_scale, y_scale: focal lengths over the depth.
@@ -258,7 +256,7 @@ def _screen_rows(camera: Floats, x_scale: Lanes, y_scale: Lanes, x: Lanes, y: La
 
 @inline
 def _axes(q: Lanes4) -> tuple[Lanes3, Lanes3, Lanes3]:
-    """Rows of the rotation matrix of a quaternion (w, x, y, z)."""
+    """Return the rows of the rotation matrix of a quaternion (w, x, y, z)."""
     w, x, y, z = q
     return (
         (1.0 - 2.0 * fma(y, y, z * z), 2.0 * fma(x, y, -(w * z)), 2.0 * fma(x, z, w * y)),
@@ -269,7 +267,7 @@ def _axes(q: Lanes4) -> tuple[Lanes3, Lanes3, Lanes3]:
 
 @inline
 def _direction(camera: Floats, mean: Lanes3) -> tuple[Lanes3, Lanes]:
-    """Unit vector from the camera to the centre, and one over the distance."""
+    """Return the unit vector from the camera to the centre, and one over the distance."""
     x = mean[0] - at(camera, POSITION)
     y = mean[1] - at(camera, POSITION + 1)
     z = mean[2] - at(camera, POSITION + 2)
@@ -335,14 +333,14 @@ def project(
 
         radius = _radius(xx, xy, yy)
         box = _rectangle(centre_x, centre_y, radius, tiles_x, tiles_y)
-        # What is not a number fails each comparison, so broken parameters are culled here.
+        # Comparisons with NaN are false, so broken parameters are culled here.
         finite = (determinant < HUGE) & (absolute(centre_x) < HUGE) & (absolute(centre_y) < HUGE)
         seen = in_front & finite & (box[0] < box[2]) & (box[1] < box[3])
 
         opacity, opacity_rate = _opacity(opacities, first, n, raw, spare)
         log2_opacity = log2(opacity)
         margin = log2_opacity - LOG2_MIN_ALPHA
-        # Rounding moves the border of 1/255 by some epsilon of the products whose difference u is.
+        # u is a difference of products; rounding moves the border of 1/255 by some epsilon of these.
         reach = fma(absolute(margin), sqrt(xx * yy / determinant) * REACH_SLOPE, margin + REACH_SLACK)
         box = _tight_box(box, centre_x, centre_y, sqrt(reach * xx * _UNIT), sqrt(reach * yy * _UNIT))
         _store_boxes(boxes, first, box, seen & (reach > 0.0))
@@ -362,7 +360,7 @@ def project(
 
 @inline
 def _covariance(m_x: Lanes3, m_y: Lanes3) -> Lanes4:
-    """Entries xx, xy, yy of M M^T + 0.3 I, and its determinant."""
+    """Return the entries xx, xy, yy of M M^T + 0.3 I, and its determinant."""
     xx, xy, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
     minors = (
         fma(m_x[0], m_y[1], -(m_x[1] * m_y[0])),
@@ -375,7 +373,7 @@ def _covariance(m_x: Lanes3, m_y: Lanes3) -> Lanes4:
 
 @inline
 def _radius(xx: Lanes, xy: Lanes, yy: Lanes) -> Lanes:
-    """Three standard deviations along the longer axis, in whole pixels."""
+    """Return three standard deviations along the longer axis, in whole pixels."""
     half_difference = 0.5 * (xx - yy)
     root = sqrt(maximum(fma(half_difference, half_difference, xy * xy), MIN_ROOT))
     return minimum(ceil(RADIUS_SIGMAS * sqrt(0.5 * (xx + yy) + root)), MAX_RADIUS)
@@ -383,7 +381,7 @@ def _radius(xx: Lanes, xy: Lanes, yy: Lanes) -> Lanes:
 
 @inline
 def _rectangle(centre_x: Lanes, centre_y: Lanes, radius: Lanes, tiles_x: int, tiles_y: int) -> _Box:
-    """The tiles that a square around the centre touches: the last ones only from their first whole pixel on."""
+    """Return the tiles that a square around the centre touches; see `oracle.tile_rectangles` for the last ones."""
     return (
         _clipped(floor((centre_x - radius) * (1.0 / TILE)), tiles_x),
         _clipped(floor((centre_y - radius) * (1.0 / TILE)), tiles_y),
@@ -394,13 +392,13 @@ def _rectangle(centre_x: Lanes, centre_y: Lanes, radius: Lanes, tiles_x: int, ti
 
 @inline
 def _clipped(tile: Lanes, tiles: int) -> Lanes:
-    """A tile's number inside of the image; 0 for NaN."""
+    """Clamp a tile's number to the image; NaN becomes 0."""
     return minimum(maximum(tile, 0.0), tiles)
 
 
 @inline
 def _tight_box(box: _Box, centre_x: Lanes, centre_y: Lanes, half_width: Lanes, half_height: Lanes) -> _Box:
-    """The tiles of a box that hold pixels of a rectangle around the centre."""
+    """Return the tiles of a box that hold pixels of a rectangle around the centre."""
     return (
         maximum(floor(ceil(centre_x - half_width) * (1.0 / TILE)), box[0]),
         maximum(floor(ceil(centre_y - half_height) * (1.0 / TILE)), box[1]),
@@ -411,18 +409,10 @@ def _tight_box(box: _Box, centre_x: Lanes, centre_y: Lanes, half_width: Lanes, h
 
 @inline
 def _color(
-    camera: Floats,
-    mean: Lanes3,
-    sh: Floats,
-    colors: Floats,
-    first: int,
-    n: int,
-    columns: int,
-    signed: bool,
-    degree: int,
-    spare: Floats,
-) -> tuple[Lanes3, Lanes3]:
-    """Colours of 16 Gaussians, and 1 where gradients pass to what they are made of."""
+    camera: Floats, mean: Lanes3, sh: Floats, colors: Floats, first: int, n: int, columns: int, signed: bool,
+    degree: int, spare: Floats,
+) -> tuple[Lanes3, Lanes3]:  # fmt: skip
+    """Return the colours of 16 Gaussians, and 1 where they pass gradients on."""
     one = splat(spare, 1.0)
     if columns == 0:
         return _columns3(colors, first, n, spare), (one, one, one)
@@ -430,7 +420,7 @@ def _color(
     color, free = sh_color(rows, start, degree, _direction(camera, mean)[0]), (one, one, one)
     if not signed:
         color = (color[0] + 0.5, color[1] + 0.5, color[2] + 0.5)
-        # A comparison with NaN is false, so NaN stays and the loss shows it.
+        # A comparison with NaN is false, so NaN stays and reaches the loss.
         under_0, under_1, under_2 = color[0] < 0.0, color[1] < 0.0, color[2] < 0.0
         free = (select(under_0, 0.0, one), select(under_1, 0.0, one), select(under_2, 0.0, one))
         color = (select(under_0, 0.0, color[0]), select(under_1, 0.0, color[1]), select(under_2, 0.0, color[2]))
@@ -451,7 +441,7 @@ def _store_boxes(boxes: NDArray[np.int32], first: int, box: _Box, shown: Mask) -
 def _store_unseen(
     first: int, splats: Floats, boxes: NDArray[np.int32], radii: NDArray[np.int32], centres: Floats
 ) -> None:
-    """What `project` says of 16 Gaussians that are all behind the camera."""
+    """Store the results of 16 Gaussians that are all behind the camera."""
     none = splat(splats, 0.0)
     store_whole(boxes, first * 4, none, none, none, none)
     store_whole(radii, first, none)
@@ -486,17 +476,12 @@ def project_backward(
     grad_centres: Floats,  # (m * 2,)
     absgrad_centres: Floats,  # (m * 2,)
 ) -> None:
-    """Gradients by what `project` takes, see there for shapes, from the sums that the tiles' backward passes left."""
+    """Compute gradients by the arguments of `project` from the sums of the tiles' backward passes."""
     last_place = places.size - 1
     scratch, scratch_sums = np.empty(WIDTH * COLUMNS, splats.dtype), np.empty(WIDTH * (SLOT + 1), splats.dtype)
     spare, sums, pairs = borrowed(scratch), borrowed(scratch_sums), borrowed(scratch_sums[WIDTH * SLOT :])
-    means, quats, scales, sh, camera = (
-        borrowed(means),
-        borrowed(quats),
-        borrowed(scales),
-        borrowed(sh),
-        borrowed(camera),
-    )
+    means, quats, scales = borrowed(means), borrowed(quats), borrowed(scales)
+    sh, camera = borrowed(sh), borrowed(camera)
     splats, first_pair, places, slots = borrowed(splats), borrowed(first_pair), borrowed(places), borrowed(slots)
     grad_means, grad_quats, grad_scales = borrowed(grad_means), borrowed(grad_quats), borrowed(grad_scales)
     grad_opacities, grad_sh, grad_colors = borrowed(grad_opacities), borrowed(grad_sh), borrowed(grad_colors)
@@ -548,16 +533,10 @@ def project_backward(
 
 @inline
 def _sum_slots(
-    first: int,
-    n: int,
-    first_pair: NDArray[np.int64],
-    places: NDArray[np.int32],
-    last_place: int,
-    slots: Floats,
-    sums: Floats,
-    pairs: Floats,
-) -> None:
-    """Add up the slots of 16 Gaussians, tile after tile; `pairs` gets the number of each one's."""
+    first: int, n: int, first_pair: NDArray[np.int64], places: NDArray[np.int32], last_place: int, slots: Floats,
+    sums: Floats, pairs: Floats,
+) -> None:  # fmt: skip
+    """Add up the slots of 16 Gaussians, tile by tile; `pairs` gets the number of slots of each."""
     for lane in range(WIDTH):
         total = splat(slots, 0.0)
         put(pairs, lane, 0.0)
@@ -572,19 +551,10 @@ def _sum_slots(
 
 @inline
 def _color_backward(
-    camera: Floats,
-    mean: Lanes3,
-    sh: Floats,
-    first: int,
-    n: int,
-    columns: int,
-    degree: int,
-    d_color: Lanes3,
-    blended: Mask,
-    spare: Floats,
-    grad_sh: Floats,
-) -> Lanes3:
-    """Write the gradient by the coefficients; returns that by the centre, through the direction it is seen in."""
+    camera: Floats, mean: Lanes3, sh: Floats, first: int, n: int, columns: int, degree: int, d_color: Lanes3,
+    blended: Mask, spare: Floats, grad_sh: Floats,
+) -> Lanes3:  # fmt: skip
+    """Store the gradient by the coefficients; return that by the centre, through the view direction."""
     direction, inverse_distance = _direction(camera, mean)
     rows, start = sh_rows(sh, first, n, columns, spare)
     g = sh_direction_gradient(rows, start, degree, direction, d_color)
@@ -599,16 +569,10 @@ def _color_backward(
 
 @inline
 def _shape_backward(
-    camera: Floats,
-    mean: Lanes3,
-    scale: Lanes3,
-    quat: Lanes4,
-    shape: tuple[Lanes, ...],
-    total: tuple[Lanes, ...],
-    d_centre_x: Lanes,
-    d_centre_y: Lanes,
-) -> tuple[Lanes3, Lanes4, Lanes3]:
-    """Gradients by the standard deviations, the quaternion, and the centre through the projection.
+    camera: Floats, mean: Lanes3, scale: Lanes3, quat: Lanes4, shape: tuple[Lanes, ...], total: tuple[Lanes, ...],
+    d_centre_x: Lanes, d_centre_y: Lanes,
+) -> tuple[Lanes3, Lanes4, Lanes3]:  # fmt: skip
+    """Return gradients by the standard deviations, the quaternion, and the centre through the projection.
 
     Args:
         scale, quat: activated.
@@ -639,17 +603,17 @@ def _shape_backward(
     d_y_row = (_dot(axes[0], d_y), _dot(axes[1], d_y), _dot(axes[2], d_y))
     by_x, by_depth_x = _axis_backward(camera, 0, x, near_x, x_scale, depth, d_x_row, d_centre_x)
     by_y, by_depth_y = _axis_backward(camera, 1, y, near_y, y_scale, depth, d_y_row, d_centre_y)
-    return d_scale, d_quat, _turned_back(camera, (by_x, by_y, by_depth_x + by_depth_y))
+    return d_scale, d_quat, _rotate_back(camera, (by_x, by_y, by_depth_x + by_depth_y))
 
 
 @inline
 def _covariance_backward(
     shape: tuple[Lanes, ...], total: tuple[Lanes, ...], m_x: Lanes3, m_y: Lanes3
 ) -> tuple[Lanes3, Lanes3]:
-    """Gradient by the rows of M.
+    """Return the gradient by the rows of M.
 
     With the inverse covariance L^T L and E = ((uu, uv), (uv, vv)), the gradient by the covariance is L^T E L / 2, and
-    that by M is twice as much, times M.
+    that by M is twice this times M.
     """
     l_xx, l_xy, l_yy = shape[FACTOR_XX], shape[FACTOR_XY], shape[FACTOR_YY]
     uu, uv, vv = total[SUM_UU], total[SUM_UV], total[SUM_VV]
@@ -662,7 +626,7 @@ def _covariance_backward(
 
 @inline
 def _quaternion_gradient(q: Lanes4, r0: Lanes3, r1: Lanes3, r2: Lanes3) -> Lanes4:
-    """Gradient by a quaternion from that by the rows of its rotation matrix."""
+    """Return the gradient by a quaternion from that by the rows of its rotation matrix."""
     w, x, y, z = q
     a, b, c = r2[1] - r1[2], r0[2] - r2[0], r1[0] - r0[1]
     d, e, f = r0[1] + r1[0], r0[2] + r2[0], r1[2] + r2[1]
@@ -676,7 +640,7 @@ def _quaternion_gradient(q: Lanes4, r0: Lanes3, r1: Lanes3, r2: Lanes3) -> Lanes
 
 @inline
 def _unit_backward(unit: Lanes4, length: Lanes, g: Lanes4) -> Lanes4:
-    """Gradient by what `_unit` takes from that by what it returns."""
+    """Return the gradient by the argument of `_unit` from that by its result."""
     along = fma(unit[0], g[0], fma(unit[1], g[1], fma(unit[2], g[2], unit[3] * g[3])))
     along = select(length > MIN_NORM, along, 0.0)
     inverse = 1.0 / maximum(length, MIN_NORM)
@@ -692,15 +656,15 @@ def _unit_backward(unit: Lanes4, length: Lanes, g: Lanes4) -> Lanes4:
 def _axis_backward(
     camera: Floats, axis: int, x: Lanes, near_x: Lanes, x_scale: Lanes, depth: Lanes, d_row: Lanes3, d_centre: Lanes
 ) -> tuple[Lanes, Lanes]:
-    """Gradient by the camera coordinates along one axis of the image (0 or 1) and by the depth.
+    """Return the gradient by the camera coordinate along one axis of the image (0 or 1) and by the depth.
 
     Args:
-        x, near_x: the coordinate over the depth, and the same clamped.
+        x, near_x: the coordinate over the depth, before and after clamping.
         x_scale: focal length over the depth.
         d_row: gradient by the axis's row of J W.
         d_centre: gradient by the centre on the image.
     """
-    across, along = _turned(camera, axis, d_row) * x_scale, _turned(camera, 2, d_row) * x_scale
+    across, along = _rotate(camera, axis, d_row) * x_scale, _rotate(camera, 2, d_row) * x_scale
     free = select(absolute(x) > at(camera, LIMIT_X + axis), 0.0, along)
     by_coordinate = fma(d_centre, x_scale, -(free / depth))
     by_depth = fma(2.0 * near_x, along, -across) / depth - d_centre * x_scale * x
@@ -727,18 +691,10 @@ def _store4(array: Floats, first: int, v: Lanes4, where: Mask) -> None:
 
 @inline
 def _store_no_gradient(
-    first: int,
-    columns: int,
-    grad_means: Floats,
-    grad_quats: Floats,
-    grad_scales: Floats,
-    grad_opacities: Floats,
-    grad_sh: Floats,
-    grad_colors: Floats,
-    grad_centres: Floats,
-    absgrad_centres: Floats,
-) -> None:
-    """The gradients of 16 Gaussians that are in no tile's list."""
+    first: int, columns: int, grad_means: Floats, grad_quats: Floats, grad_scales: Floats, grad_opacities: Floats,
+    grad_sh: Floats, grad_colors: Floats, grad_centres: Floats, absgrad_centres: Floats,
+) -> None:  # fmt: skip
+    """Store zero gradients of 16 Gaussians that are in no tile's list."""
     none = splat(grad_means, 0.0)
     store_columns(grad_means, first * 3, none, none, none)
     store_columns(grad_quats, first * 4, none, none, none, none)

@@ -1,7 +1,7 @@
-"""Spherical harmonics up to degree 3 of 16 directions at once: values, and gradients by direction and coefficients.
+"""Evaluate spherical harmonics up to degree 3 in 16 directions at once, with gradients by direction and coefficients.
 
-Order and signs are those of 3D Gaussian Splatting, see `spherical_harmonics`. The 48 coefficients of a Gaussian lie
-together, three channels each, and are loaded and stored transposed, 16 Gaussians by 16 coefficients at a time.
+Order and signs are those of 3D Gaussian Splatting, see `fields.spherical_harmonics`. The 48 coefficients of a Gaussian
+are contiguous, three channels each, and are loaded and stored transposed, 16 Gaussians by 16 coefficients at a time.
 """
 
 from __future__ import annotations
@@ -9,19 +9,7 @@ from __future__ import annotations
 import math
 
 from lapgs_plugin.jit.compiler import inline
-from lapgs_plugin.jit.lanes import (
-    WIDTH,
-    Floats,
-    Lanes,
-    Lanes3,
-    Mask,
-    at,
-    fma,
-    load_rows,
-    put,
-    select,
-    store_rows,
-)
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, Lanes3, Mask, at, fma, load_rows, put, select, store_rows
 
 COLUMNS = 48
 """Coefficients of degree 3, three channels each."""
@@ -40,7 +28,7 @@ _C34 = math.sqrt(105 / (16 * math.pi))
 
 @inline
 def sh_rows(sh: Floats, first: int, n: int, columns: int, spare: Floats) -> tuple[Floats, int]:
-    """Where 16 rows of 48 coefficients begin: in `sh` itself, or copied to `spare` and filled up with zeros.
+    """Return an array with 16 rows of 48 coefficients and their start: `sh`, or `spare` with a copy padded with zeros.
 
     Args:
         sh: (n * columns,).
@@ -90,7 +78,7 @@ def _plus(color: Lanes3, factor: Lanes, red: Lanes, green: Lanes, blue: Lanes) -
 
 @inline
 def sh_color(rows: Floats, start: int, degree: int, d: Lanes3) -> Lanes3:
-    """Sum of the harmonics up to `degree` in direction d, times their coefficients, for three channels.
+    """Return the sum of the harmonics up to `degree` in direction d times their coefficients, three channels.
 
     Args:
         rows, start: as `sh_rows` returns them.
@@ -132,10 +120,10 @@ def _weighted(color: Lanes3, red: Lanes, green: Lanes, blue: Lanes) -> Lanes:
 
 @inline
 def sh_direction_gradient(rows: Floats, start: int, degree: int, d: Lanes3, color: Lanes3) -> Lanes3:
-    """Gradient by the direction of what `sh_color` returns, from that by the colour.
+    """Return the gradient by the direction from that by the result of `sh_color`.
 
-    The harmonics are differentiated as the polynomials they are written as; whoever normalises the direction removes
-    the component along it, which depends on how they are written.
+    The component along the direction depends on which polynomials the harmonics are written as; the gradient of the
+    direction's normalisation removes it.
     """
     x, y, z = d
     g_x, g_y, g_z = x * 0.0, x * 0.0, x * 0.0
@@ -179,7 +167,7 @@ def sh_direction_gradient(rows: Floats, start: int, degree: int, d: Lanes3, colo
 def store_sh_gradient(
     grad_sh: Floats, first: int, columns: int, degree: int, d: Lanes3, color: Lanes3, where: Mask, spare: Floats
 ) -> None:
-    """Gradient by the coefficients of 16 rows: zero in bands that were not evaluated and in lanes not in `where`.
+    """Store the gradient by the coefficients of 16 rows: zero above `degree` and in lanes outside of `where`.
 
     Args:
         grad_sh: (m * columns,) with room for all 16 rows.
@@ -187,7 +175,7 @@ def store_sh_gradient(
         color: gradient by the colour that `sh_color` returned.
         spare: at least 16 * 48 floats.
     """
-    # Both factors of the products, because zero times the direction of a broken centre would not be zero.
+    # Both factors are masked, because zero times the NaN direction of a broken centre is not zero.
     r, g, b = select(where, color[0], 0.0), select(where, color[1], 0.0), select(where, color[2], 0.0)
     d = (select(where, d[0], 0.0), select(where, d[1], 0.0), select(where, d[2], 0.0))
     none = r * 0.0

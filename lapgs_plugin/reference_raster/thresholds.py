@@ -1,24 +1,23 @@
-"""Where an image hangs on a comparison that rounding can turn: the pixels and Gaussians two correct rasterizers may
-disagree on.
+"""Find the pixels and Gaussians on which two correct rasterizers may disagree, because rounding decides a comparison.
 
-A rasterizer decides: in front or behind, in which tiles, in which order, visible or skipped, last one or one more. Two
-implementations that round differently may decide differently where the compared numbers agree to within rounding, and
-then differ by far more than rounding. Everywhere else they must agree, so comparisons are made outside this mask.
+A rasterizer compares numbers to decide: in front or behind, in which tiles, in which order, visible or skipped, last
+Gaussian or not. Where compared numbers are equal up to rounding, two implementations may decide differently and then
+differ by far more than rounding. Everywhere else they must agree, so tests compare them outside of this mask.
 
 The mask is computed in float64 with a running first-order error bound. `tolerance` is the relative error of an
-elementary result (a dot product of a few terms); each quantity gets the bound that follows from its own formula,
-including cancellation: a needle's 2D determinant, say, is known far less well than its entries. A pixel is masked when,
-before the transmittance has surely fallen under its limit, for any Gaussian
-    - alpha is within its bound of 1/255, or of the cap 0.99 and not surely over it,
+elementary result (a dot product of a few terms). The bound of each quantity follows from its own formula, including
+cancellation: the 2D determinant of a needle, for example, is less precise than its entries. A pixel is masked if,
+before the transmittance has certainly fallen under its limit, for any Gaussian
+    - alpha is within its bound of 1/255, or of the cap 0.99 and not certainly above it,
     - the transmittance is within its bound of 1e-4,
-    - it is in the pixel's tile or not depending on the bounds of centre, radius (rounded up) and depth (culled at 0.2),
-      or its determinant may be 0 (culled) or negative (skipped where the exponent turns positive),
-    - the next Gaussian that contributes is not surely behind it. Exactly equal centres are not masked: their depths are
-      computed from the same numbers, so they tie in any implementation and the index decides.
-Of a Gaussian the radius may be open, and its gradient where it has a kink: a colour channel at the clamp, or a centre
-at the limit where the Jacobian stops following it.
+    - the bounds of centre, radius (rounded up) and depth (culled at 0.2) leave open if it is in the pixel's tile, or
+      its determinant may be 0 (culled) or negative (skipped where the exponent becomes positive),
+    - the next contributing Gaussian is not certainly behind it. Exactly equal centres are not masked: their depths are
+      computed from the same numbers, so they tie in any implementation, and the index decides.
+For a Gaussian, the mask says if its radius is open and if its gradient has a kink: a colour channel at the clamp, or a
+centre at the limit where the Jacobian is clamped.
 
-Gradients mix pixels; compare those of a loss whose weights vanish on the masked pixels, for Gaussians not at a kink.
+Gradients mix pixels. Compare those of a loss whose weights vanish on the masked pixels, for Gaussians not at a kink.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_basis
-from lapgs_plugin.reference_raster.oracle import (
+from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_ALPHA,
     MAX_RADIUS,
@@ -43,19 +42,16 @@ from lapgs_plugin.reference_raster.oracle import (
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
-    projection_jacobians,
-    tile_lists,
-    tile_rectangles,
-    world_covariances,
 )
+from lapgs_plugin.reference_raster.oracle import projection_jacobians, tile_lists, tile_rectangles, world_covariances
 
 ROUNDINGS = 8
-"""Default tolerance in units of the float type's epsilon: the longest dot products of the projection."""
+"""Default tolerance in units of the float type's epsilon, for the longest dot products of the projection."""
 
 
 @dataclass(frozen=True)
 class ThresholdMask:
-    """What two correct implementations may legitimately disagree on.
+    """Mark pixels and Gaussians on which two correct implementations may disagree.
 
     Attributes:
         pixels: (h, w) True where a decision within rounding changes the pixel.
@@ -70,7 +66,7 @@ class ThresholdMask:
 
 @dataclass(frozen=True)
 class _Bounded:
-    """The v Gaussians that might reach the image, each quantity with the bound of its error, in float64.
+    """Hold the v Gaussians that might reach the image, each quantity with its error bound, in float64.
 
     Attributes:
         ids: (v,) their index in the field.
@@ -80,7 +76,7 @@ class _Bounded:
         conics: (v, 3) xx, xy, yy of the inverse covariance.
         conic_errors: (v,) relative error of the quadratic form with this conic.
         opacities, opacity_errors: (v,) the error is relative.
-        surely: (v, 4) tiles the Gaussian touches however it is rounded: x0, y0, x1, y1; empty if it may be culled.
+        surely: (v, 4) tiles the Gaussian touches with any rounding: x0, y0, x1, y1; empty if it may be culled.
         possibly: (v, 4) tiles it touches with some rounding.
         open_radii, kinks: (v,) as in `ThresholdMask`.
     """
@@ -110,10 +106,10 @@ def threshold_mask(
     tolerance: float | None = None,
     three_sigma_cut: bool = True,
 ) -> ThresholdMask:
-    """Pixels and Gaussians whose rendering hangs on rounding.
+    """Find the pixels and Gaussians whose rendering depends on rounding.
 
     Args:
-        field: n Gaussians, with exactly the numbers that are rendered.
+        field: n Gaussians, exactly as they are rendered.
         camera: the view.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
@@ -154,7 +150,7 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
     limits = points.new_tensor(camera.tan_half_fov) * JACOBIAN_LIMIT  # (2,)
     at_limit = ((slopes.abs() - limits).abs() <= slope_errors + tolerance * limits).any(1)  # (v,)
     kinks = touched & (at_limit | _at_clamp(field, camera, ids, degree, tolerance))  # (v,)
-    # A row of the rotation that only picks a coordinate makes the depth one exactly rounded sum: the same bits for all.
+    # If the rotation only picks a coordinate, the depth is one exactly rounded sum: the same bits everywhere.
     axis_aligned = bool((rotation[2].abs() == 1).any())
     logits = field.opacity_logits[ids]  # (v,)
     return _Bounded(
@@ -177,7 +173,7 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
 
 @dataclass(frozen=True)
 class _Shapes:
-    """The v Gaussians' footprints.
+    """Hold the footprints of v Gaussians.
 
     Attributes:
         conics: (v, 3) xx, xy, yy of the inverse covariance.
@@ -196,13 +192,17 @@ class _Shapes:
 def _shapes(
     field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float
 ) -> _Shapes:
-    """Footprints of the Gaussians `ids` at (v, 3) camera-space `points`; `relative` (v,) is the Jacobians' error."""
+    """Compute the footprints of the Gaussians `ids` at camera-space `points` (v, 3).
+
+    Args:
+        relative: (v,) relative error of the Jacobians.
+    """
     jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
     to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
     covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
     xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
     xy = covariances[:, 0, 1]  # (v,)
-    # Sigma' is a sum of terms as large as the longest axis seen from the side, whatever is left of them.
+    # Sigma' is a sum of terms as large as the longest axis seen from the side, even if these cancel.
     largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + PIXEL_VARIANCE
     errors = largest_term * relative  # (v,) of each entry of the covariance
     determinants = xx * yy - xy * xy  # (v,)
@@ -228,7 +228,7 @@ def _shapes(
 def _tiles(
     means2d: Tensor, errors: Tensor, shapes: _Shapes, camera: Camera, three_sigma_cut: bool
 ) -> tuple[Tensor, Tensor]:
-    """(v, 4) tiles that each Gaussian touches whatever the (v, 2) errors of its centre are, and those it may touch."""
+    """Return (v, 4) tiles that each Gaussian certainly touches, and those it may touch, given (v, 2) centre errors."""
     if not three_sigma_cut:
         everywhere = tile_rectangles(means2d, torch.full_like(means2d[:, 0], math.inf), camera)  # (v, 4)
         return everywhere, everywhere
@@ -244,19 +244,19 @@ def _tiles(
 
 
 def _area(rectangles: Tensor) -> Tensor:
-    """(v,) number of tiles of (v, 4) rectangles."""
+    """Return the number of tiles (v,) of rectangles (v, 4)."""
     return (rectangles[:, 2:] - rectangles[:, :2]).clamp(min=0).prod(dim=1)
 
 
 def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, tolerance: float) -> Tensor:
-    """(v,) True where a colour channel is within rounding of 0, where an unsigned field clamps."""
+    """Return (v,) True where a colour channel is within rounding of 0, at which unsigned fields clamp."""
     if field.signed:
         return torch.zeros(len(ids), dtype=torch.bool, device=ids.device)
     offsets = field.means[ids] - camera.position  # (v, 3)
     basis = sh_basis(torch.nn.functional.normalize(offsets, dim=-1), degree)[:, :, None]  # (v, k, 1)
     sh = field.sh[ids, : basis.shape[1]]  # (v, k, 3)
     values = (basis * sh).sum(1) + 0.5  # (v, 3)
-    # The direction is a difference of positions, so its relative error grows as the Gaussian nears the camera.
+    # The direction is a difference of positions: its relative error is larger for Gaussians near the camera.
     positions = (field.means[ids].abs() + camera.position.abs()).sum(1)  # (v,)
     steepness = 1 + degree * (1 + positions / offsets.norm(dim=1))  # (v,)
     errors = tolerance * (0.5 + steepness[:, None] * sh.abs().sum(1))  # (v, 3)
@@ -264,7 +264,7 @@ def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, to
 
 
 def _open_pixels(bounded: _Bounded, camera: Camera, tolerance: float) -> Tensor:
-    """(h, w) True where a decision is open."""
+    """Return (h, w) True where a decision is open."""
     lists = tile_lists(bounded.depths, bounded.possibly, camera)
     offsets = torch.arange(TILE, dtype=torch.float64, device=bounded.depths.device)  # (16,)
     mask = torch.zeros(lists.rows, lists.columns, TILE, TILE, dtype=torch.bool, device=bounded.depths.device)
@@ -280,7 +280,7 @@ def _open_pixels(bounded: _Bounded, camera: Camera, tolerance: float) -> Tensor:
 
 
 def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixels: Tensor, tolerance: float) -> Tensor:
-    """Which pixels of a tile have an open decision.
+    """Find the pixels of a tile with an open decision.
 
     Args:
         members: (k,) rows of `bounded` that may be in the tile, by depth.
@@ -308,7 +308,7 @@ def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixel
 
 
 def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float) -> tuple[Tensor, ...]:
-    """o exp(-q) before the cap: lower bound, value and upper bound; (p, k) each."""
+    """Return lower bound, value and upper bound of o exp(-q) before the cap; (p, k) each."""
     dx, dy = (bounded.means2d[members] - pixels[:, None]).unbind(-1)  # (p, k) each
     xx, xy, yy = bounded.conics[members].unbind(-1)  # (k,) each
     q = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (p, k)
@@ -323,7 +323,7 @@ def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float
 
 
 def _ties(bounded: _Bounded, members: Tensor, visible: Tensor) -> Tensor:
-    """(p, k) True where a Gaussian is not surely behind the one that contributes before it in that pixel."""
+    """Return (p, k) True where a Gaussian is not certainly behind the previous contributing one in that pixel."""
     order = torch.arange(len(members), device=members.device).expand_as(visible)  # (p, k)
     latest = torch.where(visible, order, -1).cummax(dim=1).values  # (p, k)
     previous = torch.cat([torch.full_like(latest[:, :1], -1), latest[:, :-1]], dim=1)  # (p, k), -1: none

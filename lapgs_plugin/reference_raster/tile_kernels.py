@@ -1,14 +1,14 @@
-"""Blending splats in tiles, forward and backward.
+"""Blend splats in tiles, forward and backward.
 
-A tile is worked on by one thread, in 16 blocks of 4x4 pixels, each one vector. Splats that the tile's list holds but no
-pixel of a block sees are left out exactly: the least u^2 + v^2 over the block's rectangle has a closed form, and one
-vector, with a block in each lane, tells it for the whole tile. Compact blocks waste fewer lanes than rows of 16 pixels.
+One thread processes a tile, in 16 blocks of 4x4 pixels, each one vector. A block skips the splats of the tile's list
+that none of its pixels sees. This test is exact: the minimum of u^2 + v^2 over a rectangle has a closed form, which one
+vector evaluates for all blocks of a tile. Square blocks waste fewer lanes than rows of 16 pixels.
 
-The forward pass goes block by block, so that the pixels stay in registers while a batch of splats passes. The backward
-pass goes splat by splat from the last one, so that a splat's gradient stays in registers while the blocks pass. Its
-pixels carry two numbers: the transmittance behind the splat and the loss's derivative by it, times it.
+The forward pass goes block by block, so that the pixels stay in registers while a batch of splats is blended. The
+backward pass goes splat by splat from the last one, so that a splat's gradient stays in registers over all blocks. Its
+state has two numbers for each pixel: the transmittance behind the splat, and the loss's derivative by it times it.
 
-Both passes evaluate alpha by the same expression and therefore agree, bit by bit, on which splats are blended.
+Both passes evaluate alpha by the same expression. They therefore agree, bit by bit, on which splats are blended.
 """
 
 from __future__ import annotations
@@ -67,23 +67,23 @@ from lapgs_plugin.reference_raster.layout import (
 )
 
 BATCH = 256
-"""Splats that are dealt to the blocks of a tile at a time; their lists stay in the level-1 cache."""
+"""Splats that are listed for the blocks of a tile at a time; the lists stay in the level-1 cache."""
 
 AHEAD = 8
-"""How many splats ahead of their use the cache is asked for them."""
+"""How many splats ahead of their use they are prefetched."""
 
-# Vectors of a block's state, forward: transmittance (negative once the pixel is opaque or if it is outside of the
-# image), colour, and how far down the tile's list the last blended splat is, counted from 1.
+# Vectors of a block's state, forward: transmittance (negative for pixels that are opaque or outside of the image),
+# colour, and the position of the last blended splat in the tile's list, counted from 1.
 _T, _R, _G, _B, _LAST, _FORWARD = range(6)
 # Backward: transmittance behind the splat, derivative by it times it, derivatives by the colour, last blended splat.
 _T_BEHIND, _REST, _GRAD_R, _GRAD_G, _GRAD_B, _FINAL, _BACKWARD = range(7)
 
 FINAL = 2 * TILE_PIXELS
-"""Floats that the forward pass keeps of a tile for the backward pass: a block's transmittance, then its last splat."""
+"""Floats of a tile that the backward pass needs: for each block the transmittance, then the last splat."""
 
 
 def pixel_offsets(dtype: type[np.floating]) -> Floats:
-    """Coordinates relative to their tile: of each block's pixels (x, then y), then of all blocks' corners (x, y)."""
+    """Return coordinates in the tile: of each block's pixels (x, then y), then of all blocks' corners (x, y)."""
     corner_y, corner_x = (axis.ravel() * BLOCK for axis in np.indices((TILE // BLOCK, TILE // BLOCK)))  # (16,) each
     y, x = (axis.ravel() for axis in np.indices((BLOCK, BLOCK)))  # (16,) each
     pixels = np.stack([corner_x[:, None] + x, corner_y[:, None] + y], axis=1)  # (16, 2, 16)
@@ -95,7 +95,7 @@ _CORNERS = 2 * TILE_PIXELS
 
 @inline
 def _aligned(size: int, like: Floats) -> Floats:
-    """Uninitialised floats whose vectors do not straddle lines of the cache."""
+    """Return uninitialised floats whose vectors do not straddle cache lines."""
     memory = np.empty(size + WIDTH, like.dtype)
     start = -memory.ctypes.data % (WIDTH * memory.itemsize) // memory.itemsize
     return memory[start : start + size]
@@ -113,10 +113,10 @@ def _pixels_y(offsets: Floats, block: int, tile_y: int) -> Lanes:
 
 @inline
 def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
-    """The blocks, as bits, in which the splat at `s` has an alpha of 1/255 or more anywhere.
+    """Return the blocks, as bits, in which the splat at `s` has an alpha of 1/255 or more anywhere.
 
-    The least u^2 + v^2 over a rectangle is at its centre or on one of the two sides that face it: on the side nearest
-    in x, where y is best for that x, or on the side nearest in y, where x is best for that y.
+    The minimum of u^2 + v^2 over a rectangle is at the splat's centre or on one of the two sides that face it: on the
+    side nearest in x at the best y for that x, or on the side nearest in y at the best x for that y.
 
     Args:
         left, top: pixel coordinates of the blocks' first pixels.
@@ -132,7 +132,7 @@ def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
 
 @inline
 def _distance(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> Lanes:
-    """u^2 + v^2."""
+    """Return u^2 + v^2."""
     u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
     v = dy * broadcast(splats, s + FACTOR_YY)
     return fma(u, u, v * v)
@@ -147,16 +147,16 @@ def blend(
     width: int,
     height: int,
     tiles_x: int,
-    tile_start: NDArray[np.int64],  # (tiles + 1,) where each tile's splats begin in `members`
-    members: NDArray[np.int32],  # (pairs,) splats, tile after tile, nearest first
+    tile_start: NDArray[np.int64],  # (tiles + 1,) start of each tile's splats in `members`
+    members: NDArray[np.int32],  # (pairs,) splats, tile by tile, nearest first
     splats: Floats,  # (n * SPLAT,)
     background: Floats,  # (3,)
     offsets: Floats,  # see `pixel_offsets`
     image: Floats,  # (3 * height * width,)
     transmittance: Floats,  # (height * width,)
-    keep: bool,  # whether to fill what follows, for the backward pass
+    keep: bool,  # whether to fill the following arrays, for the backward pass
     hits: NDArray[np.uint16],  # (pairs,) the blocks, as bits, in which a pair may be blended
-    reached: NDArray[np.int64],  # (tiles,) pairs looked at before the tile was opaque
+    reached: NDArray[np.int64],  # (tiles,) pairs processed before the tile was opaque
     final: Floats,  # (tiles * FINAL,)
 ) -> None:
     """Blend all splats front to back over the background."""
@@ -175,7 +175,7 @@ def blend(
         batch = start
         while batch < end and alive != 0:
             size = min(end - batch, BATCH)
-            _deal_to_blocks(batch, size, members, splats, offsets, tile_x, tile_y, alive, lists, counts, keep, hits)
+            _list_by_block(batch, size, members, splats, offsets, tile_x, tile_y, alive, lists, counts, keep, hits)
             pending = alive
             while pending != 0:
                 block = lowest_bit(pending)
@@ -201,7 +201,7 @@ def blend(
 
 @inline
 def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: int, height: int) -> int:
-    """Set pixels to black and transparent; returns the blocks, as bits, that hold pixels of the image."""
+    """Set pixels to black and transparent; return the blocks, as bits, that hold pixels of the image."""
     alive = 0
     for block in range(BLOCKS):
         inside = (_pixels_x(offsets, block, tile_x) < width) & (_pixels_y(offsets, block, tile_y) < height)
@@ -215,21 +215,11 @@ def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: 
 
 
 @inline
-def _deal_to_blocks(
-    batch: int,
-    size: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    alive: int,
-    lists: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    keep: bool,
-    hits: NDArray[np.uint16],
-) -> None:
-    """List the pairs from `batch` on by the blocks that they reach."""
+def _list_by_block(
+    batch: int, size: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    alive: int, lists: NDArray[np.int64], counts: NDArray[np.int64], keep: bool, hits: NDArray[np.uint16],
+) -> None:  # fmt: skip
+    """List the pairs from `batch` on for each block that they reach."""
     left, top = load(offsets, _CORNERS) + tile_x * TILE, load(offsets, _CORNERS + WIDTH) + tile_y * TILE
     for block in range(BLOCKS):
         put(counts, block, 0)
@@ -249,21 +239,13 @@ def _deal_to_blocks(
 
 @inline
 def _blend_block(
-    block: int,
-    start: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    lists: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    state: Floats,
-) -> int:
+    block: int, start: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    lists: NDArray[np.int64], counts: NDArray[np.int64], state: Floats,
+) -> int:  # fmt: skip
     """Blend a block's list into its pixels.
 
     Returns:
-        How much of the list was blended when all pixels had become opaque, or -1 if some have not.
+        The number of splats processed when all pixels were opaque, or -1 if some are not.
     """
     place = _FORWARD * block * WIDTH
     t, last = load(state, place + _T * WIDTH), load(state, place + _LAST * WIDTH)
@@ -302,16 +284,10 @@ def _blend_block(
 
 @inline
 def _close_tile(
-    state: Floats,
-    background: Floats,
-    tile_x: int,
-    tile_y: int,
-    width: int,
-    height: int,
-    image: Floats,
+    state: Floats, background: Floats, tile_x: int, tile_y: int, width: int, height: int, image: Floats,
     transmittance: Floats,
-) -> None:
-    """Blend the background and write the pixels that are inside of the image."""
+) -> None:  # fmt: skip
+    """Blend the background and store the pixels that are inside of the image."""
     pixels = width * height
     for block in range(BLOCKS):
         place = _FORWARD * block * WIDTH
@@ -354,7 +330,7 @@ def blend_backward(
     grad_transmittance: Floats,  # (height * width,), or empty for zeros
     slots: Floats,  # (pairs * SLOT,) filled: see `layout.SLOT`
 ) -> None:
-    """Gradient of each splat in each tile."""
+    """Compute the gradient of each splat in each tile."""
     tiles, by_transmittance = reached.size, grad_transmittance.size > 0
     scratch = _aligned(_BACKWARD * TILE_PIXELS, splats)
     state, splats, background, offsets = borrowed(scratch), borrowed(splats), borrowed(background), borrowed(offsets)
@@ -386,19 +362,10 @@ def blend_backward(
 
 @inline
 def _reopen_tile(
-    state: Floats,
-    tile: int,
-    tile_x: int,
-    tile_y: int,
-    width: int,
-    height: int,
-    background: Floats,
-    final: Floats,
-    grad_image: Floats,
-    grad_transmittance: Floats,
-    by_transmittance: bool,
-) -> None:
-    """Put the pixels into the state behind the last splat; those outside of the image have no gradient."""
+    state: Floats, tile: int, tile_x: int, tile_y: int, width: int, height: int, background: Floats, final: Floats,
+    grad_image: Floats, grad_transmittance: Floats, by_transmittance: bool,
+) -> None:  # fmt: skip
+    """Set the state behind the last splat; pixels outside of the image have no gradient."""
     pixels = width * height
     for block in range(BLOCKS):
         place = _BACKWARD * block * WIDTH
@@ -427,22 +394,14 @@ def _reopen_tile(
 
 @inline
 def _splat_backward(
-    pair: int,
-    start: int,
-    members: NDArray[np.int32],
-    splats: Floats,
-    offsets: Floats,
-    tile_x: int,
-    tile_y: int,
-    blocks: int,
-    state: Floats,
-    slots: Floats,
-) -> None:
-    """Step in front of one splat in the given blocks of a tile, and sum its gradient up.
+    pair: int, start: int, members: NDArray[np.int32], splats: Floats, offsets: Floats, tile_x: int, tile_y: int,
+    blocks: int, state: Floats, slots: Floats,
+) -> None:  # fmt: skip
+    """Step in front of one splat in the given blocks of a tile, and sum up its gradient.
 
-    With T the transmittance in front of the splat, c its colour times the pixel's gradient and R the loss's derivative
-    by the transmittance behind it times that transmittance, the derivative by alpha is T c - R / (1 - alpha), and in
-    front of the splat R is more by alpha T c.
+    Let T be the transmittance in front of the splat, c its colour times the pixel's gradient, and R the loss's
+    derivative by the transmittance behind it times that transmittance. The derivative by alpha is
+    T c - R / (1 - alpha). In front of the splat, R is larger by alpha T c.
     """
     s = at(members, pair) * SPLAT
     xy, yy = broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
@@ -455,7 +414,7 @@ def _splat_backward(
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         place = _BACKWARD * block * WIDTH
-        # Read again in each block, where a register held for long would be spilled.
+        # Loaded again in each block; kept in registers, these values would be spilled.
         dx = _pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
         dy = _pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
         u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * xy)

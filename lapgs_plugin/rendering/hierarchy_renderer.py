@@ -18,7 +18,8 @@ from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import AS_TRAINED, Composition, compose, scaled
 from lapgs_plugin.rendering.field_renderer import FieldOffload, FieldRenderer
-from lapgs_plugin.runs.archive import Manifest, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest
 
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""

@@ -12,7 +12,8 @@ from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
-from lapgs_plugin.runs.archive import RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
 
 PATHS = ("orbit", "spline")

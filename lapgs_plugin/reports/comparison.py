@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
-from lapgs_plugin.runs.archive import Manifest
+from lapgs_plugin.runs.manifest import Manifest
 
 Metrics = dict[str, Any]
 """Content of metrics.json, see `figures.run_figures`."""

@@ -1,0 +1,1 @@
+"""Drive a checkout's own training script as a hierarchy: `lapgs run`."""

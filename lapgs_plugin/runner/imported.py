@@ -1,15 +1,15 @@
-"""Output folders of other programs as run folders: of 3DGS codebases, and of the paper authors' release.
+"""Import output folders of other programs as run folders: of 3DGS codebases, and of the paper authors' release.
 
-    FOLDER/cfg_args                                        the model's options, as Python writes a Namespace
+    FOLDER/cfg_args                                        the model's options, as Python prints a Namespace
     FOLDER/point_cloud/iteration_<n>/point_cloud.ply       a 3DGS codebase's only field
     FOLDER/L<l>/point_cloud/iteration_<n>/point_cloud.ply  the release's field of level l, 0 the finest
     FOLDER/L<l>/TRAIN_INFO                                 its seconds and Gaussians, counted since the first stage
-    FOLDER/runtime_breakdown.json                          its options, where it was asked for one
-    FOLDER/lapgs_record.json                               what a codebase's run took, where `lapgs run` recorded it
+    FOLDER/runtime_breakdown.json                          its options, if it measured a breakdown
+    FOLDER/lapgs_record.json                               a codebase's run as `lapgs run --off --record` measured it
 
-The release's rasterizer for residuals evaluates SH without the 0.5 and the clamp, which is our signed colour: its
-coefficients are taken over as they are. Its images are composed of renders that are clamped each, on a pixel grid of
-its own (`pyramid.MIXED_GRID`).
+The release's rasterizer for residuals evaluates SH without the 0.5 and the clamp, as our signed colour does, so the
+coefficients are copied unchanged. It clamps each render before composing, on a pixel grid of its own
+(`pyramid.MIXED_GRID`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
-from lapgs_plugin.adapters.registry import adapters
+from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import BARE_RECORD, one_line_errors
@@ -32,7 +32,9 @@ from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, PathText, RunArchive, SceneReference, read_bare_record
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText, SceneReference
+from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.scenes import smallest_size
 from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked, read_json, read_text
 
@@ -46,7 +48,7 @@ COPY = "copy it again"
 
 
 class Options(TypedDict):
-    """What is looked up in cfg_args; codebases keep more there."""
+    """Type the options used of cfg_args, which has others, too."""
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     source_path: PathText
@@ -59,14 +61,14 @@ class Options(TypedDict):
 
 
 class BreakdownOptions(TypedDict):
-    """What is looked up in the options of a breakdown."""
+    """Type the options used of a breakdown."""
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     blur_up: NotRequired[bool]
 
 
 class BreakdownFile(TypedDict):
-    """What is looked up in `BREAKDOWN`."""
+    """Type the entries used of `BREAKDOWN`."""
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     config: NotRequired[BreakdownOptions]
@@ -75,14 +77,14 @@ class BreakdownFile(TypedDict):
 
 @dataclass(frozen=True)
 class ForeignLevel:
-    """A trained field in another program's folder.
+    """Describe a trained field in another program's folder.
 
     Attributes:
-        level: 0 is full resolution.
-        iterations: it was trained for, from its folder's name.
+        level: level of the field, 0 for full resolution.
+        iterations: iterations of its training, from its folder's name.
         ply: its file.
-        seconds: optimization from the start of the first stage to the end of this one, None where it is not recorded.
-        peak: most Gaussians up to the end of this stage, None where it is not recorded.
+        seconds: optimization from the start of the first stage to the end of this one, None if not recorded.
+        peak: most Gaussians up to the end of this stage, None if not recorded.
     """
 
     level: int
@@ -94,14 +96,14 @@ class ForeignLevel:
 
 @dataclass(frozen=True)
 class ForeignRun:
-    """Another program's output folder.
+    """Describe another program's output folder.
 
     Attributes:
-        folder: it.
+        folder: the folder.
         options: the model's options, from cfg_args.
-        levels: coarsest first, without gaps.
-        codebase: name of the backbone, None where the folder does not tell.
-        record: what `lapgs run --off --record` noted, empty without it.
+        levels: fields, coarsest first, without gaps.
+        codebase: name of the backbone, None if the folder does not tell.
+        record: measurements by `lapgs run --off --record`, empty without it.
     """
 
     folder: Path
@@ -112,24 +114,25 @@ class ForeignRun:
 
     @property
     def is_hierarchy(self) -> bool:
-        """Whether the authors' release wrote it."""
+        """Whether the paper authors' release wrote it."""
         return (self.folder / f"L{self.levels[0].level}").is_dir()
 
     @property
     def times_are_known(self) -> bool:
+        """Whether the folder records the time of its training."""
         return bool(self.record) or all(level.seconds is not None for level in self.levels)
 
 
 def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
-    """Find out what is in another program's output folder.
+    """Read the contents of another program's output folder.
 
     Args:
-        folder: as given to the program with -m.
-        iteration: which of the saved fields; None takes the last of each level.
+        folder: the folder that the program got with -m.
+        iteration: iteration of the saved fields; None for the last of each level.
 
     Raises:
-        RunFolderError: it is no such folder, lacks a level or that iteration, or was trained with options that cannot
-            be rendered as they were.
+        RunFolderError: it is no such folder, lacks a level or the iteration, or was trained with options that we cannot
+            render.
     """
     folder = folder.absolute()
     options = read_cfg_args(folder / CFG_ARGS)
@@ -167,7 +170,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:
-    """The options in a cfg_args file: the text of an argparse.Namespace, of which nothing is executed.
+    """Return the options in a cfg_args file, the text of an argparse.Namespace, without executing it.
 
     Raises:
         RunFolderError: it is missing or something else, or lacks an option.
@@ -201,44 +204,44 @@ def import_run(
     settings: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> RunArchive:
-    """Make a run folder of it. The fields are copied, nothing in the original changes.
+    """Make a run folder with copies of another program's fields.
 
     Args:
-        run: what is there.
-        out: the run folder.
-        codebase: name of the backbone it was trained with; None takes the folder's word for it.
-        scene: where its scene is now; None when it is still where it was.
-        settings: options of its rasterizer that were not the defaults, such as {"mult": 1.0}.
-        overwrite: replace a run that is already in `out`.
+        run: the other program's folder.
+        out: run folder to write.
+        codebase: name of the backbone that trained it; None for the one that the folder tells.
+        scene: new place of the scene; None if it has not moved.
+        settings: settings of its rasterizer that were not the defaults, such as {"mult": 1.0}.
+        overwrite: replace the run in `out`.
 
     Returns:
         The archive, closed for writing.
 
     Raises:
-        UserInputError: the codebase is not known and not given, or a setting is none.
-        RunFolderError: the scene is not there, a field is damaged, or `out` cannot be written.
+        UserInputError: the codebase is unknown, or a setting is wrong.
+        RunFolderError: the scene is missing, a field is damaged, or `out` cannot be written.
         SceneError: the scene cannot be read.
     """
-    known, name = adapters(), codebase or run.codebase
-    if name not in known:
+    known, name = list(BACKBONES), codebase or run.codebase
+    if name is None or name not in known:
         raise UserInputError(
-            f"--backbone {name or '(not given)'}: {run.folder} does not say what it was trained with, expected "
+            f"--backbone {name or '(not given)'}: {run.folder} does not say which backbone trained it, expected one of "
             f"{', '.join(known)}"
         )
-    backbone = known[name]
+    backbone = BACKBONES[name]
     RunArchive.require_room(out, overwrite)
     manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
     scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
     try:
         size = smallest_size(manifest.scene.path, **scene_options)
-    except UserInputError as error:  # of what cfg_args says, more often than of the scene
+    except UserInputError as error:  # most often about values of cfg_args
         raise type(error)(f"{run.folder / CFG_ARGS}: {error}") from error
     fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0
         for level in run.levels:
             field = fields[level.level]
-            # The release counts on from stage to stage: an unchanged peak was an earlier stage's.
+            # The release's peak includes earlier stages: an unchanged one was theirs.
             own_peak = level.peak if level.peak is not None and level.peak > peak else len(field)
             record = LevelRecord(
                 level=level.level,
@@ -258,7 +261,7 @@ def import_run(
 
 
 def _as_recorded(record: LevelRecord, noted: Mapping[str, Any]) -> LevelRecord:
-    """A level's record with what was noted while it was trained."""
+    """Return a level's record with the measurements of its training."""
     if not noted:
         return record
     return replace(
@@ -295,13 +298,12 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
 
 
 def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str | None:
-    """The backbone by its own options, or by what the authors' release noted. Most folders do not tell."""
-    known = adapters()
-    for name, adapter in known.items():
+    """Return the backbone by options that only it has, or as the release noted it; None if neither tells."""
+    for adapter in all_adapters():
         if any(option in options for option in adapter.info.telling_options):
-            return name
+            return adapter.info.name
     noted = breakdown.get("backbone")
-    return noted if noted in known else None
+    return noted if noted in list(BACKBONES) else None
 
 
 def _is_file(path: Path) -> bool:

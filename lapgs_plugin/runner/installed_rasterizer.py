@@ -1,4 +1,4 @@
-"""Whether the rasterizer that is installed is the one a checkout was written for: several go by one module name."""
+"""Check that the installed rasterizer is the one that a checkout was written for: several share one module name."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ast
 import inspect
 from types import ModuleType
 
-from lapgs_plugin.adapters.registry import KNOWN_EXTENSIONS
+from lapgs_plugin.adapters.registry import known_extensions
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 SETTINGS = "GaussianRasterizationSettings"
@@ -16,12 +16,12 @@ def require_matching_rasterizer(renderer: ModuleType, rasterizer: str, title: st
     """Compare the settings that a checkout's `render` passes with those that the rasterizer takes.
 
     Args:
-        renderer: the checkout's `gaussian_renderer`; without the settings, nothing is compared.
-        rasterizer: name of the module that it imports them from.
-        title: of the backbone.
+        renderer: the checkout's `gaussian_renderer`; nothing is compared if it does not have the settings.
+        rasterizer: name of the rasterizer's module.
+        title: title of the backbone.
 
     Raises:
-        UserInputError: the rasterizer is another code base's.
+        UserInputError: the rasterizer belongs to another code base.
     """
     settings = vars(renderer).get(SETTINGS)
     passed = _passed_settings(renderer)
@@ -37,9 +37,9 @@ def require_matching_rasterizer(renderer: ModuleType, rasterizer: str, title: st
         )
 
 
-def explained(error: ImportError, script: str) -> MissingExtraError | None:
-    """One line instead of a traceback for an extension that cannot be imported; None for any other module."""
-    for name, purpose in KNOWN_EXTENSIONS.items():
+def explain_import_error(error: ImportError, script: str) -> MissingExtraError | None:
+    """Return an error of one line for an extension that cannot be imported; None for any other module."""
+    for name, purpose in known_extensions().items():
         package = name.partition(".")[0]
         if (error.name or "").partition(".")[0] == package:
             return MissingExtraError(
@@ -50,7 +50,7 @@ def explained(error: ImportError, script: str) -> MissingExtraError | None:
 
 
 def _passed_settings(renderer: ModuleType) -> set[str]:
-    """Keywords of the calls that make settings."""
+    """Return the keywords of the calls that make settings."""
     calls = [node for node in ast.walk(ast.parse(inspect.getsource(renderer))) if isinstance(node, ast.Call)]
     makers = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == SETTINGS]
     return {keyword.arg for call in makers for keyword in call.keywords if keyword.arg is not None}

@@ -1,16 +1,15 @@
-"""Which part of an iteration a checkout's training loop is in, told by what it calls.
+"""Mark the parts of an iteration in a checkout's training loop by the functions that it calls.
 
-The loop calls, in the order of an iteration, with what is marked there:
+In the order of an iteration, each call and the part that begins with it:
 
     update_learning_rate                     other             before the rasterizer: views, targets, logging
-    GaussianRasterizationSettings            forward           every render makes them first
-    the rasterizer returns                   loss              composition, exposure, the loop's own loss
+    GaussianRasterizationSettings            forward           the first call of every render
+    return of the rasterizer                 loss              composition, exposure, the loop's own loss
     Tensor.backward                          backward
-    density control and its scores           densification     all of it, renders without gradients included
-    the step of any optimizer                optimizer
+    density control and its scores           densification     including renders without gradients
+    step of any optimizer                    optimizer
 
-and after each of the last three `other`. All of it passes through replaced symbols that exist only while something is
-measured, so that a run without `--breakdown` is the run it was.
+`other` begins after each of the last three. Without `--breakdown` none of these symbols is replaced.
 """
 
 from __future__ import annotations
@@ -26,15 +25,19 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
+from lapgs_plugin.runner.rasterizer_wrapper import WrappedRasterizer
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 
 
 class IterationParts:
-    """Marks the parts of iterations for the stage that runs.
+    """Mark the parts of iterations of the running stage.
 
     Args:
-        device: where the checkout renders.
-        measures: whether anything is measured.
+        device: device that the checkout renders on.
+        measures: whether to measure; without it no symbol is replaced.
+
+    Attributes:
+        breakdown: seconds of the running stage by part.
     """
 
     def __init__(self, device: torch.device, measures: bool) -> None:
@@ -42,21 +45,21 @@ class IterationParts:
         self.breakdown = Breakdown()
 
     def stage_begins(self) -> None:
-        """What is marked from now on belongs to another stage."""
+        """Start the measurement of another stage."""
         self.breakdown = breakdown_on(self._device) if self._measures else Breakdown()
 
     def inner_replacements(self, renderer: ModuleType) -> list[Replacement]:
-        """Of what a render looks up; goes before replacements that compose, so that these count as composition."""
+        """Return replacements in `render`; they come before those that compose, whose time then counts as loss."""
         if not self._measures:
             return []
-        whoever = "render(), to tell rendering from composition"
+        consumer = "render(), to tell rendering from composition"
         return [
-            Replacement(renderer, "GaussianRasterizationSettings", self._settings, None, whoever),
-            Replacement(renderer, "GaussianRasterizer", self._rasterizer, None, whoever),
+            Replacement(renderer, "GaussianRasterizationSettings", self._settings, None, consumer),
+            Replacement(renderer, "GaussianRasterizer", self._rasterizer, None, consumer),
         ]
 
     def outer_replacements(self, train: ModuleType, info: BackboneInfo) -> list[Replacement]:
-        """Of what the loop calls; goes after all other replacements, so that they count as what they surround."""
+        """Return replacements in the training loop; they come after all others, whose time they include."""
         if not self._measures:
             return []
         utilities = [module for name, module in sys.modules.items() if name.startswith("utils.")]
@@ -70,7 +73,7 @@ class IterationParts:
 
     @contextmanager
     def watching_optimizers(self) -> Iterator[None]:
-        """While inside, the step of every optimizer is marked, however many a checkout has."""
+        """Mark the steps of all optimizers inside."""
         if not self._measures:
             yield
             return
@@ -92,9 +95,15 @@ class IterationParts:
 
     def _rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(raster_settings: Any) -> Any:
-            return _TimedRasterizer(original(raster_settings=raster_settings), self)
+            return WrappedRasterizer(original(raster_settings=raster_settings), self._render)
 
         return make_rasterizer
+
+    def _render(self, rasterizer: Any, inputs: dict[str, Any]) -> Any:
+        rendered = rasterizer(**inputs)
+        if torch.is_grad_enabled():
+            self.breakdown.mark("loss")
+        return rendered
 
     def _backward(self, original: Callable[..., None]) -> Callable[..., None]:
         def backward(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> None:
@@ -110,19 +119,3 @@ class IterationParts:
                 return original(*args, **kwargs)
 
         return densify
-
-
-class _TimedRasterizer:
-    """A rasterizer of the checkout for one view, after whose call composition begins."""
-
-    def __init__(self, original: Any, parts: IterationParts) -> None:
-        self._original, self._parts = original, parts
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-    def __call__(self, **inputs: Any) -> Any:
-        rendered = self._original(**inputs)
-        if torch.is_grad_enabled():
-            self._parts.breakdown.mark("loss")
-        return rendered

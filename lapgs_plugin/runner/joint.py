@@ -1,9 +1,8 @@
-"""The finished fields, trained along in the last part of a residual stage.
+"""Optimize the finished fields jointly with the residual in the last part of a residual stage.
 
-A finished level cannot learn any more that what it left to the next one is more than that one can express; its
-mistakes on views that nobody photographed stay as well. So towards the end of a stage the finished fields are rendered
-again instead of being read from a cache, and step whenever the residual does. They are small, and rendered at their
-own sizes, but on a GPU that waits for the next launch more than it computes, they double what an iteration takes.
+A frozen coarse level cannot correct errors that the finer level is unable to represent. So towards the end of a stage
+the finished fields are rendered instead of being read from a cache, and step whenever the residual does. Each adds the
+launches of a render of its own to an iteration.
 """
 
 from __future__ import annotations
@@ -15,43 +14,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import GROUPS, TrainingCall
+from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
-from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.run_state import RunContext
-from lapgs_plugin.runner.shim import StageRendering
+from lapgs_plugin.runner.context import FinishedStage, RunContext, TrainingRun
+from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
 from lapgs_plugin.runner.stage_images import StageImages
-from lapgs_plugin.runs.archive import RunArchive
 
 COLORS = ("f_dc", "f_rest")
 
 
-@dataclass(frozen=True)
-class FinishedStage:
-    """A stage whose field is in the archive.
-
-    Attributes:
-        stage: what was trained.
-        call: of the script's `training`, as that stage made it.
-    """
-
-    stage: Stage
-    call: TrainingCall
-
-
 @dataclass
-class _FinishedField:
-    """A finished field on its way again.
+class _JointField:
+    """Hold a finished field that is optimized again.
 
     Attributes:
-        of: where it comes from.
+        of: the stage that it comes from.
         gaussians: the checkout's model of it.
-        rendering: what the shim has to know to render it by itself.
+        rendering: tells the rasterizer's wrapper to render it alone.
         background: (3,) behind it.
         views: level views by key, made when they are first rendered.
     """
@@ -64,43 +47,36 @@ class _FinishedField:
 
 
 class JointLevels:
-    """Takes the place of a stage's cached predictions, and trains what they are made of.
+    """Render the predictions of coarser levels in place of cached ones, and optimize the fields behind them.
 
     Args:
-        context: what the stages share.
+        context, run: the run, whose archive has the coarser fields.
         finished: the coarser stages, coarsest first.
-        archive: holds their fields.
-        images: of the running stage.
-        path: how signed colour is evaluated.
+        images: images of the running stage.
     """
 
     def __init__(
-        self,
-        context: RunContext,
-        finished: Sequence[FinishedStage],
-        archive: RunArchive,
-        images: StageImages,
-        path: ColorPath,
+        self, context: RunContext, run: TrainingRun, finished: Sequence[FinishedStage], images: StageImages
     ) -> None:
-        self._context, self._archive, self._images = context, archive, images
+        self._context, self._run, self._images = context, run, images
         self._pyramid = Pyramid(context.options.grid)
         self._cameras = {images.key(camera): camera for camera in images.cameras}
         views = {id(camera.world_view_transform): key for key, camera in self._cameras.items()}
-        self._fields = [self._unfrozen(one, views, path) for one in finished]
+        self._fields = [self._load(one, views) for one in finished]
 
-    def _unfrozen(self, finished: FinishedStage, views: dict[int, str], path: ColorPath) -> _FinishedField:
+    def _load(self, finished: FinishedStage, views: dict[int, str]) -> _JointField:
         adapter, device, call = self._context.adapter, self._context.device, finished.call
-        gaussians = adapter.model_of(call, self._archive.field(finished.stage.level).to(device))
-        rendering = StageRendering(signed=finished.stage.signed, path=path, views=views, capture=True)
+        gaussians = adapter.model_of(call, self._run.archive.field(finished.stage.level).to(device))
+        rendering = StageRendering(signed=finished.stage.signed, path=self._run.color_path, views=views, capture=True)
         background = torch.full((3,), float(call.dataset.white_background), device=device)
-        return _FinishedField(finished, gaussians, rendering, background)
+        return _JointField(finished, gaussians, rendering, background)
 
     def follow(self, gaussians: Any, residual_color_rate: float) -> None:
-        """Step the finished fields whenever an optimizer of the running stage does, at that one's rates.
+        """Step the finished fields whenever an optimizer of the running stage steps, at its learning rates.
 
         Args:
             gaussians: the running stage's model.
-            residual_color_rate: factor that the rates of its colours have, and those of a base do not.
+            residual_color_rate: factor on its SH learning rates, which a base does not have.
         """
         for leading in self._context.adapter.optimizers(gaussians):
             names = [group["name"] for group in leading.param_groups]
@@ -118,30 +94,30 @@ class JointLevels:
             leading.register_step_post_hook(_Follow(following))
 
     def prefetch(self, key: str) -> None:
-        """Nothing has to be brought from anywhere."""
+        """Do nothing: predictions are rendered."""
 
     def get(self, key: str) -> Tensor:
-        """(3, h, w) Up of what the finished fields make of a view, with gradients where they are recorded."""
+        """Return the upsampled prediction (3, h, w) of a view, differentiable where gradients are recorded."""
         camera = self._cameras[key]
         levels = [(one, one.of.stage.level) for one in self._fields]
         renders = ((level, self._render(one, key, self._images.size(camera, level))) for one, level in levels)
         width, height = self._images.size(camera, levels[-1][1] - 1)
         return upsample(self._pyramid, compose(self._pyramid, renders).image, (height, width))
 
-    def _render(self, one: _FinishedField, key: str, size: tuple[int, int]) -> Tensor:
-        """(3, h, w) of one field alone."""
+    def _render(self, one: _JointField, key: str, size: tuple[int, int]) -> Tensor:
+        """Return the image (3, h, w) of one field alone."""
         if key not in one.views:
             one.views[key] = self._context.adapter.view_at(self._cameras[key], size, one.of.stage.signed, _no_image)
-        return self._context.image(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
+        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
 
     @property
     def fields(self) -> dict[int, GaussianField]:
-        """What the fields are now, by level."""
+        """Copies of the fields by level, on the device."""
         adapter = self._context.adapter
         return {one.of.stage.level: adapter.snapshot(one.gaussians, one.of.stage.signed) for one in self._fields}
 
     def export_fields(self) -> dict[int, GaussianField]:
-        """What the fields have become, by level, as `BackboneAdapter.export_field` gives them, on the CPU."""
+        """Return the fields for the archive by level, on the CPU; see `BackboneAdapter.export_field`."""
         adapter = self._context.adapter
         exported = {}
         for one in self._fields:
@@ -151,7 +127,7 @@ class JointLevels:
 
 
 class _Follow:
-    """Called after a step of the leading optimizer: the same step for those who follow."""
+    """Step another optimizer after each step of the leading one, at its learning rates."""
 
     def __init__(self, following: torch.optim.Optimizer) -> None:
         self._following = following
@@ -164,4 +140,4 @@ class _Follow:
 
 
 def _no_image() -> Tensor:
-    raise AssertionError("a finished field is compared with nothing of its own")
+    raise AssertionError("a finished field has no target of its own")

@@ -1,9 +1,9 @@
-"""What a checkout's own run took: `lapgs run --off --record` watches a script from outside and changes nothing in it.
+"""Measure a checkout's own run for `lapgs run --off --record`, without changing it.
 
-The symbols that the driver of a hierarchy replaces to take its time are wrapped here for the same purpose, so that both
-are timed between the same moments: from the first iteration to the return of `training`, without saving. A call more an
-iteration, of about a microsecond, is all that the script gets. After the script's end its held-out views are rendered
-with its own `render`. Everything goes into one file of the script's output folder.
+Wraps the symbols that the driver of a hierarchy replaces to measure time, so that both are timed between the same
+moments: from the first iteration to the return of `training`, without saving. The script gets one more call an
+iteration. After its end its held-out views are rendered with its own `render`. The measurements go into one file of the
+script's output folder.
 """
 
 from __future__ import annotations
@@ -24,18 +24,20 @@ from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
 
 logger = logging.getLogger(__name__)
 
 TIMELINE_ENTRIES = 200
-"""About how many moments of a run are noted with their number of Gaussians."""
+"""About how many entries the timeline of a run has."""
 
 
 class BareRunRecorder:
-    """Runs a script's main block and notes what it took.
+    """Run a script's main block and measure it.
 
     Args:
-        adapter: of the script's backbone.
+        adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
     """
 
@@ -132,7 +134,7 @@ class BareRunRecorder:
             self._timeline.append({"iteration": iteration, "elapsed": elapsed, "num_gaussians": count})
 
     def _record(self) -> dict[str, Any]:
-        """What the file holds; `imported` and `experiments.rows` read it."""
+        """Return the contents of the file, which `imported` and `experiments.rows` read."""
         gaussians = self._scene.gaussians
         return {
             "iterations": self._iteration,
@@ -148,28 +150,27 @@ class BareRunRecorder:
 
     @torch.no_grad()
     def _held_out(self, gaussians: Any) -> dict[str, float]:
-        """Means of PSNR in dB and SSIM over the held-out views, empty without any."""
+        """Return means of PSNR in dB and SSIM over the held-out views, empty without any."""
         assert self._call is not None, "called after training"
         cameras = list(self._scene.getTestCameras())
         background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
-        images: list[Tensor] = []
-
-        def keeping(original: Callable[..., Any]) -> Callable[..., Any]:
-            return lambda raster_settings: _Keeping(original(raster_settings=raster_settings), images)
-
+        wrapper = RasterizerWrapper()
+        wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
         renderer = sys.modules["gaussian_renderer"]
-        with Attachment([Replacement(renderer, "GaussianRasterizer", keeping, None, "render()")]):
-            return mean_quality(self._rendered(camera, gaussians, background, images) for camera in cameras)
+        with Attachment([Replacement(renderer, "GaussianRasterizer", wrapper.rasterizer, None, "render()")]):
+            return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
 
-    def _rendered(self, camera: Any, gaussians: Any, background: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """A view as its rasterizer, which puts it into `images`, makes it, and its photo; (3, h, w) each."""
+    def _rendered(
+        self, camera: Any, gaussians: Any, background: Tensor, rendering: StageRendering
+    ) -> tuple[Tensor, Tensor]:
+        """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
         assert self._call is not None, "called after training"
         self._adapter.render(self._call, camera, gaussians, background)
-        image = images.pop()
-        return image, camera.original_image.to(image.device)
+        assert rendering.captured is not None, "render() rasterizes"
+        return rendering.captured, camera.original_image.to(rendering.captured.device)
 
     def _image_bytes(self) -> int:
-        """Of the photos that lie on the GPU."""
+        """Return the bytes of photos on the GPU."""
         cameras = [*self._scene.getTrainCameras(), *self._scene.getTestCameras()]
         images = [camera.original_image for camera in cameras]
         return sum(image.numel() * image.element_size() for image in images if image.device.type == "cuda")
@@ -177,18 +178,3 @@ class BareRunRecorder:
     def _synchronize(self) -> None:
         if self._device == "cuda":
             torch.cuda.synchronize()
-
-
-class _Keeping:
-    """A rasterizer of the checkout for one view, whose image is kept."""
-
-    def __init__(self, original: Any, images: list[Tensor]) -> None:
-        self._original, self._images = original, images
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-    def __call__(self, **inputs: Any) -> Any:
-        outputs = self._original(**inputs)
-        self._images.append(outputs[0])
-        return outputs

@@ -1,20 +1,19 @@
-"""Run folders: what a training run leaves behind.
+"""Write and read run folders.
 
     RUN/manifest.json              everything needed to render the run again
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
-    RUN/preview.jpg                what the viewer shows until it can render
-    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   what is made of it later
+    RUN/preview.jpg                an image that the viewer shows until it can render
+    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   results of other commands
 
-Every file but the history is written under a temporary name and renamed, and a level is listed in the manifest only
-after its PLY is on the disk: a run killed at any moment is a run that opens, with the levels that were finished.
+Every file but the history is written under a temporary name and renamed, and the manifest lists a level only after its
+PLY is on the disk. So a run that is killed at any moment still opens, with the levels that were finished.
 
-Finished fields that were trained along with level k are replaced when it is finished, or stay as they were. First they
-are written to point_cloud.with_level_<k>.ply beside their predecessors. From the moment the manifest lists level k they
-are the fields of their levels; then they are renamed, if need be by whoever opens the run for writing next. Those of a
-level that is not listed count for nothing.
+Joint training of level k also changes the finished fields. Their new versions are first written beside the old ones, to
+point_cloud.with_level_<k>.ply. They count from the moment that the manifest lists level k; then they are renamed, by
+the next process that opens the run for writing if this one is killed before. If level k is not listed they are removed.
 """
 
 from __future__ import annotations
@@ -22,19 +21,12 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-import sys
-import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import datetime, timezone
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, BinaryIO, ClassVar, Literal
+from typing import Any
 
-import torch
-from pydantic import AfterValidator, Field, GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveInt
-
-from lapgs_plugin import __version__
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
 from lapgs_plugin.files import (
@@ -45,351 +37,28 @@ from lapgs_plugin.files import (
     FolderLock,
     atomic_write,
     one_line_errors,
-    require_manifest,
 )
-from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Stage
-from lapgs_plugin.runs.overhead import Overhead
-from lapgs_plugin.untrusted import STRICT, STRICT_WITH_MORE, checked, read_json, read_json_lines, shortened, usable_path
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, read_manifest
+from lapgs_plugin.runs.profiling import Overhead
+from lapgs_plugin.runs.results import HistoryEntry, Metrics
+from lapgs_plugin.runs.tensors import read_tensors, write_tensors
+from lapgs_plugin.untrusted import read_json, read_json_lines, shortened
 
 logger = logging.getLogger(__name__)
-
-FORMAT_VERSION = 1
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
-"""Of a finished level's field as it was trained along with a finer one, until it is in its place."""
-
-PathText = Annotated[str, AfterValidator(usable_path)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Name = Annotated[str, Field(max_length=200)]
-
-
-def _peak_and_images(values: dict[str, int]) -> dict[str, int]:
-    """Check bytes of memory: none, or those that `PeakMemory` notes."""
-    if values and values.keys() != {"peak", "images"}:
-        raise ValueError(f"{shortened(sorted(values))} are counted, expected peak and images, or nothing")
-    return values
-
-
-MemoryBytes = Annotated[dict[str, NonNegativeInt], AfterValidator(_peak_and_images)]
-Settings = Annotated[dict[str, Any], GetPydanticSchema(lambda _source, schema: schema(KnownSettings))]
-
-
-class KnownSettings(TypedDict):
-    """What this package itself looks up in a manifest's settings; training programs keep more there.
-
-    `training.settings` checks all of them before it continues a run.
-    """
-
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    iterations: NotRequired[PositiveInt]
-    hierarchy: NotRequired[Literal["nested", "laplacian"]]
-    clamped: NotRequired[bool]
-    raster: NotRequired[dict[str, bool | int | float | None]]
-
-
-class HistoryEntry(TypedDict):
-    """A line of the history, of which all but the first two are there where they were measured."""
-
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    level: NonNegativeInt
-    iteration: NonNegativeInt
-    elapsed: NotRequired[NonNegativeFloat]
-    loss: NotRequired[float]
-    psnr: NotRequired[float]
-    ssim: NotRequired[float]
-    num_gaussians: NotRequired[NonNegativeInt]
-
-
-class MetricsOfView(TypedDict):
-    """One view in `Metrics`; further figures are distances."""
-
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    name: str
-    psnr: float
-    ssim: float
-    lpips_vgg: NotRequired[float]
-    lpips_alex: NotRequired[float]
-    lpips_squeeze: NotRequired[float]
-    lpips_vgg_3dgs: NotRequired[float]
-
-
-class MetricsOfLevel(TypedDict):
-    """One level in `Metrics`."""
-
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    psnr: float
-    upsampled_psnr: float
-    iterations: PositiveInt
-    image_size: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
-    train_seconds: NonNegativeFloat
-    num_gaussians: NonNegativeInt
-    mean_gaussians: NonNegativeFloat | None
-    peak_gaussians: NonNegativeInt
-    breakdown_seconds: dict[str, NonNegativeFloat]
-    memory_bytes: MemoryBytes
-
-
-class Metrics(TypedDict):
-    """What `evaluation.figures.run_figures` measures, as far as it is there."""
-
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    psnr: NotRequired[float]
-    ssim: NotRequired[float]
-    lpips_vgg: NotRequired[float]
-    lpips_alex: NotRequired[float]
-    lpips_squeeze: NotRequired[float]
-    lpips_vgg_3dgs: NotRequired[float]
-    lpips_missing: NotRequired[dict[str, str]]
-    fps: NotRequired[NonNegativeFloat]
-    split: NotRequired[Literal["test", "train"]]
-    num_views: NotRequired[NonNegativeInt]
-    views: NotRequired[list[MetricsOfView]]
-    levels: NotRequired[dict[str, MetricsOfLevel]]
-    train_seconds: NotRequired[NonNegativeFloat]
-    overhead_seconds: NotRequired[dict[str, NonNegativeFloat]]
-    breakdown_seconds: NotRequired[dict[str, NonNegativeFloat]]
-    num_gaussians: NotRequired[dict[str, NonNegativeInt]]
-    weighted_gaussians: NotRequired[NonNegativeFloat]
-    mean_gaussians: NotRequired[NonNegativeFloat | None]
-    peak_gaussians: NotRequired[NonNegativeInt]
-    peak_memory_bytes: NotRequired[NonNegativeInt | None]
-    peak_memory_without_images_bytes: NotRequired[int | None]
-    rasterizer: NotRequired[str]
-    versions: NotRequired[dict[str, str]]
-
-
-class Timeline(TypedDict):
-    """A moment of a `BareRecord`."""
-
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
-    iteration: NonNegativeInt
-    elapsed: NonNegativeFloat
-    num_gaussians: NonNegativeInt
-
-
-class BareRecord(TypedDict):
-    """What `lapgs run --off --record` notes of a script's own run, see `adapters.witness`."""
-
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
-    iterations: PositiveInt
-    train_seconds: NonNegativeFloat
-    saving_seconds: NonNegativeFloat
-    num_gaussians: NonNegativeInt
-    peak_gaussians: NonNegativeInt
-    mean_gaussians: NonNegativeFloat
-    memory_bytes: MemoryBytes
-    psnr: NotRequired[float]
-    ssim: NotRequired[float]
-    timeline: list[Timeline]
-
-
-def read_bare_record(path: Path) -> dict[str, Any]:
-    """What is noted in a `BARE_RECORD`.
-
-    Raises:
-        RunFolderError: it cannot be read, or is damaged.
-    """
-    advice = "record the run again, with `lapgs run --off --record`"
-    return dict(read_json(path, BareRecord, error=RunFolderError, advice=advice))
-
-
-@dataclass(frozen=True)
-class SceneReference:
-    """Which images a run was trained on, and how they were read.
-
-    Attributes:
-        path: the scene folder, absolute.
-        resolution: the resolution setting as the user wrote it, such as "1k" or "1/4".
-        eval: whether every eighth view was held out.
-        background: RGB in [0, 1] behind the base field.
-        kind: "colmap" or "transforms".
-        images: name of the image folder in a COLMAP scene.
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-
-    path: PathText
-    resolution: Name
-    eval: bool
-    background: tuple[Share, Share, Share]
-    kind: Name
-    images: PathText = "images"
-
-
-@dataclass(frozen=True)
-class LevelRecord:
-    """What is known of a finished level.
-
-    Attributes:
-        level: pyramid level, 0 is full resolution.
-        signed: whether its field is a residual.
-        iterations: optimizer steps it was trained for.
-        num_gaussians: Gaussians in its PLY.
-        peak_gaussians: most Gaussians at any moment of its training.
-        train_seconds: iterative optimization alone.
-        overhead_seconds: everything else by name, such as "pyramid", "cache", "inheritance"; "archive" is added when
-            its files have been written.
-        image_size: (width, height) in pixels it was trained at.
-        memory_bytes: on a GPU, "peak" of its memory during training and how much of that were "images".
-        mean_gaussians: Gaussians being optimized, mean over the iterations; None when that was not recorded.
-        breakdown_seconds: of the optimization by part of an iteration (`breakdown.PARTS`); empty when not measured.
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-
-    level: NonNegativeInt
-    signed: bool
-    iterations: PositiveInt
-    num_gaussians: NonNegativeInt
-    peak_gaussians: NonNegativeInt
-    train_seconds: NonNegativeFloat
-    overhead_seconds: dict[str, NonNegativeFloat]
-    image_size: tuple[PositiveInt, PositiveInt]
-    memory_bytes: MemoryBytes = field(default_factory=dict)
-    mean_gaussians: NonNegativeFloat | None = None
-    breakdown_seconds: dict[str, NonNegativeFloat] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:
-        """The record of a stage that one's own loop trained, and of which no more was measured than its time."""
-        n = len(field)
-        return cls(stage.level, stage.signed, stage.iterations, n, n, train_seconds, {}, stage.image_size)
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """Everything needed to render a run again, and what it took to train it.
-
-    Attributes:
-        scene: the images it was trained on.
-        levels: number of levels L of the whole hierarchy, finished or not.
-        grid: pixel grid of the pyramid, "camera" or "even".
-        supervision, inherit: as named on the command line.
-        sh_degree: highest SH degree of the fields.
-        rasterizer: name of the rasterizer it was trained with.
-        seed: what the run's random choices were seeded with.
-        settings: every other setting of the trainer, as JSON.
-        records: the finished levels in training order, coarsest first.
-        created_by: program and version.
-        created: ISO 8601 time in UTC.
-        format_version: of the run folder.
-
-    Raises:
-        UserInputError: there are no levels or too many, or the records are not the first of the levels L-1, ..., 0.
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-
-    scene: SceneReference
-    levels: int
-    grid: Name
-    supervision: Name
-    inherit: Name
-    sh_degree: Annotated[int, Field(ge=0, le=3)]
-    rasterizer: Name
-    seed: NonNegativeInt
-    settings: Settings
-    records: Annotated[tuple[LevelRecord, ...], Field(max_length=MOST_LEVELS)] = ()
-    created_by: Name = f"lapgs_plugin {__version__}"
-    created: Name = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    format_version: int = FORMAT_VERSION
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.levels <= MOST_LEVELS:
-            raise UserInputError(f"levels is {shortened(self.levels)}, expected 1 to {MOST_LEVELS}")
-        finished = [record.level for record in self.records]
-        expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
-        if finished != expected:
-            raise UserInputError(
-                f"finished levels {shortened(finished)}, expected {shortened(expected)} of {self.levels}, coarsest "
-                "first"
-            )
-
-    @classmethod
-    def of_loop(
-        cls,
-        scene: SceneReference,
-        levels: int,
-        rasterizer: str,
-        *,
-        grid: str = "camera",
-        inherit: str = "geometry",
-        sh_degree: int = 3,
-    ) -> Manifest:
-        """The manifest of a run that one's own loop trains, composed images against photographs.
-
-        Such a run is rendered and measured as any other; `lapgs train --resume` does not continue it.
-        """
-        return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings={})
-
-    @property
-    def complete(self) -> bool:
-        """Whether every level is finished."""
-        return len(self.records) == self.levels
-
-    @property
-    def next_level(self) -> int | None:
-        """The level to train next, None when the run is complete."""
-        return None if self.complete else self.levels - 1 - len(self.records)
-
-    def record(self, level: int) -> LevelRecord:
-        """The record of a finished level.
-
-        Raises:
-            RunFolderError: it is not finished.
-        """
-        for record in self.records:
-            if record.level == level:
-                return record
-        if not 0 <= level < self.levels:
-            raise RunFolderError(
-                f"level {level} is not in this run, expected 0 to {self.levels - 1}; choose one of them"
-            )
-        finished = ", ".join(str(record.level) for record in self.records) or "none"
-        raise RunFolderError(
-            f"level {level} is not in this run (finished: {finished} of {self.levels}); "
-            "continue it with its own command and --resume"
-        )
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any], name: str = "the manifest") -> Manifest:
-        """The inverse of `dataclasses.asdict`, also after a round trip through JSON.
-
-        Args:
-            values: by field.
-            name: how messages call where they come from.
-
-        Raises:
-            RunFolderError: something is missing, unknown, of another type or inconsistent; names it.
-        """
-        advice = "restore it or train again with --overwrite"
-        manifest: Manifest = checked(_as_json(values), cls, name, error=RunFolderError, advice=advice)
-        if lacking := sorted({f.name for f in fields(cls)} - values.keys()):
-            raise RunFolderError(f"{name} is damaged: it lacks {', '.join(lacking)}; {advice}")
-        return manifest
-
-
-def _as_json(value: Any) -> Any:
-    """With lists instead of tuples, as JSON has them."""
-    if isinstance(value, dict):
-        return {key: _as_json(inner) for key, inner in value.items()}
-    return [_as_json(inner) for inner in value] if isinstance(value, (list, tuple)) else value
+"""The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 
 
 class RunArchive:
-    """A run folder. One process at a time may write to it; any number may read.
+    """Write and read one run folder. One process at a time may write to it; any number may read.
 
-    Use `create` for a new run, `open` for an existing one, and the archive as a context manager (or `close`) to let go
-    of a folder opened for writing. Methods that write raise RunFolderError when the disk is full or the folder is not
-    writable; what was there before stays as it was.
+    Use `create` for a new run and `open` for an existing one. `close`, or leaving the archive as a context manager,
+    releases a folder opened for writing. Methods that write raise RunFolderError when the disk is full or the folder is
+    not writable, and leave the previous file as it was.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None) -> None:
@@ -400,7 +69,7 @@ class RunArchive:
 
     @classmethod
     def create(cls, path: Path | str, manifest: Manifest, overwrite: bool = False) -> RunArchive:
-        """Start a run in a new or empty folder and hold it for writing.
+        """Start a run in a new or empty folder and lock it for writing.
 
         Args:
             path: the folder; created with its parents.
@@ -409,11 +78,11 @@ class RunArchive:
 
         Raises:
             RunFolderError: there is a run and `overwrite` is not given, the folder holds something else, another
-                process is writing to it, it cannot be written, or the manifest holds what cannot be read again.
+                process is writing to it, it cannot be written, or the manifest has a value that cannot be read again.
         """
         assert not manifest.records, "a new run has no finished level"
         folder = Path(path).absolute()
-        Manifest.from_json(asdict(manifest))  # what could not be read again is refused before it is trained
+        Manifest.from_json(asdict(manifest))  # refuse now what could not be read after training
         cls.require_room(folder, overwrite)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -421,8 +90,8 @@ class RunArchive:
         try:
             cls.require_room(folder, overwrite)  # another process may have started one before the lock was ours
             with one_line_errors(folder):
-                # Should this be interrupted, the folder is first the old run without its checkpoint, which the new one
-                # must never continue from, then an empty run; at no time a manifest without its fields.
+                # If this is interrupted, the folder holds the old run without its checkpoint, which the new run must
+                # never continue from, or an empty run, but never a manifest without its fields.
                 archive.path(CHECKPOINT).unlink(missing_ok=True)
                 archive._write_json(MANIFEST, asdict(manifest), training=True)
                 _remove_results(folder)
@@ -433,10 +102,10 @@ class RunArchive:
 
     @staticmethod
     def require_room(path: Path | str, overwrite: bool = False) -> None:
-        """Check, before anything expensive is done, that `create` would accept the folder. Writes nothing.
+        """Check that `create` would accept the folder, before anything expensive is done. Writes nothing.
 
         Raises:
-            RunFolderError: as `create`, except for what only writing shows.
+            RunFolderError: as `create`, except for problems that only writing shows.
         """
         folder = Path(path).absolute()
         with one_line_errors(folder, "read"):
@@ -460,24 +129,23 @@ class RunArchive:
 
     @classmethod
     def open(cls, path: Path | str, *, resume: bool = False, check: bool = True) -> RunArchive:
-        """Open a run, checking that the fields of its finished levels are there and whole.
+        """Open a run and check that the fields of its finished levels are complete.
 
         Args:
             path: the folder.
-            resume: hold it for writing.
-            check: False leaves fields unlooked at until `field` reads them, for callers to whom a part of a run
-                is of use.
+            resume: lock it for writing.
+            check: False checks a field only when `field` reads it, for callers that can use an incomplete run.
 
         Raises:
-            RunFolderError: there is no run, it was written by another version, a level's PLY is missing or cut short,
-                or, with `resume`, another process is writing to it.
+            RunFolderError: there is no run, another version wrote it, a level's PLY is missing or cut short, or, with
+                `resume`, another process is writing to it.
         """
         folder = Path(path).absolute()
-        manifest = _read_manifest(folder)
+        manifest = read_manifest(folder)
         lock = FolderLock.acquire(folder) if resume else None
         try:
             if resume:
-                manifest = _read_manifest(folder)  # the process that held it may have finished a level meanwhile
+                manifest = read_manifest(folder)  # another process may have finished a level before the lock was ours
                 with one_line_errors(folder):
                     _remove_scratch(folder)
             archive = cls(folder, manifest, lock)
@@ -492,7 +160,7 @@ class RunArchive:
         return archive
 
     def close(self) -> None:
-        """Let go of a folder that was held for writing."""
+        """Release a folder that was locked for writing."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -515,11 +183,11 @@ class RunArchive:
         return tuple(record.level for record in self._manifest.records)
 
     def path(self, *parts: str) -> Path:
-        """The run folder, or something in it."""
+        """Return the path of the run folder, or of something in it."""
         return self._folder.joinpath(*parts)
 
     def field_path(self, level: int) -> Path:
-        """The PLY of a level: the field as it was last trained with a level that is finished."""
+        """Return the PLY of a level: the newest version that a finished level's training wrote."""
         for later in reversed(self.available_levels):
             if _exists(waiting := self._waiting_path(level, later)):
                 return waiting
@@ -532,10 +200,10 @@ class RunArchive:
         return self.path(f"level_{level}", TRAINED_ALONG.format(later))
 
     def field(self, level: int) -> GaussianField:
-        """The field of a finished level, float32 on the CPU.
+        """Read the field of a finished level, float32 on the CPU.
 
         Raises:
-            RunFolderError: the level is not finished, or its PLY is not what the manifest says.
+            RunFolderError: the level is not finished, or its PLY disagrees with the manifest.
         """
         record = self._manifest.record(level)
         self._require_file(record)
@@ -553,18 +221,18 @@ class RunArchive:
         optimizer_state: dict[str, Any] | None = None,
         trained_along: Mapping[int, GaussianField] | None = None,
     ) -> None:
-        """Keep the field of a trained level: its PLY first, then the manifest that lists it, and no checkpoint of it.
+        """Write a trained level: first its PLY, then the manifest that lists it; remove its checkpoint.
 
-        Until the manifest is written, the run is what it was; from then on it has this level and all of
-        `trained_along`, whatever happens.
+        If this is interrupted before the manifest is written, the run is as before; afterwards it has this level and
+        all of `trained_along`.
 
         Args:
             record: of the level `manifest.next_level`; the seconds that writing takes are added to its overhead as
                 "archive".
             field: as trained.
-            optimizer_state: for full inheritance, what `optimizer_state` gives to the next level; kept until that one
-                is finished.
-            trained_along: what finished fields have become meanwhile, by level, each with as many Gaussians as before.
+            optimizer_state: for full inheritance, the state that `optimizer_state` returns to the next level; kept
+                until that one is finished.
+            trained_along: finished fields after joint training, by level, each with as many Gaussians as before.
 
         Raises:
             FieldError: a field holds NaN or inf; nothing is written.
@@ -586,7 +254,7 @@ class RunArchive:
                 path.parent.mkdir(exist_ok=True)
                 field.save_ply(path)
             if optimizer_state is not None:
-                self._write_tensors(path.with_name(OPTIMIZER), optimizer_state)
+                write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
         manifest = replace(self._manifest, records=(*self._manifest.records, record))
         self._write_json(MANIFEST, asdict(manifest), training=True)
@@ -597,7 +265,7 @@ class RunArchive:
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
 
     def _settle_fields(self) -> None:
-        """Put fields that were trained along in their places, and away those whose level was not finished after all."""
+        """Rename jointly trained fields to their final names, and remove those whose level was not finished."""
         for level in range(self._manifest.levels):
             for later in reversed(range(level)):
                 waiting = self._waiting_path(level, later)
@@ -608,7 +276,7 @@ class RunArchive:
                         waiting.replace(self._settled_path(level))
 
     def optimizer_state(self, level: int) -> dict[str, Any]:
-        """The optimizer state that a finished level left for the next one, its tensors on the CPU.
+        """Read the optimizer state that the next level inherits from a finished one, its tensors on the CPU.
 
         Raises:
             RunFolderError: there is none, or it cannot be read.
@@ -616,12 +284,12 @@ class RunArchive:
         path = self.path(f"level_{level}", OPTIMIZER)
         if not _exists(path):
             raise RunFolderError(
-                f"{path} does not exist, and the next level goes on with it; start again with --overwrite"
+                f"{path} does not exist, and the next level continues from it; start again with --overwrite"
             )
-        return _read_tensors(path, "start again with --overwrite")
+        return read_tensors(path, "start again with --overwrite")
 
     def append_history(self, entry: dict[str, Any]) -> None:
-        """Add one entry to the history: JSON with finite numbers, having "level" and "iteration"."""
+        """Append one entry to the history: JSON with finite numbers, with "level" and "iteration"."""
         self._require_lock()
         assert {"level", "iteration"} <= entry.keys(), "a history entry says where in the run it belongs"
         line = json.dumps(entry, allow_nan=False) + "\n"
@@ -630,7 +298,7 @@ class RunArchive:
             stream.write(line)
 
     def history(self) -> list[dict[str, Any]]:
-        """All entries in the order they were added. A last line torn by a crash is left out.
+        """Return all entries in the order they were added. A last line that a crash cut short is left out.
 
         Raises:
             RunFolderError: another line is damaged.
@@ -639,9 +307,9 @@ class RunArchive:
         return read_json_lines(path, HistoryEntry, error=RunFolderError) if _exists(path) else []
 
     def rewind_history(self, level: int, iteration: int) -> None:
-        """Drop the entries after an iteration of a level, which a resumed run will add again.
+        """Remove the entries after an iteration of a level, which a resumed run adds again.
 
-        Training visits level L-1 first, so an entry is later when its level is lower.
+        Training starts with level L-1, so an entry with a lower level is later.
         """
         self._require_lock()
         kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
@@ -651,15 +319,15 @@ class RunArchive:
             stream.write(text.encode())
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Replace the run's metrics: JSON with finite numbers. Needs no hold of the folder."""
+        """Replace the run's metrics: JSON with finite numbers. Needs no lock."""
         self._write_json(METRICS, metrics)
 
     def write_stability(self, figures: dict[str, Any]) -> None:
-        """Replace the run's figures of flicker: JSON with finite numbers. Needs no hold of the folder."""
+        """Replace the run's flicker metrics: JSON with finite numbers. Needs no lock."""
         self._write_json(STABILITY, figures)
 
     def metrics(self) -> dict[str, Any] | None:
-        """The run's metrics, None when they were never measured.
+        """Read the run's metrics; None if they were never measured.
 
         Raises:
             RunFolderError: the file is damaged.
@@ -669,21 +337,21 @@ class RunArchive:
         return dict(read_json(path, Metrics, error=RunFolderError, advice=advice)) if _exists(path) else None
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
-        """Replace the checkpoint of the level in training: tensors, numbers, strings and containers of them."""
+        """Replace the checkpoint of the level in training; `state` as `tensors.write_tensors` takes it."""
         self._require_lock()
-        self._write_tensors(self.path(CHECKPOINT), {"level": self._manifest.next_level, "state": state})
+        write_tensors(self.path(CHECKPOINT), {"level": self._manifest.next_level, "state": state})
 
     def load_checkpoint(self) -> dict[str, Any] | None:
-        """The latest checkpoint of the next level to train, its tensors on the CPU; None when there is none.
+        """Read the checkpoint of the next level to train, its tensors on the CPU; None if there is none.
 
         Raises:
-            RunFolderError: it cannot be read, or is of a level that is neither finished nor the next.
+            RunFolderError: it cannot be read, or its level is neither finished nor the next.
         """
         path = self.path(CHECKPOINT)
         if not _exists(path):
             return None
         advice = "delete it to continue from the last finished level"
-        saved = _read_tensors(path, advice)
+        saved = read_tensors(path, advice)
         level, state = saved.get("level"), saved.get("state")
         if type(level) is not int or not isinstance(state, dict):
             found = f"level {shortened(level)} and a state that is a {type(state).__name__}"
@@ -692,7 +360,7 @@ class RunArchive:
             return state
         if level not in self.available_levels:
             raise RunFolderError(f"{path} is of level {level}, expected {self._manifest.next_level}; {advice}")
-        # A run killed right after a level was finished leaves that level's checkpoint behind.
+        # A run killed right after finishing a level leaves the checkpoint of that level.
         logger.warning("%s is of level %d, which is finished: it is not used", path, level)
         return None
 
@@ -728,16 +396,12 @@ class RunArchive:
         with one_line_errors(self.path(name), training=training), atomic_write(self.path(name)) as stream:
             stream.write(text.encode())
 
-    def _write_tensors(self, path: Path, state: dict[str, Any]) -> None:
-        with one_line_errors(path, training=True), atomic_write(path) as stream:
-            _torch_save(state, stream)
-
     def _require_lock(self) -> None:
         assert self._lock is not None, "open the run with resume=True to write to it"
 
 
 def _require_field_of(record: LevelRecord, field: GaussianField) -> None:
-    """Check that a field is what a record is of, and may be archived.
+    """Check that a field belongs to a record and is finite.
 
     Raises:
         FieldError: it holds NaN or inf.
@@ -749,104 +413,20 @@ def _require_field_of(record: LevelRecord, field: GaussianField) -> None:
         raise FieldError(f"level {record.level}: {error}") from error
 
 
-def _torch_save(state: dict[str, Any], stream: BinaryIO) -> None:
-    """torch.save that lets the OSError of a full disk through; torch replaces it by a RuntimeError."""
-    try:
-        torch.save(state, stream)
-    except RuntimeError as error:
-        if isinstance(error.__context__, OSError):
-            raise error.__context__ from error
-        raise
-
-
 def _exists(path: Path) -> bool:
-    """Whether there is a file, in a folder that may be looked into.
+    """Return whether there is a file.
 
     Raises:
-        RunFolderError: it may not.
+        RunFolderError: its folder cannot be read.
     """
     with one_line_errors(path, "read"):
         return path.exists()
 
 
-def _read_tensors(path: Path, advice: str) -> dict[str, Any]:
-    """What `torch.save` wrote of a dictionary; tensors that are no more than the file holds.
-
-    Raises:
-        RunFolderError: it cannot be read, or would take more memory than it has bytes.
-    """
-    try:
-        _require_stored(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, OSError, ... by damage
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
-    if not isinstance(state, dict):
-        raise RunFolderError(f"{path} holds a {type(state).__name__}, expected a dictionary; {advice}")
-    _require_held(state, path, advice)
-    return state
-
-
-def _require_stored(path: Path) -> None:
-    """Check that a zip file's contents are as long as it says and no longer than the file, as `torch.save` writes them.
-
-    Raises:
-        ValueError: they are packed or overlap, and would unpack to more than the file holds.
-        zipfile.BadZipFile, OSError: it is no zip file, or cannot be read.
-    """
-    with zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-    size, held = path.stat().st_size, sum(entry.file_size for entry in entries)
-    if held > size or any(entry.file_size != entry.compress_size for entry in entries):
-        raise ValueError(f"it unpacks to {held:,} bytes, expected no more than its own {size:,}")
-
-
-def _require_held(state: dict[str, Any], path: Path, advice: str) -> None:
-    """Check that tensors are plain ones on the CPU and together no larger than their file.
-
-    A view can name more elements than there are in memory, which would be allocated as soon as it is copied.
-
-    Raises:
-        RunFolderError: they are not.
-    """
-    waiting: list[Any] = [state]
-    seen: set[int] = set()
-    held, size = 0, path.stat().st_size
-    while waiting:
-        each = waiting.pop()
-        if id(each) in seen:
-            continue
-        seen.add(id(each))
-        if isinstance(each, torch.Tensor):
-            if each.layout != torch.strided or each.device.type != "cpu" or each.is_quantized:
-                raise RunFolderError(f"{path} holds a {each.layout} tensor, expected dense ones; {advice}")
-            held += each.nelement() * each.element_size()
-        elif isinstance(each, dict):
-            waiting.extend(each.values())
-        elif isinstance(each, (list, tuple)):
-            waiting.extend(each)
-    if held > size:
-        raise RunFolderError(f"{path} names tensors of {held:,} bytes, expected at most its own {size:,}; {advice}")
-
-
-def _read_manifest(folder: Path) -> Manifest:
-    require_manifest(folder)
-    path = folder / MANIFEST
-    advice = "restore it or train again with --overwrite"
-    values = read_json(path, dict[str, Any], error=RunFolderError, advice=advice)
-    version = values.get("format_version")
-    if version != FORMAT_VERSION:
-        raise RunFolderError(
-            f"{path} has format_version {shortened(version)}, this version of lapgs reads {FORMAT_VERSION}; "
-            f"use the version that wrote it ({shortened(values.get('created_by', 'unknown'))})"
-        )
-    return Manifest.from_json(values, str(path))
-
-
 def _is_run(folder: Path) -> bool:
-    """Whether the manifest was written by any version of this package; others' manifest.json files are not ours.
+    """Return whether any version of this package wrote the manifest; other programs write a manifest.json, too.
 
-    One that cannot be read any more is ours where it lies beside a history.
+    An unreadable one counts as ours if there is a history beside it.
     """
     with one_line_errors(folder, "read"):
         if not (folder / MANIFEST).is_file():
@@ -859,7 +439,7 @@ def _is_run(folder: Path) -> bool:
 
 
 def _remove_results(folder: Path) -> None:
-    """Remove what a former run left, and nothing that a run does not write."""
+    """Remove the files of a previous run and nothing else."""
     _remove_scratch(folder)
     for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW):
         (folder / name).unlink(missing_ok=True)
@@ -876,7 +456,7 @@ def _remove_results(folder: Path) -> None:
 
 
 def _remove_scratch(folder: Path) -> None:
-    """Remove what a killed run could not: half-written temporaries, cached predictions, a torn line of history."""
+    """Remove what a killed run left: temporary files, cached predictions, an incomplete line of history."""
     for pattern in (TEMPORARY_PATTERN, f"level_*/{TEMPORARY_PATTERN}"):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)

@@ -1,13 +1,13 @@
-"""Images of views, kept where they cost least and handed out on the training device: level targets and predictions.
+"""Store images of views on the GPU, in memory or on the disk, and return them on the training device.
 
-An image is encoded once, by `ImageStore.put`, and decoded on the device by every `get`. Until then only its stored
-bytes move, which for 8-bit photographs is a quarter of what float32 would be:
+`ImageStore.put` encodes an image once, and every `get` decodes it on the device. Until then only its stored bytes are
+copied, a quarter of float32 for 8-bit photographs:
 
     "gpu"     bytes on the device
-    "memory"  bytes in memory; for a GPU page-locked, so that the GPU can copy them while it and the processor work on
-    "disk"    a file an image; a thread of the store reads it into page-locked memory, and from there as above
+    "memory"  bytes in memory; for a GPU page-locked, so that the GPU copies them while it and the processor work
+    "disk"    one file for each image; a thread of the store reads it into page-locked memory, and then as above
 
-`announce` starts that journey early and `get` waits for its end by an event in the GPU's own queue of work.
+`prefetch` starts the copy early, and `get` waits for it by an event in the GPU's own queue of work.
 """
 
 from __future__ import annotations
@@ -37,21 +37,20 @@ from lapgs_plugin.hierarchy.settings import AUTO, PLACES
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "uint8": torch.uint8}
 
 GPU_LIMIT = 1 << 30
-"""Bytes of a stage's images that `place` keeps on a GPU at most, however large it is."""
+"""Most bytes of a stage's images that `place` keeps on a GPU of any size."""
 GPU_SHARE = 0.1
 """The same as a share of the GPU's memory: the rest is for Gaussians and what they need to be trained."""
 
 EIGHT_BIT_TOLERANCE = 1e-6
-"""How far from k/255 a value may be for its image to count as 8-bit: a GPU multiplies by 1/255, an ulp beside k/255."""
+"""Largest distance from k/255 of a value of an 8-bit image: a GPU multiplies by 1/255, which may be an ulp off."""
 AHEAD = 8
-"""Announced images that wait on the device; another one takes the place of the oldest, which may never be fetched."""
+"""Most prefetched images that wait on the device; one more replaces the oldest, which may never be used."""
 LOADERS = 2
-"""Threads that read files: one can read while the copy of the other's image is under way."""
+"""Threads that read files: one can read while the other's image is being copied."""
 
 
 def place(total_bytes: int, device: torch.device | str) -> str:
-    """Where images of that many stored bytes, with all that are needed beside them, cost least: "gpu" while they are a
-    small part of it, or "memory"."""
+    """Return the place for so many bytes of images: "gpu" if they are a small part of its memory, or "memory"."""
     if torch.device(device).type != "cuda":
         return "memory"
     available = torch.cuda.get_device_properties(torch.device(device)).total_memory
@@ -59,24 +58,35 @@ def place(total_bytes: int, device: torch.device | str) -> str:
 
 
 def chosen_precision(precision: str, device: torch.device | str) -> str:
-    """Return a precision that images are stored in: as given, or what "auto" means on the device that looks at them."""
+    """Return the precision to store images in: as given, or the one that "auto" means on the training device."""
     if precision != AUTO:
         return precision
     return "float16" if torch.device(device).type == "cuda" else "float32"
 
 
+def eight_bit_levels(image: Tensor) -> Tensor | None:
+    """Return the uint8 levels k of an image whose values are all k/255; None for any other image.
+
+    Args:
+        image: float32, any shape, finite.
+    """
+    levels = (image * 255).round_()
+    low, high, distance = torch.stack([*levels.aminmax(), (levels / 255).sub_(image).abs_().amax()]).tolist()
+    return levels.to(torch.uint8) if low >= 0 and high <= 255 and distance <= EIGHT_BIT_TOLERANCE else None
+
+
 @dataclass(frozen=True)
 class _Image:
-    """An encoded image: value = stored / divisor + low, or `stored` itself where `divisor` is None.
+    """Hold an encoded image: value = stored / divisor + low, or `stored` itself where `divisor` is None.
 
     Attributes:
         shape: (channels, h, w).
-        divisor: 0-dimensional, on the training device. A tensor, because GPUs replace a division by a number with a
-            multiplication by its reciprocal, which is not what a photograph was decoded with.
+        divisor: 0-dimensional, on the training device. A tensor, because GPUs replace the division by a number with a
+            multiplication by its reciprocal, which gives other values than decoding the photograph did.
         low: value of a stored 0.
         stored: the bytes on the device or in memory; None on disk.
         path: the file; None elsewhere.
-        page_locked: what keeps `stored` page-locked.
+        page_locked: keeps `stored` page-locked.
     """
 
     shape: torch.Size
@@ -89,11 +99,11 @@ class _Image:
 
 @dataclass(frozen=True)
 class _Arrival:
-    """Stored bytes that were brought to the device.
+    """Hold stored bytes that were copied to the device.
 
     Attributes:
         stored: complete once `event` has happened.
-        event: in the store's stream; None where there is nothing to wait for.
+        event: in the store's stream; None if there is nothing to wait for.
     """
 
     stored: Tensor
@@ -101,14 +111,14 @@ class _Arrival:
 
 
 class ImageStore:
-    """Images by name. One thread puts, announces and gets.
+    """Store images by name. Only one thread may use it.
 
     Args:
         where: "gpu", "memory" or "disk".
-        precision: what a value is stored as. "float32" is exact. "uint8" is exact for images of which all values are
-            k/255, and 256 steps over the range of each other image (predictions are not confined to [0, 1]).
-        device: of the tensors handed out, a CPU or CUDA one.
-        folder: for "disk", where to keep the files; made here and removed by `close`.
+        precision: of stored values. "float32" is exact. "uint8" is exact for images whose values are all k/255; the
+            range of any other image, which may exceed [0, 1], is divided into 256 steps.
+        device: of returned tensors, a CPU or CUDA one.
+        folder: for "disk", the folder of the files; made here and removed by `close`.
 
     Raises:
         UserInputError: an unknown place or precision, or "gpu" without one.
@@ -136,7 +146,7 @@ class ImageStore:
 
     @staticmethod
     def check(where: str, precision: str, device: torch.device | str = "cpu") -> None:
-        """Raise what the constructor would about its arguments."""
+        """Raise the errors of the constructor without making a store."""
         places = PLACES if torch.device(device).type == "cuda" else PLACES[1:]
         if where not in places:
             raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
@@ -144,14 +154,14 @@ class ImageStore:
             raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
 
     def put(self, name: str, image: Tensor) -> None:
-        """Keep an image, in place of what was kept under the name before.
+        """Store an image, replacing an earlier one of that name.
 
         Args:
             name: of the view.
             image: (3, h, w) or (1, h, w), any float type and device, not clamped. Copied.
 
         Raises:
-            TrainingDivergedError: it holds NaN or inf, or values beyond float16 where that is the precision.
+            TrainingDivergedError: it holds NaN or inf, or values beyond float16 if that is the precision.
             RunFolderError: the disk is full or the folder not writable.
             UserInputError: there is not enough memory to page-lock.
         """
@@ -161,12 +171,12 @@ class ImageStore:
         self._images[name] = self._keep(name, encoded, low, divisor)
 
     def prefetch(self, name: str) -> None:
-        """Start bringing an image to the device, in the background, where it lies until it is fetched.
+        """Start copying an image to the device in the background, where it waits for `get`.
 
-        At most `AHEAD` images do; `get` has to bring an older one again.
+        At most `AHEAD` images wait; an older one is copied again by `get`.
 
         Raises:
-            KeyError: it was never put.
+            KeyError: there is no such image.
         """
         image = self._images[name]
         if name in self._coming or self._at_hand(image):
@@ -180,21 +190,21 @@ class ImageStore:
             self._coming.pop(next(iter(self._coming))).cancel()
 
     def get(self, name: str) -> Tensor:
-        """An image on the device, float32, for the stream that is current; not to be modified.
+        """Return an image on the device, float32, for the current stream. Do not modify it.
 
-        The processor waits for nothing but a file that is still being read.
+        The processor waits only for a file that is still being read.
 
         Args:
             name: of the view.
 
         Raises:
-            KeyError: it was never put.
+            KeyError: there is no such image.
             RunFolderError: its file cannot be read any more.
         """
         return _decode(self._arrived(name), self._images[name])
 
     def get_batch(self, names: Sequence[str]) -> Tensor:
-        """(b, c, h, w) several images of one size; see `get`. Those that are encoded alike are decoded together."""
+        """Return several images of one size (b, c, h, w), decoded together if they are encoded alike; see `get`."""
         images = [self._images[name] for name in names]
         first = images[0]
         if any(image.low != first.low or image.divisor is not first.divisor for image in images):
@@ -208,7 +218,7 @@ class ImageStore:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """In the order in which they were first put."""
+        """Names of the images in the order in which they were first stored."""
         return tuple(self._images)
 
     def __len__(self) -> int:
@@ -219,12 +229,12 @@ class ImageStore:
 
     @property
     def bytes_on_device(self) -> int:
-        """Bytes on the GPU: images kept there and those announced."""
+        """Bytes on the GPU: images stored there and prefetched ones."""
         return self._bytes_kept("gpu") + (0 if self._stream is None else self._bytes_prefetched())
 
     @property
     def bytes_in_memory(self) -> int:
-        """Bytes in the computer's memory: images kept there, and on a CPU those announced."""
+        """Bytes in the computer's memory: images stored there, and for a CPU prefetched ones."""
         return self._bytes_kept("memory") + (self._bytes_prefetched() if self._stream is None else 0)
 
     @property
@@ -232,10 +242,10 @@ class ImageStore:
         return self._bytes_kept("disk")
 
     def close(self) -> None:
-        """Forget everything and remove the files."""
+        """Drop all images and remove the files."""
         self._loaders.shutdown(wait=True, cancel_futures=True)
         if self._where == "gpu":
-            torch.cuda.synchronize(self._device)  # any stream may still be reading what is given back now
+            torch.cuda.synchronize(self._device)  # any stream may still read the memory that is freed now
         self._coming.clear()
         self._images.clear()
         if self._folder is not None and self._folder.is_dir():
@@ -250,7 +260,7 @@ class ImageStore:
         self.close()
 
     def _arrived(self, name: str) -> Tensor:
-        """The stored bytes of an image on the device, for the stream that is current."""
+        """Return the stored bytes of an image on the device, for the current stream."""
         image = self._images[name]
         if self._at_hand(image):
             assert image.stored is not None
@@ -260,12 +270,12 @@ class ImageStore:
         if arrival.event is not None:
             stream = torch.cuda.current_stream(self._device)
             stream.wait_event(arrival.event)
-            # The tensor belongs to another stream: its memory is not to be given away before this one is done with it.
+            # The tensor belongs to another stream: its memory must not be reused before this one has read it.
             arrival.stored.record_stream(stream)
         return arrival.stored
 
     def _at_hand(self, image: _Image) -> bool:
-        """Whether the stored bytes lie on the device already."""
+        """Return whether the stored bytes are on the device already."""
         return image.stored is not None and (self._where == "gpu" or self._stream is None)
 
     def _bytes_kept(self, where: str) -> int:
@@ -278,17 +288,15 @@ class ImageStore:
         return math.prod(image.shape) * self._dtype.itemsize
 
     def _encode(self, name: str, values: Tensor) -> tuple[Tensor, float, Tensor | None]:
-        """An image as stored, with `low` and `divisor` of `_Image`. Computed where the image is."""
+        """Return an image as stored, with `low` and `divisor` of `_Image`. Computed on the image's device."""
         if self._dtype != torch.uint8:
             encoded = values.to(self._dtype)
             self._finite_range(name, encoded)
             return encoded, 0.0, None
         values = values.to(torch.float32)
         low, high = self._finite_range(name, values)
-        if low > -EIGHT_BIT_TOLERANCE and high < 1 + EIGHT_BIT_TOLERANCE:
-            levels = (values * 255).round_()
-            if float((levels / 255).sub_(values).abs_().amax()) <= EIGHT_BIT_TOLERANCE:
-                return levels.to(torch.uint8), 0.0, self._255
+        if (levels := eight_bit_levels(values)) is not None:
+            return levels, 0.0, self._255
         # A range too small to divide by is stored as its lower end.
         divisor = 255 / (high - low) if high - low > 1e-30 else 0.0
         encoded = (values - low).mul_(divisor).round_().to(torch.uint8)
@@ -304,13 +312,13 @@ class ImageStore:
         return low, high
 
     def _keep(self, name: str, encoded: Tensor, low: float, divisor: Tensor | None) -> _Image:
-        """Copy an encoded image to where it will stay."""
+        """Copy an encoded image to its place."""
         if self._folder is not None:
             return _Image(encoded.shape, divisor, low, path=self._write(name, encoded.cpu()))
         page_locked = None
         if self._where == "gpu":
             stored = torch.empty(encoded.shape, dtype=self._dtype, device=self._device).copy_(encoded)
-            torch.cuda.current_stream(self._device).synchronize()  # from here on any stream may read it
+            torch.cuda.current_stream(self._device).synchronize()  # from now on any stream may read it
         elif self._stream is not None:
             page_locked = _PageLocked(encoded.nbytes, self._device)
             stored = page_locked.view(encoded.shape, self._dtype).copy_(encoded)
@@ -321,19 +329,19 @@ class ImageStore:
     def _write(self, name: str, encoded: Tensor) -> Path:
         assert self._folder is not None
         known = self._images.get(name)
-        # Numbered, because view names may hold slashes or what a file system refuses.
+        # Numbered, because names of views may contain slashes or other characters that a file system refuses.
         path = known.path if known and known.path else self._folder / f"{len(self._images):06d}.bin"
         with one_line_errors(path, training=True):
             self._folder.mkdir(parents=True, exist_ok=True)
             try:
                 path.write_bytes(_buffer(encoded.contiguous()))
             except OSError:
-                path.unlink(missing_ok=True)  # half an image would only keep a full disk full
+                path.unlink(missing_ok=True)  # half an image is useless and keeps a full disk full
                 raise
         return path
 
     def _bring(self, stored: Tensor) -> _Arrival:
-        """Copy page-locked bytes to the GPU beside whatever it is doing."""
+        """Copy page-locked bytes to the GPU while it works."""
         with torch.cuda.stream(self._stream):
             arriving = stored.to(self._device, non_blocking=True)
             event = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
@@ -341,7 +349,7 @@ class ImageStore:
         return _Arrival(arriving, event)
 
     def _read(self, image: _Image) -> _Arrival:
-        """Bring a file to the device; runs in a loader thread."""
+        """Read a file and copy it to the device; runs in a loader thread."""
         assert image.path is not None
         if self._stream is None:
             stored = torch.empty(image.shape, dtype=self._dtype)
@@ -351,11 +359,11 @@ class ImageStore:
         _read_file(image.path, staged)
         arrival = self._bring(staged)
         assert arrival.event is not None
-        arrival.event.synchronize()  # the thread's next image will be read into the same memory
+        arrival.event.synchronize()  # the thread reads its next image into the same memory
         return arrival
 
     def _staged(self, image: _Image) -> Tensor:
-        """Page-locked memory of this loader thread for an image on its way from the disk."""
+        """Return page-locked memory of this loader thread for an image from the disk."""
         page_locked: _PageLocked | None = getattr(self._staging, "page_locked", None)
         if page_locked is None or page_locked.num_bytes < self._num_bytes(image):
             page_locked = self._staging.page_locked = _PageLocked(self._num_bytes(image), self._device)
@@ -363,10 +371,10 @@ class ImageStore:
 
 
 class _PageLocked:
-    """Memory that a GPU can copy from by itself while the processor goes on.
+    """Allocate memory that a GPU can copy from by itself while the processor works.
 
-    Registered with the driver, page by page, instead of taken from torch's allocator of page-locked memory: that one
-    rounds every size up to a power of two (21 MB of image become 34) and never gives anything back.
+    Its pages are registered with the driver. torch's allocator of page-locked memory rounds every size up to a power of
+    two and never frees it.
 
     Raises:
         UserInputError: the driver refuses.
@@ -376,7 +384,7 @@ class _PageLocked:
         self.num_bytes = num_bytes
         page = mmap.PAGESIZE
         room = torch.empty(num_bytes + 2 * page, dtype=torch.uint8)
-        # Whole pages of our own: two registrations must not share one.
+        # Whole pages: two registrations must not share one.
         start, length = -room.data_ptr() % page, -(-num_bytes // page) * page
         self._bytes = room[start : start + num_bytes]
         runtime = torch.cuda.cudart()  # type: ignore[no-untyped-call]
@@ -390,34 +398,33 @@ class _PageLocked:
                 "keep them on the disk or at a lower precision"
             )
         release = weakref.finalize(self, _release, room, address, device, runtime.cudaHostUnregister)
-        release.atexit = False  # the end of the process releases it, and the driver may be gone by then
+        release.atexit = False  # the process releases it at its end, when the driver may be gone
 
     def view(self, shape: torch.Size, dtype: torch.dtype) -> Tensor:
-        """Its beginning as a tensor, which does not keep it page-locked."""
+        """Return its beginning as a tensor, which does not keep it page-locked."""
         return self._bytes[: math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
 
 
 def _release(room: Tensor, address: int, device: torch.device, unregister: Callable[[int], SupportsInt]) -> None:
-    """Let go of page-locked memory; `room` is an argument so that it outlives its registration."""
-    with contextlib.suppress(RuntimeError):  # a GPU that failed copies nothing any more
-        torch.cuda.synchronize(device)  # a copy may be under way
+    """Release page-locked memory; `room` is an argument so that it outlives its registration."""
+    with contextlib.suppress(RuntimeError):  # a GPU that failed copies nothing
+        torch.cuda.synchronize(device)  # a copy may be in progress
     if int(unregister(address)) != 0:
         _forget_refusal(device)
 
 
 def _forget_refusal(device: torch.device) -> None:
-    """Let the CUDA runtime forget that it refused a call of this thread.
+    """Clear the CUDA runtime's last error, a call of this thread that it refused.
 
-    It remembers until it is asked, and PyTorch asks after each of its launches: one that has nothing to do with it
-    would raise. PyTorch has no binding to ask by, and a second copy of the runtime would not know, so a launch of
-    nothing asks.
+    The error stays until it is read. PyTorch reads it after each launch, so an unrelated launch would raise. PyTorch
+    cannot just read it, and a second copy of the runtime has an error of its own; so a small launch reads it here.
     """
     with contextlib.suppress(RuntimeError):
         torch.ones((), device=device)
 
 
 def _buffer(tensor: Tensor) -> memoryview:
-    """The bytes of a contiguous CPU tensor, to read from or write into."""
+    """Return the bytes of a contiguous CPU tensor, to read or write."""
     return tensor.view(-1).view(torch.uint8).numpy().data
 
 
@@ -428,7 +435,7 @@ def _read_file(path: Path, stored: Tensor) -> None:
 
 
 def _decode(stored: Tensor, image: _Image) -> Tensor:
-    """A float32 image from its stored bytes, in the current stream."""
+    """Return a float32 image from its stored bytes, in the current stream."""
     if image.divisor is None:
         return stored.float()
     values = torch.div(stored, image.divisor)  # float32

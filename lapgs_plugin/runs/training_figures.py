@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lapgs_plugin.runs.archive import LevelRecord
+from lapgs_plugin.runs.manifest import LevelRecord
 
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
 
     Keys:
         train_seconds: seconds of optimization over all stages; overhead_seconds: all other seconds, by name.
-        breakdown_seconds: seconds of the optimization by part (`breakdown.PARTS`); empty unless all levels have them.
+        breakdown_seconds: seconds of the optimization by part (`profiling.PARTS`); empty unless all levels have them.
         num_gaussians: by level, Gaussians of the fields that the image is rendered from; of nested levels the last.
         peak_gaussians: the most that were optimized at a time.
         weighted_gaussians: mean of the levels' Gaussians, weighted by iterations, as in the paper's plot of time.

@@ -1,7 +1,6 @@
-"""Images of views that wait at half their size and are raised when somebody looks at them.
+"""Store images of views at half their size and upsample them when they are used.
 
-What a residual stage builds on is Up of an image of a quarter of its pixels. That one is what is kept, and what travels
-to the device.
+A residual stage needs Up of an image that has a quarter of its pixels; only that one is stored and copied.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from lapgs_plugin.runs.image_store import ImageStore
 
 
 class UpsampledImages:
-    """Up of images by name.
+    """Return Up of stored images by name.
 
     Attributes:
-        store: keeps the images as they are before Up; where and how precisely is its affair.
+        store: of the images before Up.
         pyramid: Up between two levels.
     """
 
@@ -29,34 +28,34 @@ class UpsampledImages:
         self._sizes: dict[str, tuple[int, int]] = {}
 
     def put(self, name: str, image: Tensor, size: tuple[int, int]) -> None:
-        """Keep an image, in place of what was kept under the name before.
+        """Store an image, replacing an earlier one of that name.
 
         Args:
             name: of the view.
             image: (c, ceil(h / 2), ceil(w / 2)), as `ImageStore.put` takes it.
-            size: (h, w) of what `get` will give, height first.
+            size: (h, w) of the image that `get` returns, height first.
 
         Raises:
-            UserInputError: the image is not half of `size`; and whatever `ImageStore.put` raises.
+            UserInputError: the image is not half of `size`; and all that `ImageStore.put` raises.
         """
         require_half(image, size)
         self.store.put(name, image)
         self._sizes[name] = size
 
     def prefetch(self, name: str) -> None:
-        """Start bringing what a view's image is made of to the device; see `ImageStore.prefetch`."""
+        """Start copying a view's stored image to the device; see `ImageStore.prefetch`."""
         self.store.prefetch(name)
 
     @torch.no_grad()
     def get(self, name: str) -> Tensor:
-        """(c, h, w) Up of an image on the device, float32, made anew by every call; see `ImageStore.get`."""
+        """Return Up of an image (c, h, w) on the device, float32, a new tensor in every call; see `ImageStore.get`."""
         return upsample(self.pyramid, self.store.get(name), self._sizes[name])
 
     def close(self) -> None:
-        """Forget everything and remove the files."""
+        """Drop all images and remove the files."""
         self.store.close()
 
     @torch.no_grad()
     def get_batch(self, names: Sequence[str]) -> Tensor:
-        """(b, c, h, w) Up of several images of one size, in as many launches as for one; see `get`."""
+        """Return Up of several images of one size (b, c, h, w), in as many launches as for one; see `get`."""
         return upsample(self.pyramid, self.store.get_batch(names), self._sizes[names[0]])

@@ -1,4 +1,4 @@
-"""Which rasterizer trains, and where: gsplat on a GPU, ours on a CPU."""
+"""Choose the rasterizer and the device of a run: gsplat on a GPU, our own on a CPU."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from lapgs_plugin.training.settings import TrainSettings
 
 
 def choose_rasterizer(name: str) -> str:
-    """What `--rasterizer auto` is on this machine; any other name as it is.
+    """Return the rasterizer that `--rasterizer auto` means on this machine; any other name is returned unchanged.
 
-    With a GPU it is gsplat or an error: nobody is to find out hours later that it stood idle. An empty
-    CUDA_VISIBLE_DEVICES, or -1, says that there is none.
+    With a GPU it is gsplat or an error, so that a run does not leave the GPU idle unnoticed. An empty
+    CUDA_VISIBLE_DEVICES, or -1, hides the GPU.
 
     Raises:
         MissingExtraError: there is a GPU, and PyTorch or gsplat cannot use it.
@@ -44,7 +44,7 @@ def choose_rasterizer(name: str) -> str:
 
 
 def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
-    """The rasterizer of that name for a run with these settings, and the device that it trains on.
+    """Return the rasterizer of that name for a run with these settings, and its device.
 
     Raises:
         UserInputError: an unknown name, or settings that it does not honour.
@@ -54,13 +54,13 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         rasterizer = gsplat.GsplatRasterizer(
             antialiasing=settings.antialiased,
             packed=settings.packed,
-            absgrad=settings.densification.absgrad or settings.densification.strategy == "multiview",
+            absgrad=settings.densification.options.needs_absgrad,
             own_radii=True,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
     made = make_rasterizer(name)
     asked = {
-        "--strategy mcmc": settings.densification.strategy == "mcmc",
+        f"--strategy {settings.densification.strategy}": settings.densification.options.needs_gsplat,
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,

@@ -1,4 +1,4 @@
-"""Check what a stage is continued from: a checkpoint's state, and the optimizer state that the coarser level left."""
+"""Check a checkpoint's state, and the optimizer state of a coarser level, before training continues from them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ else:  # pydantic cannot read the older TypedDict of `typing`
 
 ADVICE = "delete it to continue from the last finished level"
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
-"""Adam's state of a parameter, once it has made a step."""
+"""Adam's state of a parameter after its first step."""
 _STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 
 Moments = dict[str, dict[str, Tensor]]
 
 
 class ProgressState(TypedDict):
-    """`stage.StageProgress`; the loss is NaN before the first iteration."""
+    """State of a `stage.StageProgress`; the loss is NaN before the first iteration."""
 
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     iteration: NonNegativeInt
@@ -44,7 +44,7 @@ class ProgressState(TypedDict):
 
 
 class ModelState(TypedDict):
-    """What `model.TrainableField.state` gives."""
+    """Result of `model.TrainableField.state`."""
 
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     params: dict[str, Tensor]
@@ -54,7 +54,7 @@ class ModelState(TypedDict):
 
 
 class StageState(TypedDict):
-    """What `stage.StageRun.state` gives, and the overhead so far."""
+    """Result of `stage.StageRun.state`, and the overhead so far."""
 
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     level: NonNegativeInt
@@ -71,14 +71,14 @@ class StageState(TypedDict):
 def check_checkpoint(
     state: dict[str, Any], path: Path, stage: Stage, settings: TrainSettings, finished: Collection[int]
 ) -> None:
-    """Check that a stage can be continued from a checkpoint, before anything is made of it.
+    """Check that a stage can continue from a checkpoint.
 
     Args:
-        state: what the checkpoint holds.
+        state: of the checkpoint.
         path: of its file, for the message.
-        stage: that is to be continued.
+        stage: to continue.
         settings: of the run.
-        finished: levels of the run that are.
+        finished: levels of the run.
 
     Raises:
         RunFolderError: it is damaged, or of another stage.
@@ -93,16 +93,16 @@ def check_checkpoint(
 
 
 def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: int, path: Path) -> None:
-    """Check what density control remembers, against what it begins with.
+    """Check the state of density control against the state that it starts with.
 
     Args:
         state: from a checkpoint.
         fresh: of the same strategy before its first iteration.
-        count: Gaussians of the field.
+        count: number of Gaussians in the field.
         path: of the checkpoint, for the message.
 
     Raises:
-        RunFolderError: it is of another strategy or field.
+        RunFolderError: it belongs to another strategy or field.
     """
     sums = {name for name, first in fresh.items() if first is None}
     right = state.keys() == fresh.keys() and len({state[name] is None for name in sums}) <= 1
@@ -122,10 +122,10 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
 
 
 def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
-    """Check the optimizer state that a finished level left, against its field.
+    """Check the optimizer state of a finished level against its field.
 
     Raises:
-        RunFolderError: it is damaged, or of another field.
+        RunFolderError: it is damaged, or belongs to another field.
     """
     try:
         _MOMENTS.validate_python(moments)
@@ -137,7 +137,7 @@ def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
 
 
 def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
-    """Compare the parts of a state with each other and with the run; raises ValueError."""
+    """Check the parts of a state against each other and the run; raises ValueError."""
     iteration, joint_from = state["progress"]["iteration"], settings.joint_from(stage)
     if state["level"] != stage.level:
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
@@ -152,7 +152,7 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         _check_model(model, f"joint.{level}", model["signed"], settings.sh_degree)
     random = state["random"]
     if random.dtype != torch.uint8 or random.shape != torch.get_rng_state().shape:
-        raise ValueError(f"random is {_what(random)}, expected a state of PyTorch's generator")
+        raise ValueError(f"random is {_described(random)}, expected a state of PyTorch's generator")
     try:
         torch.Generator().set_state(random)
     except RuntimeError as error:
@@ -160,7 +160,7 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
 
 
 def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int) -> None:
-    """Check a field and what its optimizer has of it."""
+    """Check a field with its gradients and Adam's state of it."""
     params = model["params"]
     field = field_from_splats(params, model["signed"])
     shapes = _shapes(field)
@@ -172,7 +172,9 @@ def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int)
     for kind in ("params", "gradients"):
         for each, tensor in model.get(kind, {}).items():
             if each not in params or not _is_finite(tensor, shapes.get(each), torch.float32):
-                raise ValueError(f"{name}.{kind}.{each} is {_what(tensor)}, expected finite float32 {shapes.get(each)}")
+                raise ValueError(
+                    f"{name}.{kind}.{each} is {_described(tensor)}, expected finite float32 {shapes.get(each)}"
+                )
     try:
         _check_moments(model["moments"], {each: shapes[each] for each in params})
     except ValueError as error:
@@ -180,7 +182,7 @@ def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int)
 
 
 def _check_moments(moments: Moments, shapes: Mapping[str, torch.Size]) -> None:
-    """Check Adam's state against the parameters that it is of; SH may be one tensor or two."""
+    """Check Adam's state against the shapes of the parameters; SH may be one tensor or two."""
     others = set(SPLAT_NAMES)
     if moments.keys() not in ({*others, "sh"}, {*others, "sh0", "shN"}) or not moments.keys() <= shapes.keys():
         raise ValueError(f"Adam's state is of {', '.join(sorted(map(str, moments)))}, expected {', '.join(shapes)}")
@@ -190,17 +192,17 @@ def _check_moments(moments: Moments, shapes: Mapping[str, torch.Size]) -> None:
         for key, tensor in state.items():
             shape = torch.Size([]) if key == "step" else shapes[name]
             if not _is_finite(tensor, shape, torch.float32) or (key != "exp_avg" and bool((tensor < 0).any())):
-                raise ValueError(f"{name}.{key} is {_what(tensor)}, expected finite float32 {tuple(shape)}")
+                raise ValueError(f"{name}.{key} is {_described(tensor)}, expected finite float32 {tuple(shape)}")
 
 
 def _shapes(field: GaussianField) -> dict[str, torch.Size]:
-    """Of each parameter, by gsplat's names of it."""
+    """Return the shape of each parameter by gsplat's names."""
     values = {theirs: field.parameters[ours].shape for theirs, ours in SPLAT_NAMES.items()}
     return {**values, "sh": field.sh.shape, "sh0": field.sh[:, :1].shape, "shN": field.sh[:, 1:].shape}
 
 
 def _is_finite(value: Any, shape: torch.Size | None, dtype: torch.dtype) -> bool:
-    """Whether it is a tensor of that shape and type without NaN and inf."""
+    """Return whether it is a tensor of that shape and type without NaN and inf."""
     return (
         isinstance(value, Tensor)
         and value.shape == shape
@@ -209,8 +211,8 @@ def _is_finite(value: Any, shape: torch.Size | None, dtype: torch.dtype) -> bool
     )
 
 
-def _what(value: Tensor) -> str:
-    """A tensor for a message."""
+def _described(value: Tensor) -> str:
+    """Return type and shape of a tensor for a message."""
     return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
 
 

@@ -1,10 +1,9 @@
-"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC. A third is `multiview`'s."""
+"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
@@ -14,35 +13,38 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.ops.self_check import matches_reference
+from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.settings import Densification, StageSchedule
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.strategies import Default, Mcmc
 
 if TYPE_CHECKING:
     from lapgs_plugin.training.multiview import ViewScores
 
 MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
-"""Of a base field that starts from points: a tenth of the size and half opaque, as MCMC's authors start it."""
+"""Factor on the sizes, and opacity, of a base field that starts from points: as MCMC's authors start it."""
 MCMC_REGULARIZATION = 0.01
 """Weight of the mean opacity and of the mean standard deviation in the loss."""
 
 
-class DensityControl(Protocol):
-    """What edits a field in training.
+class DensityControl:
+    """Edit the field of one stage between iterations. Every method but `after_step` may be left as it is.
 
     Attributes:
-        state: what it remembers between iterations, for checkpoints.
+        state: statistics it keeps between iterations, for checkpoints: tensors, numbers, or None where there are no
+            sums over Gaussians, (n,), yet.
     """
 
-    state: dict[str, Any]
+    def __init__(self) -> None:
+        self.state: dict[str, Any] = {}
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Whether `after_step` of that iteration wants to know more of a render than its image."""
-        ...
+        """Return whether `after_step` of that iteration needs more of a render than its image."""
+        return False
 
-    def scored_at(self, iteration: int) -> bool:
-        """Whether `after_step` of that iteration wants the scores of several views."""
-        ...
+    def score_threshold(self, iteration: int) -> float | None:
+        """Return the threshold of `multiview.view_scores` if `after_step` of that iteration needs these scores."""
+        return None
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of a render that is not the last one of a step.
@@ -51,7 +53,6 @@ class DensityControl(Protocol):
             result: after `backward()` by the sum of its views' losses; of several views, with a leading dimension.
             camera: it was rendered from, or any of those cameras.
         """
-        ...
 
     def after_step(
         self,
@@ -64,57 +65,44 @@ class DensityControl(Protocol):
         """Accumulate the statistics of a step's last render and edit the field when the schedule says so.
 
         Args:
-            model: edited in place; its parameters are new tensors afterwards when something changed.
+            model: edited in place; its parameters are new tensors afterwards if something changed.
             iteration: of the step's last view, from 1 within the stage.
-            result, camera: as `accumulate` takes them; the result may be None where `needs_statistics` says so.
-            scores: of the field before the edit; None except where `scored_at` says so.
+            result, camera: as `accumulate` takes them; the result may be None where `needs_statistics` is false.
+            scores: of the field before the edit; None where `score_threshold` is None.
 
         Returns:
             Whether Gaussians were added, removed or reset.
         """
-        ...
+        raise NotImplementedError
 
     def regularization(self, field: GaussianField) -> Tensor | None:
-        """A term of the loss, or None."""
-        ...
+        """Return a term of the loss, or None."""
+        return None
 
 
-def density_control(schedule: StageSchedule, settings: Densification, extent: float) -> DensityControl:
-    """The strategy that the settings name; arguments as `Densifier` takes them."""
-    from lapgs_plugin.training.multiview import MultiviewDensifier
-
-    kinds: dict[str, type[Densifier] | type[McmcDensifier]] = {"mcmc": McmcDensifier, "multiview": MultiviewDensifier}
-    return kinds.get(settings.strategy, Densifier)(schedule, settings, extent)
-
-
-class Densifier:
-    """Density control of one stage: feeds a rasterizer's statistics to gsplat's `DefaultStrategy`.
+class Densifier(DensityControl):
+    """Feed a rasterizer's statistics to gsplat's `DefaultStrategy`.
 
     Args:
         schedule: when the stage densifies and resets.
-        settings: thresholds.
-        extent: scene extent in world units, which decides what is cloned and what is split.
+        options: thresholds.
+        extent: scene extent in world units, which decides between cloning and splitting.
     """
 
-    def __init__(self, schedule: StageSchedule, settings: Densification, extent: float) -> None:
+    def __init__(self, schedule: StageSchedule, options: Default, extent: float) -> None:
         self._schedule = schedule
         self._strategy = DefaultStrategy(
-            grow_grad2d=settings.grow_grad2d,
+            grow_grad2d=options.grow_grad2d,
             refine_start_iter=schedule.densify_start,
             refine_stop_iter=schedule.densify_until,
             refine_every=schedule.densify_every,
             reset_every=schedule.reset_every,
-            absgrad=settings.absgrad,
+            absgrad=options.absgrad,
         )
-        self.state: dict[str, Any] = self._strategy.initialize_state(scene_scale=extent)
+        self.state = self._strategy.initialize_state(scene_scale=extent)
 
     def needs_statistics(self, iteration: int) -> bool:
-        """See `DensityControl`."""
         return iteration < self._schedule.densify_until
-
-    def scored_at(self, iteration: int) -> bool:
-        """See `DensityControl`."""
-        return False
 
     def after_step(
         self,
@@ -124,23 +112,22 @@ class Densifier:
         camera: Camera,
         scores: ViewScores | None = None,
     ) -> bool:
-        """See `DensityControl`."""
         if not self.needs_statistics(iteration):
             return False
-        assert result is not None, "looked at in this iteration"
-        if refines(self._schedule, iteration):
+        assert result is not None, "needed in this iteration"
+        refined, reset = self._schedule.refines(iteration), iteration % self._schedule.reset_every == 0
+        if refined:
             info = self._info(result, camera)
             self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
         else:
             self.accumulate(result, camera)
-        reset = iteration % self._schedule.reset_every == 0
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
-            reset_opa(model.params, model.optimizers, self.state, value=self._strategy.prune_opa * 2.0)
-        return reset or refines(self._schedule, iteration)
+            self._lower_opacities(model, self._strategy.prune_opa * 2.0)
+        return refined or reset
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
-        """A render as gsplat's strategies look at it."""
+        """Return a render as gsplat's strategies expect it."""
         n = result.means2d.shape[-2]
         means2d: Any = result.means2d.detach().view(-1, n, 2)  # (b, n, 2)
         means2d.grad = means2d.absgrad = self._gradient(result).view(-1, n, 2)
@@ -149,110 +136,51 @@ class Densifier:
             "radii": result.radii.view(-1, n, 1).expand(-1, -1, 2),  # (b, n, 2)
             "width": camera.width,
             "height": camera.height,
-            "n_cameras": 1,  # what gsplat multiplies by, for the mean of the views' losses; ours is their sum
+            "n_cameras": 1,  # gsplat multiplies by it, for the mean of the views' losses; ours is their sum
             "gaussian_ids": None,
         }
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add what gsplat's strategy adds between two refinements; see `DensityControl`.
 
-        For all Gaussians: gsplat selects visible ones, and to learn how many there are the processor waits for a GPU.
+        It covers all Gaussians: gsplat selects visible ones, and the processor waits for a GPU to learn their number.
         """
         gradient = self._gradient(result)  # (n, 2) or (b, n, 2)
         if self.state["grad2d"] is None:
             self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
         size = camera.width, camera.height
-        add_up(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
+        add_statistics(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
 
     def _gradient(self, result: RenderResult) -> Tensor:
-        """(n, 2) or (b, n, 2), by the centres on the image, absolute where so asked."""
+        """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
         gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
         assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
         return gradient
 
-    def regularization(self, field: GaussianField) -> Tensor | None:
-        """None: nothing is added to the loss."""
-        return None
+    def _lower_opacities(self, model: TrainableField, highest: float) -> None:
+        reset_opa(model.params, model.optimizers, self.state, value=highest)
 
 
-def add_up(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
-    """Add the norms of gradients by centres, in normalised device coordinates, and 1 where a Gaussian is shown.
-
-    Args:
-        gradient: (n, 2) in loss per pixel; of several views (b, n, 2).
-        radii: (n,) or (b, n), 0 where it is not shown.
-        size: (width, height) of the image.
-        norms, counts: (n,) what is added to.
-    """
-    if gradient.device.type == "cuda" and statistics_in_triton():
-        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
-
-        add_statistics(gradient, radii, size, norms, counts)
-    else:
-        _add_statistics(gradient, radii, size, norms, counts)
-
-
-def _add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
-    """`densification_triton.add_statistics` in PyTorch's operations."""
-    scaled = gradient.clone().view(-1, len(norms), 2)
-    scaled[..., 0] *= size[0] / 2.0
-    scaled[..., 1] *= size[1] / 2.0
-    for of_view, shown in zip(scaled, (radii > 0).view(-1, len(norms)), strict=True):
-        norms += torch.where(shown, of_view.norm(dim=-1), 0.0)
-        counts += shown
-
-
-@lru_cache(maxsize=1)
-def statistics_in_triton() -> bool:
-    """Whether our kernel sums up what PyTorch's operations do."""
-
-    def difference() -> float:
-        from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics
-
-        gradient = torch.linspace(-1, 1, 1200, device="cuda").view(2, 300, 2)
-        radii = torch.arange(600, dtype=torch.int32, device="cuda").view(2, 300) % 7
-        sums = [torch.ones(2, 300, device="cuda") for _ in range(2)]
-        for add, both in zip((add_statistics, _add_statistics), sums, strict=True):
-            add(gradient, radii, (8, 6), both[0], both[1])
-        return float((sums[0] - sums[1]).abs().max())
-
-    return matches_reference(
-        "statistics of densification in several operations instead of one kernel", difference, 1e-5
-    )
-
-
-class McmcDensifier:
-    """Density control of one stage by gsplat's `MCMCStrategy` (Kheradmand et al. 2024), which runs on a GPU only.
+class McmcDensifier(DensityControl):
+    """Let gsplat's `MCMCStrategy` (Kheradmand et al. 2024) edit the field, which runs on a GPU only.
 
     Gaussians that have become transparent are moved to opaque ones, 5 % are added at a time up to `cap_max`, and
     positions get noise in every iteration. Opacities are never reset.
 
     Args:
         schedule: when the stage adds and moves.
-        settings: the limit.
-        extent: not looked at.
+        options: the limit.
     """
 
-    def __init__(self, schedule: StageSchedule, settings: Densification, extent: float) -> None:
+    def __init__(self, schedule: StageSchedule, options: Mcmc) -> None:
         self._schedule = schedule
         self._strategy = MCMCStrategy(
-            cap_max=settings.cap_max,
+            cap_max=options.cap_max,
             refine_start_iter=schedule.densify_start,
             refine_stop_iter=schedule.densify_until,
             refine_every=schedule.densify_every,
         )
-        self.state: dict[str, Any] = self._strategy.initialize_state()
-
-    def needs_statistics(self, iteration: int) -> bool:
-        """Never: it goes by opacities."""
-        return False
-
-    def scored_at(self, iteration: int) -> bool:
-        """See `DensityControl`."""
-        return False
-
-    def accumulate(self, result: RenderResult, camera: Camera) -> None:
-        """Nothing: it looks at no render."""
+        self.state = self._strategy.initialize_state()
 
     def after_step(
         self,
@@ -262,26 +190,21 @@ class McmcDensifier:
         camera: Camera,
         scores: ViewScores | None = None,
     ) -> bool:
-        """See `DensityControl`."""
-        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step that was taken, scaled for its views
+        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
-        return iteration < self._schedule.densify_until and refines(self._schedule, iteration)
+        return iteration < self._schedule.densify_until and self._schedule.refines(iteration)
 
     def regularization(self, field: GaussianField) -> Tensor | None:
-        """What drives Gaussians that are not needed towards transparent and small."""
+        """Return a term that makes unneeded Gaussians transparent and small."""
         opacity, deviation = torch.sigmoid(field.opacity_logits).mean(), torch.exp(field.log_scales).mean()
         return MCMC_REGULARIZATION * (opacity + deviation)
 
 
 def mcmc_start(field: GaussianField) -> GaussianField:
-    """A field from points as MCMC's authors start it."""
+    """Return a field from points with the sizes and opacities that MCMC's authors start with."""
     return field.with_parameters(
         {
             "log_scales": field.log_scales + math.log(MCMC_SCALE),
             "opacity_logits": torch.full_like(field.opacity_logits, math.log(MCMC_OPACITY / (1 - MCMC_OPACITY))),
         }
     )
-
-
-def refines(schedule: StageSchedule, iteration: int) -> bool:
-    return iteration > schedule.densify_start and iteration % schedule.densify_every == 0

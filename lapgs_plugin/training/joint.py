@@ -1,7 +1,7 @@
-"""The finished fields, trained along in the last part of a residual stage.
+"""Train finished fields jointly with the residual, in the last part of its stage.
 
-What `adapters.joint` does in a checkout's loop, in ours: predictions are rendered anew instead of being read from a
-cache, and the fields that they are made of step with the residual.
+Their predictions are rendered in every iteration instead of being read from a cache, and the fields step with the
+residual. `runner.joint` does the same in a checkout's loop.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lapgs_plugin.training.model import TrainableField
 
 @dataclass
 class JointFields:
-    """Finished fields under training.
+    """Train finished fields.
 
     Attributes:
         models: by level, coarsest first.
@@ -76,7 +76,7 @@ class JointFields:
         return self._level_cameras[name, level]
 
     def step(self, means_rate: float, sh_rest_factor: float = 1.0, scale: StepScale = ONE_VIEW) -> None:
-        """One Adam step on every field, after backward passes through what `predict` gave.
+        """Make one Adam step on every field, after backward passes through results of `predict`.
 
         Args:
             means_rate: step size of the positions for one view, in world units.
@@ -88,9 +88,9 @@ class JointFields:
 
     @property
     def fields(self) -> dict[int, GaussianField]:
-        """What the fields have become, by level, without gradients."""
+        """The current fields by level, without gradients."""
         return {level: model.field.detach() for level, model in self.models.items()}
 
     def state(self) -> dict[int, dict[str, Any]]:
-        """Of every model, for checkpoints: what `TrainableField.from_state` takes, by level."""
+        """Return the state of every model by level, for checkpoints; `TrainableField.from_state` takes one."""
         return {level: model.state() for level, model in self.models.items()}

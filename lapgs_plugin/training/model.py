@@ -1,4 +1,4 @@
-"""The field under training: named parameters with one optimizer each, as densification strategies edit them."""
+"""Optimize a field: named parameters with one optimizer each, as densification strategies edit them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats, splats_from_field
-from lapgs_plugin.ops.adam import ADAM_EPS, ONE_VIEW, GpuFieldAdam, StepScale, adam_in_triton, step_together
+from lapgs_plugin.ops.adam import (
+    ADAM_EPS,
+    ONE_VIEW,
+    GpuFieldAdam,
+    StepScale,
+    step_together,
+    triton_works,
+)
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.training.settings import LearningRates
 
@@ -20,15 +27,15 @@ SH_REST_SCALE = 1 / 20
 
 @dataclass
 class TrainableField:
-    """A field being optimized. `params` and `optimizers` are edited in place by densification.
+    """Optimize a field. Densification edits `params` and `optimizers` in place.
 
     Attributes:
-        params: by the name that gsplat's strategies know it by, each (n, ...) with gradients. SH are one tensor, "sh",
-            where our own Adam steps, which knows a rate for columns. Where PyTorch's or gsplat's does, which have one
-            for a tensor, they are two, "sh0" and "shN".
+        params: by gsplat's names, each (n, ...) with gradients. With our own Adam, which has a rate for each column, SH
+            are one tensor, "sh". With PyTorch's or gsplat's, which has one rate for a tensor, they are two, "sh0" and
+            "shN".
         optimizers: one Adam for each of them.
         signed: whether the field is a residual.
-        sparse: whether a step moves those Gaussians alone that have a gradient.
+        sparse: whether a step moves only Gaussians that have a gradient.
         sh_rest_rate: step size of SH above degree 0 before a step's factor.
     """
 
@@ -45,13 +52,13 @@ class TrainableField:
         """Start optimizing `field`, where it is, with empty Adam moments.
 
         Args:
-            field: what to start from; copied.
+            field: to start from; copied.
             rates: step sizes.
             extent: of the scene, in world units; scales the steps of positions.
             sparse: with gsplat's `SelectiveAdam`, on a GPU.
         """
         on_gpu = field.means.device.type != "cpu"
-        if sparse or (on_gpu and not adam_in_triton()):
+        if sparse or (on_gpu and not triton_works()):
             return cls._in_two(field, rates, extent, sparse)
         names = {**SPLAT_NAMES, "sh": "sh"}
         params = {
@@ -82,7 +89,7 @@ class TrainableField:
 
     @property
     def field(self) -> GaussianField:
-        """The current parameters, sharing their memory and gradients."""
+        """The current parameters; memory and gradients are shared."""
         return field_from_splats(self.params, self.signed)
 
     def step(
@@ -92,7 +99,7 @@ class TrainableField:
         sh_rest_factor: float = 1.0,
         scale: StepScale = ONE_VIEW,
     ) -> None:
-        """One Adam step on every parameter, then clear the gradients.
+        """Make one Adam step on every parameter, then clear the gradients.
 
         Args:
             means_rate: step size of the positions for one view, already scaled by the extent. The positions' optimizer
@@ -112,10 +119,10 @@ class TrainableField:
             if name != "means":
                 optimizer.param_groups[0]["lr"] = rate
         for param in self.params.values():
-            param.grad = None  # what an optimizer's own `zero_grad` does in several times the time
+            param.grad = None  # faster than the optimizers' own `zero_grad`
 
     def _step_scaled(self, active_coefficients: int | None, scale: StepScale) -> None:
-        """`step` with step sizes as the optimizers have them."""
+        """Make a `step` with the optimizers' present step sizes."""
         if isinstance(self.optimizers.get("sh"), FieldAdam):
             every = self.params["sh"].shape[1]
             self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
@@ -140,7 +147,7 @@ class TrainableField:
                 optimizer.step()
 
     def _scale_rest_of_sh(self, factor: float) -> None:
-        """Let SH above degree 0 learn at their own rate times `factor`."""
+        """Set the step size of SH above degree 0 to its rate times `factor`."""
         if "shN" in self.optimizers:
             self.optimizers["shN"].param_groups[0]["lr"] = self.sh_rest_rate * factor
             return
@@ -152,19 +159,19 @@ class TrainableField:
 
     @property
     def _touched(self) -> Tensor:
-        """(n,) which Gaussians the views since the last step had anything to say about."""
+        """(n,) whether each Gaussian has got a gradient since the last step."""
         gradient = self.params["opacities"].grad
         assert gradient is not None, "no backward pass since the last step"
         return gradient != 0
 
     def optimizer_moments(self) -> dict[str, dict[str, Tensor]]:
-        """Adam's state of every parameter, by strategy name: step and both moments."""
+        """Return Adam's state of every parameter by its name: step and both moments."""
         return {name: dict(opt.state[self.params[name]]) for name, opt in self.optimizers.items()}
 
     def adopt_moments(self, moments: dict[str, dict[str, Tensor]], kept: Tensor) -> None:
         """Continue with the Adam moments of rows `kept` (m,) of an earlier field: full inheritance.
 
-        They may be of a field whose SH were one tensor where these are two, or the reverse.
+        Their SH may be one tensor where this field has two, or the reverse.
         """
         moments = _moments_of("sh" in self.optimizers, moments)
         for name, optimizer in self.optimizers.items():
@@ -175,7 +182,7 @@ class TrainableField:
             }
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to go on later, as plain tensors."""
+        """Return everything needed to continue later, as plain tensors."""
         return {
             "params": {name: param.detach() for name, param in self.params.items()},
             "moments": self.optimizer_moments(),
@@ -193,17 +200,17 @@ class TrainableField:
         device: torch.device | str = "cpu",
         sparse: bool = False,
     ) -> TrainableField:
-        """Go on from what `state` gave; `rates`, `extent` and `sparse` as `create` takes them."""
+        """Continue from a result of `state`; `rates`, `extent` and `sparse` as `create` takes them."""
         field = field_from_splats(state["params"], state["signed"]).to(device)
         model = cls.create(field, rates, extent, sparse=sparse)
         model.adopt_moments(state["moments"], torch.arange(len(field)))
-        for name, gradient in state.get("gradients", {}).items():  # of views whose step has not come yet
+        for name, gradient in state.get("gradients", {}).items():  # of views since the last step
             model.params[name].grad = gradient.to(device)
         return model
 
 
 def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[str, float]:
-    """Step sizes by the name of the parameter."""
+    """Return step sizes by the name of the parameter."""
     return {
         "means": rates.means_first * extent,
         "quats": rates.quats,
@@ -241,7 +248,7 @@ def _cpu_adam(param: torch.nn.Parameter, rate: float, rest_scale: float) -> Fiel
 
 
 def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
-    """An Adam that updates a tensor on a GPU in one kernel."""
+    """Return an Adam that updates a tensor on a GPU in one kernel."""
     if not sparse:
         return torch.optim.Adam([param], lr=rate, eps=ADAM_EPS, fused=True)
     from gsplat.optimizers import SelectiveAdam
@@ -253,10 +260,10 @@ def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
 
 @torch.no_grad()
 def fused_steps(optimizers: Sequence[torch.optim.Adam], views: int = 1) -> None:
-    """One step of each, with the bits of its own `step`, in an eighth of the time that the processor takes for those.
+    """Make one step of each optimizer with the bits of its own `step`, in less processor time.
 
     Args:
-        optimizers: as `gpu_adam` makes them: fused, of one tensor each.
+        optimizers: of `gpu_adam`: fused, with one tensor each.
         views: of a `StepScale`.
     """
     started = []
@@ -274,7 +281,7 @@ def fused_steps(optimizers: Sequence[torch.optim.Adam], views: int = 1) -> None:
         torch._foreach_add_([state["step"] for _, _, state in started], views)
     for group, param, state in started:
         beta1, beta2 = (beta**views for beta in group["betas"])
-        # The kernel takes these betas to the power of the count: of views, where it is to be one of steps.
+        # The kernel raises these betas to the power of the count, which has to be one of steps instead of views.
         count = state["step"] if views == 1 else state["step"] / views
         torch._fused_adam_(
             [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [count],

@@ -1,4 +1,4 @@
-"""What a run tells the person who waits for it."""
+"""Show the progress of a run."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from lapgs_plugin.hierarchy.plan import Stage
 
 @dataclass(frozen=True)
 class Tick:
-    """The state of training at one moment.
+    """Hold the state of training at one moment.
 
     Attributes:
-        level, iteration: where in the run; the iteration counts from 1 within the stage.
+        level, iteration: the iteration counts from 1 within the stage of the level.
         elapsed: optimization seconds since the start of the run, over all stages.
         loss: smoothed photometric loss.
         num_gaussians: Gaussians being optimized.
         rate: iterations a second since the last tick.
-        psnr: held-out PSNR in dB of the composed image at full resolution, when it was measured.
+        psnr: held-out PSNR in dB of the composed image at full resolution; None if it was not measured now.
     """
 
     level: int
@@ -35,20 +35,20 @@ class Tick:
 
 
 class Monitor:
-    """Receives a run's progress; every method is a no-op to override."""
+    """Receive a run's progress. Every method is a no-op to override."""
 
     def stage_started(self, stage: Stage, first_iteration: int) -> None:
-        """Training of `stage` begins, at iteration `first_iteration` when it was resumed."""
+        """Receive a stage whose training begins, or is resumed, at an iteration."""
 
     def tick(self, stage: Stage, tick: Tick) -> None:
-        """Some iterations later."""
+        """Receive the state after some more iterations."""
 
     def say(self, text: str) -> None:
-        """Something worth a line."""
+        """Receive one line of text."""
 
 
 class ProgressMonitor(Monitor):
-    """A progress bar a stage: rate, time left, loss, Gaussians and held-out PSNR. Use as a context manager."""
+    """Show a progress bar for each stage: rate, time left, loss, Gaussians, held-out PSNR. Use as a context manager."""
 
     def __init__(self, console: Console, levels: int) -> None:
         self._levels = levels
@@ -87,7 +87,7 @@ class ProgressMonitor(Monitor):
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         assert self._task is not None
-        self._psnr = tick.psnr if tick.psnr is not None else self._psnr  # measured rarely: the last one stays in sight
+        self._psnr = tick.psnr if tick.psnr is not None else self._psnr  # measured rarely: the last one stays visible
         held_out = "" if self._psnr is None else f" {self._psnr:.2f} dB"
         figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
         self._progress.update(self._task, completed=tick.iteration, figures=figures)

@@ -1,8 +1,7 @@
-"""Scores from several views, which say where a Gaussian more or less would help: the idea of FastGS (Ren et al. 2025).
+"""Densify by scores from several views: the idea of FastGS (Ren et al. 2025).
 
-A gradient says that a Gaussian wants to move, in whatever view was last looked at. Whether the image is wrong there is
-another question: some training views are rendered, their badly shown pixels are marked, and each Gaussian is asked how
-many of these it makes up.
+A gradient says that a Gaussian should move, but not whether the image is wrong there. For scores, some training views
+are rendered, and for each Gaussian the pixels with large errors are counted that it makes up.
 """
 
 from __future__ import annotations
@@ -12,32 +11,33 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from gsplat.strategy.ops import duplicate, remove, reset_opa, split
+from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.inheritance import SH_C0
-from lapgs_plugin.training.densification import Densifier, add_up, refines
+from lapgs_plugin.ops.densification_statistics import add_statistics
+from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.settings import Densification, StageSchedule
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.strategies import Multiview
 
 SCORED_VIEWS = 10
 """Views that are rendered for scores."""
 HIGHEST_OPACITY = 0.8
-"""What opacities are taken back to at each refinement: nothing behind an opaque Gaussian gets a gradient."""
+"""Opacities are lowered to this at each refinement: nothing behind an opaque Gaussian gets a gradient."""
 LATE_OPACITY, LATE_BLAME = 0.1, 0.9
-"""Once densification has ended what is fainter than the first goes, and what has more than the second share of the
-largest blame."""
+"""After densification, Gaussians with a lower opacity or a larger blame are removed."""
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """What some views say about each Gaussian.
+    """Hold each Gaussian's part in the errors of some views.
 
     Attributes:
-        pixels: (n,) badly shown pixels that it makes up, its weights alpha T summed, in the mean over the views.
-        blame: (n,) the same, each view weighted with its loss, and all stretched to lie from 0 to 1.
+        pixels: (n,) pixels with large errors that it makes up: its weights alpha T there summed, mean over views.
+        blame: (n,) the same with each view weighted by its loss, scaled to the range from 0 to 1.
     """
 
     pixels: Tensor
@@ -46,13 +46,13 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class ScoredView:
-    """A view that is asked.
+    """Hold one view for `view_scores`.
 
     Attributes:
-        grey: (3, h, w) of the field with every colour zero and unclamped, differentiable by its coefficients.
-        prediction: (3, h, w) what training compares with the target, without gradients.
+        grey: (3, h, w) image of the field with all colours zero and unclamped, differentiable by its SH coefficients.
+        prediction: (3, h, w) the image that training compares with the target, without gradients.
         target: (3, h, w).
-        loss: of the two, a scalar.
+        loss: scalar, of prediction and target.
     """
 
     grey: Tensor
@@ -61,27 +61,27 @@ class ScoredView:
     loss: Tensor
 
 
-def badly_shown(prediction: Tensor, target: Tensor, threshold: float) -> Tensor:
-    """(h, w) where the mean difference of the channels is above a share of the way from the least to the largest."""
+def large_errors(prediction: Tensor, target: Tensor, threshold: float) -> Tensor:
+    """Return where (h, w) the error, a mean over channels, is above a share of its range in the image."""
     error = (prediction - target).abs().mean(0)
     least, largest = error.aminmax()
     return error - least > threshold * (largest - least)
 
 
 def view_scores(views: Iterable[ScoredView], coefficients: Tensor, threshold: float) -> ViewScores:
-    """Ask some views, one backward pass each.
+    """Score Gaussians by some views, with one backward pass for each.
 
     Args:
-        views: at least one, rendered one after the other.
-        coefficients: (n, 1, 3) of the constant harmonic, zeros with gradients, that each `grey` was rendered from.
-        threshold: see `badly_shown`.
+        views: at least one; an iterator may render one after the other.
+        coefficients: (n, 1, 3) of SH degree 0, zeros with gradients, that each `grey` was rendered from.
+        threshold: see `large_errors`.
     """
     pixels = torch.zeros_like(coefficients[:, 0, 0], requires_grad=False)
     blame, count = torch.zeros_like(pixels), 0
     for view in views:
-        bad = badly_shown(view.prediction, view.target, threshold)
-        # A weight is the derivative of a pixel by the Gaussian's colour.
-        (by_coefficients,) = torch.autograd.grad((view.grey[0] * bad).sum(), coefficients)
+        wrong = large_errors(view.prediction, view.target, threshold)
+        # The weight of a Gaussian in a pixel is the derivative of that pixel by the Gaussian's colour.
+        (by_coefficients,) = torch.autograd.grad((view.grey[0] * wrong).sum(), coefficients)
         made_up = by_coefficients[:, 0, 0] / SH_C0
         pixels += made_up
         blame += view.loss * made_up
@@ -91,23 +91,22 @@ def view_scores(views: Iterable[ScoredView], coefficients: Tensor, threshold: fl
 
 
 class MultiviewDensifier(Densifier):
-    """Density control of one stage by gradients and by scores of several views; arguments as `Densifier` takes them.
+    """Densify by gradients where several views have large errors; arguments as `Densifier` takes them.
 
-    Cloned are small Gaussians by their gradient, split large ones by their absolute gradient, both only where enough
-    badly shown pixels are theirs. After densification those go, a few times, that are faint or do most harm.
+    Small Gaussians are cloned by their gradient and large ones split by their absolute gradient, both only where they
+    make up enough pixels with large errors. After densification, faint and most harmful Gaussians are removed a few
+    times.
     """
 
-    def __init__(self, schedule: StageSchedule, settings: Densification, extent: float) -> None:
-        super().__init__(schedule, settings, extent)
-        self._settings = settings
-        self._late = schedule.late_prunes
+    def __init__(self, schedule: StageSchedule, options: Multiview, extent: float) -> None:
+        super().__init__(schedule, options, extent)
+        self._options = options
         self.state |= {"absgrad2d": None, "shown": None}
 
-    def scored_at(self, iteration: int) -> bool:
-        """See `DensityControl`."""
-        if iteration in self._late:
-            return True
-        return iteration < self._schedule.densify_until and refines(self._schedule, iteration)
+    def score_threshold(self, iteration: int) -> float | None:
+        late = iteration in self._schedule.late_prunes
+        refines = iteration < self._schedule.densify_until and self._schedule.refines(iteration)
+        return self._options.error_threshold if late or refines else None
 
     def after_step(
         self,
@@ -117,40 +116,39 @@ class MultiviewDensifier(Densifier):
         camera: Camera,
         scores: ViewScores | None = None,
     ) -> bool:
-        """See `DensityControl`."""
-        if iteration in self._late:
-            assert scores is not None, "asked for in this iteration"
+        if iteration in self._schedule.late_prunes:
+            assert scores is not None, "needed in this iteration"
             self._remove(model, (_opacities(model) < LATE_OPACITY) | (scores.blame > LATE_BLAME))
             return True
         if not self.needs_statistics(iteration):
             return False
-        assert result is not None, "looked at in this iteration"
+        assert result is not None, "needed in this iteration"
         self.accumulate(result, camera)
-        refined, reset = refines(self._schedule, iteration), iteration % self._schedule.reset_every == 0
+        refined, reset = self._schedule.refines(iteration), iteration % self._schedule.reset_every == 0
         if refined:
-            assert scores is not None, "asked for in this iteration"
+            assert scores is not None, "needed in this iteration"
             self._refine(model, iteration, scores)
         if reset:
             self._lower_opacities(model, self._strategy.prune_opa * 2.0)
         return refined or reset
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
-        """See `DensityControl`; absolute gradients, too."""
+        """Add the statistics of absolute gradients, too; see `DensityControl`."""
         super().accumulate(result, camera)
         assert result.absgrad2d is not None, "a rasterizer without absolute gradients"
         if self.state["absgrad2d"] is None:
             self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
         size = camera.width, camera.height
-        add_up(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
+        add_statistics(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
 
     @torch.no_grad()
     def _refine(self, model: TrainableField, iteration: int, scores: ViewScores) -> None:
         state, extent = self.state, self.state["scene_scale"]
         times = state["count"].clamp_min(1)
-        wanted = scores.pixels > self._settings.error_pixels
+        wanted = scores.pixels > self._options.error_pixels
         small = _sizes(model) <= self._strategy.grow_scale3d * extent
-        clones = wanted & small & (state["grad2d"] / times > self._settings.grow_grad2d)
-        splits = wanted & ~small & (state["absgrad2d"] / times > self._settings.split_absgrad2d)
+        clones = wanted & small & (state["grad2d"] / times > self._options.grow_grad2d)
+        splits = wanted & ~small & (state["absgrad2d"] / times > self._options.split_absgrad2d)
         edited: dict[str, Any] = {"params": model.params, "optimizers": model.optimizers, "state": state}
         count = int(clones.sum())
         if count:
@@ -171,15 +169,12 @@ class MultiviewDensifier(Densifier):
         if gone.any():
             remove(model.params, model.optimizers, self.state, gone)
 
-    def _lower_opacities(self, model: TrainableField, highest: float) -> None:
-        reset_opa(model.params, model.optimizers, self.state, value=highest)
-
 
 def _sizes(model: TrainableField) -> Tensor:
-    """(n,) the largest standard deviation of each Gaussian."""
+    """Return (n,) the largest standard deviation of each Gaussian."""
     return torch.exp(model.params["scales"].detach()).amax(-1)
 
 
 def _opacities(model: TrainableField) -> Tensor:
-    """(n,)"""
+    """Return (n,) opacities."""
     return torch.sigmoid(model.params["opacities"].detach())

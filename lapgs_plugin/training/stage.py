@@ -22,27 +22,29 @@ from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
 from lapgs_plugin.runs.image_store import AHEAD
+from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
-from lapgs_plugin.training.settings import PIXELS_OF_A_LAUNCH, StageSchedule, TrainSettings
-from lapgs_plugin.training.views import LevelImages, LevelView, view_index
+from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
+from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.views import LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
-"""Iterations between two looks at all parameters for NaN; the loss is looked at in every iteration."""
+"""Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
 LOSSES_READ_EVERY = 50
-"""The same for the loss on a GPU: every look waits until the GPU has caught up with the processor."""
+"""Losses that are read together on a GPU: each reading waits until the GPU has caught up with the processor."""
 LOSS_SMOOTHING = 0.95
-"""Weight of the past in the loss that is shown and logged: single views differ too much to read a trend."""
+"""Weight of earlier losses in the loss that is shown and logged: single views differ too much to show a trend."""
 
 
 @dataclass
 class StageProgress:
-    """What changes while a stage runs, besides the field: enough to go on with it later.
+    """Hold what a stage changes besides the field, for checkpoints.
 
     Attributes:
         iteration: the last finished one, from 1 within the stage; 0 before the first.
@@ -50,7 +52,7 @@ class StageProgress:
         loss: smoothed loss, NaN before the first iteration.
         peak_gaussians: most Gaussians optimized at once in this stage.
         gaussian_steps: Gaussians optimized, summed over the iterations.
-        most_views: what the GPU's memory has turned out to hold of views in one launch; None while it has held all.
+        most_views: views in one launch that fit into the GPU's memory; None as long as all have.
     """
 
     iteration: int = 0
@@ -63,15 +65,15 @@ class StageProgress:
 
 @dataclass(frozen=True)
 class _Launch:
-    """Views of a step that were rendered together, after their backward pass.
+    """Hold what is left of some views that were rendered together, after their backward pass.
 
     Attributes:
-        result: of the render but for its image, where density control looks at it.
+        result: of the render without its image; None if density control does not need it.
         camera: of the last view.
         loss: mean of the views' losses.
         iteration: of the last view.
-        views: how many there are.
-        gaussians: how many were optimized.
+        views: their number.
+        gaussians: number that is optimized.
     """
 
     result: RenderResult | None
@@ -84,25 +86,25 @@ class _Launch:
 
 @dataclass
 class StageRun:
-    """A stage being trained.
+    """Train one stage.
 
     Attributes:
-        stage, schedule, settings: what is to be done.
+        stage, schedule, settings: of the stage and the run.
         views: the training views at the stage's level.
-        images: what they are compared with.
+        images: their targets.
         accumulated: Up of the previous level's prediction by view name; None for the base.
         background: (3,) behind the base; residuals are rendered over zero.
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        joint_from: the iteration from which the finished fields are trained too; None when they never are.
-        unfreeze: makes these fields trainable, from their state in a checkpoint or, given None, from the archive.
-        joint: those fields while they are being trained; None before.
-        breakdown: told which part of an iteration begins.
-        say: takes a line for the user.
-        step_views: how many views the last step took.
+        joint_from: the iteration from which finished fields are trained jointly; None if they never are.
+        unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
+        joint: finished fields while they are trained jointly; None before.
+        breakdown: measures the parts of iterations.
+        say: shows a line to the user.
+        step_views: number of views of the last step.
 
-    The field, the images and the background are on one device, where the stage is trained.
+    The field, the images and the background are on the training device.
     """
 
     stage: Stage
@@ -125,10 +127,10 @@ class StageRun:
     say: Callable[[str], None] = print
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
-    _context: StageContext | None = None  # of the last view that was rendered
+    _context: StageContext | None = None  # of the last rendered view
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
-        """Train from where `progress` stands to the end of the stage. An iteration is a view; steps may take several.
+        """Train to the end of the stage, from the iteration in `progress`. An iteration is a view, a step one or more.
 
         Args:
             after_iteration: called after every step, outside the timed region; may raise to stop the run.
@@ -149,7 +151,7 @@ class StageRun:
             after_iteration(self)
 
     def settle(self) -> None:
-        """Wait for a GPU to finish the iterations so far, on the stage's clock, and read their losses.
+        """Wait for a GPU to finish its iterations, as part of the training time, and read their losses.
 
         Raises:
             TrainingDivergedError: one is NaN or infinite.
@@ -166,12 +168,12 @@ class StageRun:
             self._note_loss(loss, iteration, views)
 
     def passed(self, every: int) -> bool:
-        """Whether the last step took the stage to or past a multiple of so many iterations, or to its end."""
+        """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
         return self.progress.iteration % every < self.step_views or self.progress.iteration == self.stage.iterations
 
     @property
     def num_optimized(self) -> int:
-        """Gaussians under training: the stage's own, and those of finished fields that are trained along."""
+        """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
         along = () if self.joint is None else self.joint.models.values()
         return len(self.model) + sum(len(model) for model in along)
 
@@ -181,26 +183,26 @@ class StageRun:
 
     @property
     def _losses_at_once(self) -> int:
-        """How many losses wait to be read."""
+        """Number of losses that are read together."""
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
     @cached_property
     def _batching(self) -> BatchRasterizer | None:
-        """What renders several views at once; None where nothing does. Asking a protocol in each step takes long."""
+        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow."""
         return self.rasterizer if isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch else None
 
     def _next(self, done: int) -> range:
-        """The iterations of the step that comes after `done` ones."""
+        """Return the iterations of the step after `done` ones."""
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))
 
     def _launches(self, iterations: range) -> list[list[int]]:
-        """The iterations of a step by what is rendered together: one size, one degree of SH, no more than fit."""
+        """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
         if self._batching is None or len(iterations) == 1:
             return [[iteration] for iteration in iterations]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for iteration in iterations:
             camera, degree = self._view(iteration).camera, self.schedule.active_sh_degree(iteration)
-            key = (self._trains_along(iteration), camera.width, camera.height, degree)
+            key = (self._is_joint(iteration), camera.width, camera.height, degree)
             alike.setdefault(key, []).append(iteration)
         launches = []
         for (_, width, height, _), group in alike.items():
@@ -211,7 +213,7 @@ class StageRun:
         return launches
 
     def _step(self, iterations: range) -> None:
-        """Render, compare and go back through all views of a step, and let the optimizers step once for them."""
+        """Render all views of a step, propagate their losses back, and step the optimizers once."""
         launches = self._run_launches(iterations)
         last = iterations[-1]
         for launch in launches:
@@ -236,7 +238,7 @@ class StageRun:
             self._require_finite(last)
 
     def _run_launches(self, iterations: range) -> list[_Launch]:
-        """All launches of a step, smaller ones from its beginning where the GPU's memory does not hold them."""
+        """Run all launches of a step. If the GPU's memory is too small, start the step again with smaller launches."""
         while True:
             planned = self._launches(iterations)
             following = self._launches(self._next(iterations[-1]))[:1] if iterations[-1] < self.stage.iterations else []
@@ -251,7 +253,7 @@ class StageRun:
                 if self._losses_at_once > 1:
                     self._unread += [(launch.loss, launch.iteration, launch.views) for launch in done]
                 return done
-            # Out here, where the error holds nothing of what was rendered any more.
+            # Outside of `except`, because the error keeps the tensors of the render alive.
             self._forget_gradients()
             self.progress.most_views = most // 2
             self.say(
@@ -267,14 +269,14 @@ class StageRun:
                 param.grad = None
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
-        """Render some of a step's views and go back through their losses; `then` are the iterations after these."""
+        """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
         last = iterations[-1]
-        if self._trains_along(last) and self.joint is None:
-            assert self.unfreeze is not None, "a stage that trains finished fields can have them"
+        if self._is_joint(last) and self.joint is None:
+            assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
             self.joint = self.unfreeze(None)
         views = [self._view(iteration) for iteration in iterations]
         contexts = self._contexts(iterations, [view.name for view in views])
-        self._announce(then)
+        self._prefetch(then)
         for context in contexts:
             self.hooks.before_render(context)
         self.breakdown.mark("forward")
@@ -288,12 +290,12 @@ class StageRun:
         ]
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         kept = loss.detach()
-        if self._losses_at_once == 1:  # on a CPU read at once, before a loss that is not finite does harm
+        if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
             self._note_loss(kept.item(), last, len(views))
         regularization = self.densifier.regularization(gaussians)
         self.breakdown.mark("backward")
         total = loss if regularization is None else loss + regularization
-        # The sum of the views' losses: of one, this is what `backward` does without it.
+        # The gradient of the sum of the views' losses; for one view, the default of `backward`.
         total.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
         self._context = contexts[-1]
@@ -302,7 +304,7 @@ class StageRun:
         return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
 
     def _contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
-        """What hooks are told: a context a view, or one for all where every hook takes all at once."""
+        """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
         several = len(names) > 1
         target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
         context = StageContext(
@@ -334,28 +336,28 @@ class StageRun:
     def _render(
         self, gaussians: GaussianField, cameras: Sequence[Camera], iteration: int
     ) -> tuple[Tensor, RenderResult | None]:
-        """The image, or images of several cameras, and what else is known of the render where somebody looks at it."""
-        looks, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
+        """Return the image, or images of several cameras, and the whole result if density control needs it."""
+        needed, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
         if len(cameras) > 1:
             assert self._batching is not None
             result = self._batching.render_batch(
-                gaussians, cameras, background=self.background, sh_degree=degree, describes=looks
+                gaussians, cameras, background=self.background, sh_degree=degree, describes=needed
             )
-            return result.image, result if looks else None
-        if looks:
+            return result.image, result if needed else None
+        if needed:
             result = self.rasterizer(gaussians, cameras[0], background=self.background, sh_degree=degree)
             return result.image, result
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
-    def _trains_along(self, iteration: int) -> bool:
-        """Whether finished fields are trained along in an iteration."""
+    def _is_joint(self, iteration: int) -> bool:
+        """Return whether finished fields are trained jointly in an iteration."""
         return self.joint_from is not None and iteration >= self.joint_from
 
     def _view(self, iteration: int) -> LevelView:
         return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
 
     def _prediction(self, names: Sequence[str]) -> Tensor | None:
-        """What the finished levels predict for a view, or for several."""
+        """Return the upsampled prediction of the finished levels for a view, or for several; None for the base."""
         several = len(names) > 1
         if self.joint is not None:
             self.breakdown.mark("forward")
@@ -364,8 +366,8 @@ class StageRun:
             return None
         return self.accumulated.get_batch(names) if several else self.accumulated.get(names[0])
 
-    def _announce(self, iterations: Sequence[int]) -> None:
-        """Let the images of the next launch come while this one renders."""
+    def _prefetch(self, iterations: Sequence[int]) -> None:
+        """Copy the images of the next launch to the device while this one renders."""
         for iteration in iterations[:AHEAD]:
             name = self._view(iteration).name
             self.images.prefetch(name)
@@ -373,7 +375,8 @@ class StageRun:
                 self.accumulated.prefetch(name)
 
     def _densify(self, context: StageContext, iteration: int, launch: _Launch) -> None:
-        scores = self._scores(iteration) if self.densifier.scored_at(iteration) else None
+        threshold = self.densifier.score_threshold(iteration)
+        scores = None if threshold is None else self._scores(iteration, threshold)
         changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
         if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
             self._prune(share)
@@ -382,8 +385,8 @@ class StageRun:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _scores(self, iteration: int) -> ViewScores:
-        """What some training views say about each Gaussian; the same views whenever a run comes here."""
+    def _scores(self, iteration: int, threshold: float) -> ViewScores:
+        """Score Gaussians by some training views, which are a function of the seed and the iteration."""
         place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
         chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
         degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
@@ -401,23 +404,23 @@ class StageRun:
             )
 
         views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
-        return view_scores(views, grey, self.settings.densification.error_threshold)
+        return view_scores(views, grey, threshold)
 
     def _grey(self) -> tuple[GaussianField, Tensor]:
-        """The field with all colours zero, and the coefficients (n, 1, 3) that say so, with gradients."""
+        """Return the field with all colours zero, and its coefficients (n, 1, 3), which get gradients."""
         seen = self.model.field.detach()
         grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
         return replace(seen, sh=grey, signed=True), grey
 
     def _prune(self, share: float) -> None:
-        """Remove what training views hardly see."""
+        """Remove Gaussians with negligible visibility in the training views."""
         plain, grey = self._grey()
         images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
         pixels = blended_pixels(images, grey)
         remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))
 
     def _note_loss(self, loss: float, iteration: int, views: int) -> None:
-        """Smooth the mean loss of some views; `iteration` is that of the last one."""
+        """Add the mean loss of some views to the smoothed loss; `iteration` is that of the last view."""
         if not math.isfinite(loss):
             raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
         past, kept = self.progress.loss, LOSS_SMOOTHING**views
@@ -436,7 +439,7 @@ class StageRun:
         )
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to continue this stage bit for bit, as plain tensors and numbers."""
+        """Return everything needed to continue this stage to the same bits, as plain tensors and numbers."""
         self.settle()
         on_gpu = self._device.type == "cuda"
         return {
@@ -451,10 +454,10 @@ class StageRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from what `state` returned; the model must have been made from it already."""
+        """Continue from a result of `state`; the model must have been made from it already."""
         self.progress = StageProgress(**state["progress"])
         if self.breakdown.measures:
-            # What was not measured from its first iteration on would be parts of another whole.
+            # Without a measurement from the first iteration on, the parts would not add up to the whole.
             spent = state.get("breakdown")
             self.breakdown = breakdown_on(self._device, spent) if spent else Breakdown()
         self.densifier.state = {

@@ -1,4 +1,4 @@
-"""A whole run: stages from the coarsest level to the finest, archived one by one, resumable at any moment."""
+"""Train a whole run: its stages from the coarsest level to the finest. Each is archived; any can be resumed."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
+from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, LevelRecord, RunArchive
-from lapgs_plugin.runs.breakdown import Breakdown, breakdown_on
-from lapgs_plugin.runs.image_store import ImageStore, chosen_precision, place
-from lapgs_plugin.runs.overhead import Overhead
-from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
+from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
+from lapgs_plugin.runs.level_images import ImageStores, LevelImages
+from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
-from lapgs_plugin.training.densification import density_control, mcmc_start, statistics_in_triton
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import StageSchedule, TrainSettings, views_per_step
+from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.views import LevelImages, level_views, stored_bytes
+from lapgs_plugin.training.views import level_views
 
 TRAIN, TEST = "train", "test"
-"""Folders of cached predictions, by the views that they are of."""
+"""Folders of cached predictions for training and held-out views."""
 CHECKPOINT_SECONDS = 60.0
-"""Between two checkpoints where nobody says how many iterations."""
+"""Time between two checkpoints unless a number of iterations is given."""
 LOG_TICKS = 200
-"""About how often a run writes to its history and updates its progress display."""
+"""Approximate number of history entries and progress updates of a run."""
 
 
 def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None = None) -> StagePlan:
@@ -60,7 +61,7 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
     Args:
         size: (width, height).
         settings: of the run.
-        views: number of training views; None where that is not known.
+        views: number of training views; None if unknown.
 
     Raises:
         UserInputError: levels, split and image size do not go together, or a step takes more views than there are.
@@ -73,10 +74,10 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
 
 
 def check_storage(settings: TrainSettings, device: torch.device) -> None:
-    """Refuse a place for images that the device of a run does not have.
+    """Check that the device of a run has the place that the settings name for images.
 
     Raises:
-        UserInputError: there is no such place.
+        UserInputError: it has not.
     """
     if settings.images_on == "gpu" and device.type != "cuda":
         raise UserInputError("--images-on gpu: expected memory or disk, as a CPU trains this run")
@@ -90,7 +91,7 @@ def warm_up(
     residuals: bool = False,
     joint: bool = False,
 ) -> None:
-    """Run every kernel of an iteration once, so that compiling them is not taken for training."""
+    """Run every kernel of an iteration once, so that compilation is not measured as training."""
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
     first = field_from_points(ahead, ahead, settings.sh_degree).to(device)
     model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
@@ -104,7 +105,7 @@ def warm_up(
         photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))
     if torch.device(device).type == "cuda":
-        statistics_in_triton()
+        densification_statistics.triton_works()
     coarse = torch.zeros(3, 8, 8, device=device)
     if residuals:
         upsample(Pyramid(), coarse, (16, 16))
@@ -115,21 +116,21 @@ def warm_up(
 
 @dataclass
 class Trainer:
-    """Trains the hierarchy of one scene into a run folder.
+    """Train the hierarchy of one scene into a run folder.
 
     Attributes:
         scene: views, points and background.
-        settings: what decides the result.
-        archive: the run folder; its manifest already says the same settings.
+        settings: of the run.
+        archive: the run folder; its manifest has the same settings.
         rasterizer: renders every field.
-        device: where the rasterizer wants them, and everything is trained.
-        user_hooks: run after the stock ones.
-        monitor: told about progress.
-        checkpoint_every: iterations between two checkpoints; None writes one a minute, which costs about a hundredth of
-            the time whatever the scene. One is also written when a run is asked to stop.
-        test_every: iterations between two measurements of held-out PSNR; None measures it once at the end of a stage.
+        device: of the rasterizer and of training.
+        user_hooks: called after the stock ones.
+        monitor: shows progress.
+        checkpoint_every: iterations between two checkpoints; None writes one every minute. One is also written when the
+            user stops a run.
+        test_every: iterations between two measurements of held-out PSNR; None measures it at the end of each stage.
         breakdown: measure the parts of iterations.
-        watcher: may look at the fields between iterations.
+        watcher: looks at the fields between iterations.
     """
 
     scene: Scene
@@ -165,8 +166,8 @@ class Trainer:
 
         Raises:
             TrainingStoppedError: the user asked to stop; everything needed to resume is on disk.
-            TrainingDivergedError: NaN or inf; finished levels and the last checkpoint stay.
-            DeviceMemoryError: the GPU is full; the same stays.
+            TrainingDivergedError: NaN or inf; finished levels and the last checkpoint are kept.
+            DeviceMemoryError: the GPU is full; the same is kept.
         """
         checkpoint = self._checkpoint() if resume else None
         with stop_request() as stop:
@@ -188,7 +189,7 @@ class Trainer:
                     self._images.close()
 
     def _checkpoint(self) -> dict[str, Any] | None:
-        """What the next stage is continued from; None where it starts from its beginning."""
+        """Return the checkpoint of the next stage; None if it starts from its beginning."""
         state, level = self.archive.load_checkpoint(), self.archive.manifest.next_level
         if state is not None:
             (stage,) = (each for each in self.plan if each.level == level)
@@ -197,7 +198,7 @@ class Trainer:
         return state
 
     def _moments(self, level: int, field: GaussianField) -> dict[str, Any]:
-        """Adam's state that a finished level left, of its field."""
+        """Return Adam's state that the next level inherits from a finished one with its field."""
         moments = self.archive.optimizer_state(level)
         check_moments(moments, field, self.archive.path(f"level_{level}", OPTIMIZER))
         return moments
@@ -212,7 +213,7 @@ class Trainer:
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
             run.restore(checkpoint)
             if self.breakdown and not run.breakdown.measures:
-                self.monitor.say(f"level {stage.level} was begun without --breakdown: its parts are not told")
+                self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
         self.archive.rewind_history(stage.level, run.progress.iteration)
         self.monitor.stage_started(stage, run.progress.iteration + 1)
         self._last_tick = (run.progress.seconds, run.progress.iteration)
@@ -227,8 +228,10 @@ class Trainer:
         self._finish(run)
 
     def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
-        """The field a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
-        torch.manual_seed(self.settings.seed * 1000 + stage.level)  # split positions; the same however we got here
+        """Return the field that a stage starts from: the checkpoint's, the point cloud's or the previous level's."""
+        torch.manual_seed(
+            self.settings.seed * 1000 + stage.level
+        )  # for random split positions, which a resumed run repeats
         rates, extent = self.settings.rates, self.scene.extent
         sparse = self.settings.sparse_adam
         if checkpoint is not None:
@@ -242,8 +245,7 @@ class Trainer:
             if not stage.signed:
                 degree = self.settings.sh_degree_of(stage)
                 points = field_from_points(self.scene.points, self.scene.colors, degree)
-                if self.settings.densification.strategy == "mcmc":
-                    points = mcmc_start(points)
+                points = self.settings.densification.options.start(points)
                 return TrainableField.create(points.to(self.device), rates, extent, sparse=sparse)
             generator = torch.Generator().manual_seed(self.settings.seed)
             coarser = self.archive.field(stage.level + 1)
@@ -255,10 +257,11 @@ class Trainer:
             return model
 
     def _next_stage_inherits_moments(self, stage: Stage) -> bool:
-        """Whether the stage after this one goes on with Adam's state."""
+        """Return whether the next stage inherits Adam's state from this one."""
         return stage.level > 0 and self.settings.inherit_mode == "full"
 
     def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
+        """Return a stage that is ready to train a model."""
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
         batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         schedule = StageSchedule.create(
@@ -277,14 +280,7 @@ class Trainer:
         if self._images is not None:
             self._images.close()
         with self._overhead.timed("pyramid"):
-            self._images = LevelImages(
-                self.scene.train,
-                stage.level,
-                self.plan.levels,
-                self._pyramid,
-                with_coarse=self._supervision.needs_coarse,
-                device=self.device,
-            )
+            self._images = self._level_images(stage)
         self._fill_caches(stage)
         return StageRun(
             stage=stage,
@@ -298,7 +294,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(self._supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=density_control(schedule, self.settings.densification_of(stage), self.scene.extent),
+            densifier=self.settings.strategy_of(stage).density_control(schedule, self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
@@ -306,9 +302,9 @@ class Trainer:
         )
 
     def _unfreeze(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
-        """The finished fields, to be trained on: from a checkpoint's `JointFields.state`, or as they are archived.
+        """Return the finished fields for joint training, from a checkpoint's `JointFields.state` or the archive.
 
-        What was kept of their predictions is let go of: from here on these are rendered.
+        Their cached predictions are dropped, because from now on they are rendered.
         """
         self._memory.note(self._image_bytes)
         self._close_caches()
@@ -328,7 +324,7 @@ class Trainer:
         )
 
     def _fill_caches(self, stage: Stage) -> None:
-        """Keep the finished levels' composed prediction of every view that this stage will look at."""
+        """Cache the composed prediction of the finished levels for every view of this stage."""
         self._close_caches()
         if not stage.signed:
             return
@@ -338,9 +334,13 @@ class Trainer:
             self._test_cache = self._predictions(stage, self.scene.test, TEST)
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
-        """Up(I_hat^(l+1)) of each view, for the stage of level l."""
+        """Return Up(I_hat^(l+1)) of each view, for the stage of level l."""
         coarser = stage.level + 1
-        cache = UpsampledImages(self._empty_cache(coarser, views, name), self._pyramid)
+        where = self.settings.images_on
+        if where == AUTO and name == TEST:
+            where = "memory"  # held-out views are rarely used, outside the clock: a GPU needs its memory for others
+        precision = chosen_precision(self.settings.prediction_precision, self.device)
+        cache = self._stores(views, where).make_upsampled(coarser, precision, name, self._pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
             for view in views:
@@ -348,18 +348,20 @@ class Trainer:
                 cache.put(view.name, renderer.images([view.camera], coarser)[0], (camera.height, camera.width))
         return cache
 
-    def _empty_cache(self, level: int, views: Sequence[View], name: str) -> ImageStore:
-        """A store for predictions of a level; what is left to it is decided by the device.
+    def _stores(self, views: Sequence[View], where: str = AUTO, eight_bit: bool = False) -> ImageStores:
+        sizes = [(view.camera.width, view.camera.height) for view in views]
+        return ImageStores(sizes, self.device, eight_bit, where, self.archive.path(CACHE))
 
-        Those of held-out views are looked at now and then and outside the clock: a GPU has better use for its memory.
-        """
-        where = self.settings.images_on
-        precision = chosen_precision(self.settings.prediction_precision, self.device)
-        if where == AUTO:
-            targets = 0 if self._images is None else self._images.stored_bytes
-            fits = place(stored_bytes(views, level, precision) + targets, self.device)
-            where = "memory" if name == TEST else fits
-        return ImageStore(where, precision, device=self.device, folder=self.archive.path(CACHE, name))
+    def _level_images(self, stage: Stage) -> LevelImages:
+        """Return the targets of a stage's training views, on a CPU as float32 tensors."""
+        views, on_gpu = self.scene.train, self.device.type == "cuda"
+        eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
+        with_coarse = self._supervision.needs_coarse and stage.level < self.plan.levels - 1
+        stores = self._stores(views, eight_bit=eight_bit)
+        images = LevelImages(stores, stage.level, self._pyramid, with_coarse=with_coarse, exact=not on_gpu)
+        for view in views:
+            images.put(view.name, view.image)
+        return images
 
     def _out_of_memory(self) -> DeviceMemoryError:
         next_level = self.archive.manifest.next_level
@@ -377,13 +379,13 @@ class Trainer:
         shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
 
     def _after_iteration(self, run: StageRun, stop: StopRequest) -> None:
-        """Log, measure, save and stop, whatever became due with the last step; none of it is optimization time."""
+        """Log, measure, save and stop if the last step made it due; none of it counts as optimization time."""
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
         due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
         if due_test or due_tick or stop.requested:
-            run.settle()  # what follows is not to be charged for iterations that are still under way
+            run.settle()  # so that the iterations in progress do not count as the time of what follows
         psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
         if psnr is not None or due_tick:
             self._tick(run, psnr)
@@ -423,7 +425,7 @@ class Trainer:
 
     @torch.no_grad()
     def _held_out_psnr(self, run: StageRun) -> float:
-        """Mean PSNR in dB of the held-out views, composed so far and brought to full resolution."""
+        """Return the mean PSNR in dB of the held-out views, composed so far and upsampled to full resolution."""
         with self._overhead.timed("evaluation"):
             values = []
             for view in self.scene.test:
@@ -442,6 +444,7 @@ class Trainer:
         self._last_checkpoint = time.monotonic()
 
     def _finish(self, run: StageRun) -> None:
+        """Archive a finished stage."""
         field = run.model.field.detach()
         record = LevelRecord(
             level=run.stage.level,
@@ -469,6 +472,6 @@ class Trainer:
 
 
 def _fields(run: StageRun) -> dict[int, GaussianField]:
-    """What is under training, by level, without gradients."""
+    """Return the fields under training by level, without gradients."""
     joint = {} if run.joint is None else run.joint.fields
     return {**joint, run.stage.level: run.model.field.detach()}

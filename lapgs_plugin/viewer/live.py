@@ -21,7 +21,7 @@ from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import ShownRun
 from lapgs_plugin.viewer.poses import InitialView

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from lapgs_plugin.hierarchy.plan import level_size
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.training.settings import TrainSettings
 from tests.training_scene import HEIGHT, WIDTH, blob_field, ring_camera
 

@@ -134,7 +134,7 @@ MISTAKES = [
     (OURS, "accumulate_views = -1", ["variants.2.options.accumulate_views = -1", "expected at least 1"]),
     (OURS, "sh_degree = 9", ["variants.2.options.sh_degree = 9", "expected 0, 1, 2 or 3"]),
     (OURS, "threads = 100000", ["variants.2.options.threads = 100000", "1024"]),
-    (OURS, 'strategy = "best"', ['variants.2.options.strategy = "best"', "expected default, mcmc or multiview"]),
+    (OURS, 'strategy = "best"', ['variants.2.options.strategy = "best"', "expected default, mcmc, multiview"]),
     (OURS, 'strategy = "mcmc"', ['variants.2.options.strategy = "mcmc"', "only gsplat on a CUDA device"]),
     (OURS, "packed = true", ["variants.2.options.packed = true", "only gsplat on a CUDA device"]),
     (OURS, 'packed = "yes"', ['variants.2.options.packed = "yes"', "expected true or false"]),

@@ -1,4 +1,4 @@
-"""`lapgs import-run`: folders laid out as other programs write them, rendered as those programs render."""
+"""Test `lapgs import-run` on folders in other programs' layouts: images are those of the other program."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclass
 class Foreign:
-    """A folder as a 3DGS codebase or the release leaves it; options go into cfg_args."""
+    """Write a folder as a 3DGS codebase or the release does; options go into cfg_args."""
 
     folder: Path
     scene: Path
@@ -61,7 +61,7 @@ class Foreign:
     def field(self, place: str, iteration: int, field: GaussianField) -> GaussianField:
         path = self.folder / place / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
         path.parent.mkdir(parents=True)
-        replace(field, signed=False).save_ply(path)  # theirs have no mark of ours
+        replace(field, signed=False).save_ply(path)  # their files lack our mark
         return field
 
     def info(self, level: int, seconds: float, peak: int) -> None:
@@ -79,7 +79,7 @@ def foreign(tmp_path: Path, scene: Path) -> Foreign:
 
 
 def release_up(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """The release's way from a level to the next finer one: bilinear with half-pixel centres, then the blur."""
+    """Upsample as the release does: bilinear with half-pixel centres, then the blur."""
     taps = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
     kernel = torch.outer(taps, taps).expand(3, 1, 5, 5)
     larger = F.interpolate(image[None], size=size, mode="bilinear", align_corners=False)
@@ -87,7 +87,7 @@ def release_up(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def test_a_hierarchy_of_the_release_is_rendered_as_its_script_does(foreign: Foreign, tmp_path: Path) -> None:
-    # Colours beyond 1 in the base and below -1 in the residual, so that its clamps show.
+    # Colours above 1 in the base and below -1 in the residual make the clamps visible.
     base = foreign.field("L1", 100, replace(blob_field(seed=1), sh=4 * blob_field(seed=1).sh))
     residual = replace(foreign.field("L0", 200, replace(blob_field(seed=2), sh=4 * blob_field(seed=2).sh)), signed=True)
     run = tmp_path / "run"
@@ -110,7 +110,7 @@ def test_figures_of_the_release_count_from_its_first_stage(foreign: Foreign, tmp
     foreign.field("L1", 100, blob_field(200, seed=1))
     foreign.field("L0", 200, blob_field(150, seed=2))
     foreign.info(1, 10.5, 260)
-    foreign.info(0, 35.75, 260)  # the peak was the first stage's
+    foreign.info(0, 35.75, 260)  # the peak is the first stage's
     output = lapgs("import-run", foreign.folder, "--backbone", "taming")
     archive = RunArchive.open(foreign.folder / "lapgs")
     assert [record.level for record in archive.manifest.records] == [1, 0]
@@ -154,7 +154,7 @@ def test_opacities_that_taming_keeps_without_a_sigmoid(foreign: Foreign) -> None
     lapgs("import-run", foreign.folder, "--backbone", "taming")
     read = RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits
     torch.testing.assert_close(read, logits, rtol=0, atol=1e-4)  # worst seen 5e-6
-    lapgs("import-run", foreign.folder, "--backbone", "fastgs", "--overwrite")  # which has no such thing
+    lapgs("import-run", foreign.folder, "--backbone", "fastgs", "--overwrite")  # which has no such setting
     assert torch.equal(RunArchive.open(foreign.folder / "lapgs").field(0).opacity_logits, linear)
 
 
@@ -168,7 +168,9 @@ def test_an_interrupted_hierarchy_is_what_it_is(foreign: Foreign) -> None:
 
 def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
     foreign.field("", 30, blob_field())
-    with pytest.raises(UserInputError, match=r"does not say what it was trained with, expected fastgs, taming"):
+    with pytest.raises(
+        UserInputError, match=r"does not say which backbone trained it, expected one of fastgs, graphdeco"
+    ):
         lapgs("import-run", foreign.folder)
     (foreign.folder / "runtime_breakdown.json").write_text('{"backbone": "taming", "config": {"blur_up": true}}')
     lapgs("import-run", foreign.folder)

@@ -1,4 +1,4 @@
-"""`lapgs train` as a person meets it: one line for each mistake, nothing written by one, Ctrl-C and --resume."""
+"""`lapgs train` on the command line: one line for each mistake and nothing written, Ctrl-C and --resume."""
 
 from __future__ import annotations
 
@@ -72,8 +72,11 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
-        (("--strategy", "luck"), "expected default, mcmc or multiview"),
+        (("--strategy", "luck"), "--strategy luck: expected default, mcmc, multiview"),
         (("--strategy", "mcmc", "--packed", "--rasterizer", "cpu"), "--strategy mcmc, --packed with --rasterizer cpu"),
+        (("--cap-max", "7"), "--cap-max 7 with --strategy default: an option of --strategy mcmc; leave it out"),
+        (("--strategy", "mcmc", "--absgrad"), "--absgrad True with --strategy mcmc: an option of --strategy default"),
+        (("--strategy", "mcmc", "--error-pixels", "3"), "--error-pixels 3.0 with --strategy mcmc: an option of --str"),
         (("--cache", "gpu", "--rasterizer", "cpu"), "--images-on gpu: expected memory or disk"),
         (("--cache", "tape"), "--images-on tape: expected auto, gpu, memory, disk"),
         (("--cache-precision", "int4"), "--prediction-precision int4: expected auto, float32, float16, uint8"),
@@ -94,7 +97,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """In this process: importing torch anew takes longer than all that is looked at here."""
+    """In this process, because importing torch takes longer than the test."""
     words = ("train", scene, "-o", tmp_path / "run", "--iterations", 40, *options)
     monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, words)])
     with pytest.raises(SystemExit) as ended:
@@ -122,7 +125,7 @@ def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(tmp_path:
     assert {path: path.read_bytes() for path in files} == files
 
 
-def test_residuals_are_trained_where_they_are_asked_for(scene: Path, tmp_path: Path) -> None:
+def test_residuals_are_trained_on_request(scene: Path, tmp_path: Path) -> None:
     options = (*RESIDUALS, "--joint", "0.25", "--inherit", "xyz:0.5", "--supervision", "reconstructed")
     done = lapgs("train", scene, "-o", tmp_path / "run", *options, *SHORT)
     assert done.returncode == 0, done.stderr
@@ -131,7 +134,7 @@ def test_residuals_are_trained_where_they_are_asked_for(scene: Path, tmp_path: P
     assert (manifest.inherit, manifest.settings["joint"]) == ("xyz:0.5", 0.25)
 
 
-def test_runs_from_before_nesting_go_on_with_residuals(tmp_path: Path) -> None:
+def test_runs_from_before_nesting_continue_with_residuals(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), finished=1)
     manifest = json.loads((run / MANIFEST).read_text())
     assert manifest["settings"].pop("hierarchy") == "laplacian"

@@ -1,4 +1,4 @@
-"""`lapgs train --view`: what it says, what it refuses before anything is written, and a port that is free again."""
+"""`lapgs train --view`: its messages, its refusals before anything is written, and the port that it frees."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scene"), size=(128, 96))
 
 
-def test_nobody_looks(scene: Path, tmp_path: Path) -> None:
+def test_training_without_a_browser(scene: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         output = lapgs("train", scene, "-o", tmp_path / "run", "--iterations", 6, "--view", "--view-port", port)
@@ -49,9 +49,7 @@ def test_nobody_looks(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["train", "run"])
-def test_a_foreign_page_may_not_look(
-    command: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_foreign_page_is_refused(command: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = []
 
     def ask(self: LiveView, archive: RunArchive) -> None:

@@ -1,4 +1,4 @@
-"""A scene for the stub checkouts."""
+"""Make a scene for the stub checkouts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten training views, as many as FastGS draws for its scores, and two held out."""
+    """Make a scene of ten training views, which FastGS needs for its scores, and two held-out views."""
     path = tmp_path_factory.mktemp("scene") / "sample"
     make_sample_scene(path, width=64, height=48, views=12, points=300, progress=False)
     return path

@@ -1,4 +1,4 @@
-"""The stub checkouts, run on the CPU in this process: bare, and driven as a hierarchy."""
+"""Run the stub checkouts on the CPU in this process: bare, and as a hierarchy."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runner.driver import HierarchyDriver
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
 
 ITERATIONS = 90
-"""Of a whole run: 30 and 60 iterations in two stages."""
+"""Iterations of a whole run: 30 and 60 in two stages."""
 
 SCHEDULE = ("--eval", "--iterations", ITERATIONS, "--densify_from_iter", 5, "--densification_interval", 5)
 SCHEDULE += ("--densify_until_iter", 60, "--percent_dense", 0.05)
 
 WHITE = ("--white_background", "--densify_from_iter", 0)
-"""Over white, the checkouts reset opacities at the first iteration that densifies; never, if that is 0. In as few
-iterations as here they do not recover before FastGS prunes what is faint."""
+"""Options for a white background. Over white, checkouts reset opacities at the first iteration that densifies, never if
+that is 0. In so few iterations opacities would not recover before FastGS prunes faint Gaussians."""
 
 THIRDS: dict[str, Any] = {"split": "1/3,2/3"}
-"""Stages of 30 and 60 iterations, which these tests train residuals with unless they say otherwise."""
+"""Option for stages of 30 and 60 iterations, the default of these tests for residuals."""
 KINDS = ("nested", "laplacian")
-"""Of hierarchies."""
+"""Both kinds of hierarchy."""
 
 
 @dataclass(frozen=True)
 class Stub:
-    """A stub checkout.
+    """Describe a stub checkout.
 
     Attributes:
         name: its folder.
         stand_in: variant of the rasterizer that it runs with.
-        options: that its tests always give.
+        options: options that its tests always pass.
     """
 
     name: str
@@ -80,7 +80,7 @@ NAMES = tuple(STUBS)
 
 @dataclass(frozen=True)
 class Result:
-    """What a run printed, and where it went."""
+    """Hold the output and the folder of a run."""
 
     folder: Path
     output: str
@@ -88,13 +88,13 @@ class Result:
 
     @property
     def losses(self) -> list[float]:
-        """The running mean of the loss that the progress bar shows every ten iterations."""
+        """Running mean of the loss, which the progress bar shows every ten iterations."""
         shown = re.findall(r"(?<!Depth )Loss=([0-9.]+)", self.progress)
         return [float(value) for i, value in enumerate(shown) if i == 0 or value != shown[i - 1]]
 
     @property
     def lines(self) -> list[str]:
-        """What was printed, without times of day and durations."""
+        """Lines that were printed, without times of day and durations."""
         untimed = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]", "", self.output)
         return re.sub(r"(time: |Time taken by None: )[0-9.]+", r"\1", untimed).splitlines()
 
@@ -104,12 +104,12 @@ def arguments(stub: Stub, scene: Path, folder: Path, more: Sequence[Any] = ()) -
 
 
 PACKAGES = {"arguments", "gaussian_renderer", "scene", "utils"}
-"""Of every checkout: all have packages of the same names."""
+"""Packages of every checkout."""
 
 
 @contextmanager
 def forgetting_stubs() -> Iterator[None]:
-    """Forget a checkout's modules on leaving, those included that `lapgs run` cannot know of, as stubs share them."""
+    """Remove a checkout's modules at the end, including those that the stubs share, which `lapgs run` does not know."""
     try:
         yield
     finally:
@@ -127,7 +127,7 @@ def captured(folder: Path, results: list[Result]) -> Iterator[None]:
 
 
 def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
-    """The script as Python runs it, without anything of `lapgs run`."""
+    """Run the script as Python does, without `lapgs run`."""
     results: list[Result] = []
     before = sys.argv, sys.path[:]
     sys.argv = [str(stub.script), *arguments(stub, scene, folder, more)]
@@ -144,11 +144,11 @@ def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
 def loaded(
     stub: Stub, scene: Path, folder: Path, *more: Any, script: Path | None = None, stand_in: str | None = None
 ) -> Iterator[BackboneAdapter]:
-    """The adapter over a stub whose definitions have been executed.
+    """Load a stub's definitions and yield its adapter.
 
     Args:
-        script: of a changed copy of the stub.
-        stand_in: another rasterizer than the checkout wants.
+        script: script of a changed copy of the stub.
+        stand_in: another rasterizer than the checkout's.
     """
     script = stub.script if script is None else script
     with (
@@ -217,7 +217,7 @@ run_residuals = partial(run_hierarchy, hierarchy="laplacian")
 
 
 class StopAt(StageHook):
-    """Ctrl-C when a stage begins."""
+    """Press Ctrl-C when a stage begins."""
 
     def __init__(self, level: int) -> None:
         self.level = level
@@ -228,7 +228,7 @@ class StopAt(StageHook):
 
 
 class Seeded(StageHook):
-    """Lets every stage draw the same, whatever was drawn before it: then a resumed run can end as a whole one."""
+    """Seed all generators at the start of every stage, so that a resumed run can end as an uninterrupted one."""
 
     def on_stage_start(self, stage: Stage) -> None:
         random.seed(stage.level)
@@ -237,8 +237,8 @@ class Seeded(StageHook):
 
 
 def composed_psnr(archive: RunArchive) -> float:
-    """Of the held-out views, rendered from the archive by code that knows no checkout; averaged as the checkouts do,
-    over views and channels."""
+    """Return the PSNR of the held-out views, rendered from the archive without the checkout's code, averaged as the
+    checkouts do, over views and channels."""
     renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
     values = []
     for view in run_scene(archive).test:

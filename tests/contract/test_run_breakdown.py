@@ -1,4 +1,4 @@
-"""`lapgs run --breakdown`: known delays in a checkout's loop land in their parts, which add up to the optimization."""
+"""Test `lapgs run --breakdown`: delays in a checkout's loop appear in their parts, which add up to the optimization."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torch import Tensor
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.runs.profiling import PARTS
 from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy, run_residuals
 
 TINY = ("--iterations", 18, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 18)
 LOSS, BACKWARD, DENSIFY, STEP = 0.05, 0.03, 0.06, 0.02
-"""Seconds slept each time, many times what anything takes at 64x48 pixels."""
+"""Seconds of each sleep, far longer than any operation at 64x48 pixels."""
 
 
 class Slow(StageHook):
-    """Sleeps where it is called, and counts how often."""
+    """Sleep, and count the calls."""
 
     def __init__(self) -> None:
         self.densified = {1: 0, 0: 0}
@@ -55,7 +55,7 @@ def test_delays_land_in_their_parts(scene: Path, tmp_path: Path, name: str) -> N
         }
         for part in PARTS:
             own = parts[part] - slept.get(part, 0.0)
-            # As they add up to the whole, a sleep told of another part would be missing here.
+            # The parts add up to the whole, so a sleep counted in another part would be missing here.
             assert own > 0 or (part, slept.get(part)) == ("densification", 0.0), part
 
 
@@ -67,7 +67,7 @@ def test_optimizers_are_told_by_their_steps(scene: Path, tmp_path: Path) -> None
         time.sleep(STEP)
 
     class SlowSteps(StageHook):
-        """Registered when a stage has begun: after what marks, so that the sleep is inside."""
+        """Register a hook of the optimizer after the stage has begun, so that the sleep is inside the marked part."""
 
         def on_stage_start(self, stage: Any) -> None:
             if not handles:

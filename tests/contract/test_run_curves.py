@@ -1,4 +1,4 @@
-"""`lapgs run --test-every`: held-out PSNR over a checkout's training, without a trace in what is trained."""
+"""Test `lapgs run --test-every`: held-out PSNR during a checkout's training, which changes no field."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EVERY = 4
 
 
 def rendered(archive: RunArchive, level: int) -> float:
-    """Held-out PSNR of a finished level at full resolution, by code that knows no checkout."""
+    """Return held-out PSNR of a finished level at full resolution, without the checkout's code."""
     renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
     values = []
     for view in run_scene(archive).test:
@@ -46,7 +46,7 @@ def test_curves_leave_no_trace(scene: Path, tmp_path: Path, name: str, hierarchy
         *((0, i) for i in (4, 8, 12, 16, 20)),
     ]
     times = [entry["elapsed"] for entry in noted if "elapsed" in entry]
-    assert len(times) == len(noted) - 2  # those at the ends of stages lie at the ends
+    assert len(times) == len(noted) - 2  # entries at the ends of stages
     assert times == sorted(times)
     ends = {entry["level"]: entry["psnr"] for entry in noted if "elapsed" not in entry}
     for level, value in ends.items():

@@ -1,4 +1,4 @@
-"""Fields in and out of the checkouts' models."""
+"""Test importing fields into checkouts' models and exporting them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_field_comes_out_as_it_went_in(name: str, degree: int, scene: Path, tm
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_checkouts_ply_is_the_exported_field(name: str, scene: Path, tmp_path: Path) -> None:
-    """Both through files: the checkout writes what we read, and what it exports is what we write."""
+    """We read the checkout's files, and it exports the same field that we write."""
     field = some_field()
     with loaded(STUBS[name], scene, tmp_path) as adapter:
         model = model_of(adapter)
@@ -64,7 +64,7 @@ def test_the_checkouts_ply_is_the_exported_field(name: str, scene: Path, tmp_pat
 def test_released_opacities_are_archived_as_logits(
     scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Taming-3DGS: absolute values, which may exceed 1."""
+    """Taming-3DGS replaces opacities by absolute values, which may exceed 1."""
     with loaded(STUBS["taming"], scene, tmp_path) as adapter, torch.no_grad():
         model = model_of(adapter)
         adapter.import_field(model, some_field())
@@ -81,7 +81,7 @@ def test_released_opacities_are_archived_as_logits(
 
 
 def test_a_run_with_released_opacities_is_archived(scene: Path, tmp_path: Path) -> None:
-    """Released in the base while densification still goes on, and after it."""
+    """Opacities of the base are released during densification, and after it."""
     for ho_iteration in (12, 25):
         folder = tmp_path / str(ho_iteration)
         archive, result = run_hierarchy(STUBS["taming"], scene, folder, "--ho_iteration", ho_iteration)

@@ -1,4 +1,4 @@
-"""Residuals in a driven run of each stub: what is compared with what, what is rendered, and going on after a stop."""
+"""Test residuals in a run of each stub: the loss's images, the rendered images, and resuming."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ Run = tuple[RunArchive, Result]
 
 @pytest.fixture(scope="module")
 def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Run]:
-    """The two-level run of a stub, made once; the checkout saves and reports when a stage ends, and nothing more is
-    learned by a finished field."""
+    """Run a stub with two levels once; the checkout saves and reports at the end of a stage, and finished fields are
+    frozen."""
     made: dict[str, Run] = {}
 
     def run(name: str) -> Run:
@@ -81,14 +81,14 @@ def test_each_level_has_what_the_backbone_writes_for_a_model(name: str, run_of: 
 
 @pytest.mark.parametrize("name", ["taming", "graphdeco"])
 def test_the_archive_renders_what_the_checkout_reported(name: str, run_of: Callable[[str], Run]) -> None:
-    """The checkout's own report of held-out views, and a rendering of the PLYs by code that knows no checkout."""
+    """The checkout's own report of held-out views equals a rendering of the PLYs without its code."""
     archive, result = run_of(name)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
     assert composed_psnr(archive) == pytest.approx(reported, abs=1e-3)  # 5e-5 seen: predictions are float16
 
 
 class Recorder(StageHook):
-    """Keeps what hooks are told in the last iterations of each stage."""
+    """Keep the contexts of hooks in the last iterations of each stage."""
 
     def __init__(self) -> None:
         self.contexts: dict[int, list[tuple[StageContext, Tensor]]] = {}
@@ -99,7 +99,7 @@ class Recorder(StageHook):
 
 @pytest.fixture(scope="module")
 def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene for three levels, its sizes odd at the second."""
+    """Make a scene for three levels with odd sizes at the second."""
     path = tmp_path_factory.mktemp("big") / "scene"
     make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
     return path
@@ -107,7 +107,7 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(big: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunArchive, Recorder]:
-    """A run of three levels whose fields hardly move: what is compared, not how well it fits, is looked at."""
+    """Run three levels whose fields hardly move: the tests are about the images of the loss, not about quality."""
     recorder = Recorder()
     folder = tmp_path_factory.mktemp("recorded") / "run"
     more = ("--densify_until_iter", 0, "--iterations", 12)
@@ -136,7 +136,7 @@ def test_targets_are_the_levels_of_the_photos(recorded: tuple[RunArchive, Record
 
 
 def test_composed_images_build_on_the_finished_levels(recorded: tuple[RunArchive, Recorder], big: Path) -> None:
-    """What lies below a residual is Up of the archived levels, rendered by code that knows no checkout."""
+    """The upsampled prediction is that of the archived levels, rendered without the checkout's code."""
     archive, recorder = recorded
     renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
     cameras = {view.name: view.camera for view in load_scene(big, progress=False).train}
@@ -148,14 +148,14 @@ def test_composed_images_build_on_the_finished_levels(recorded: tuple[RunArchive
         assert context.accumulated is not None
         difference = (context.accumulated - below).abs()
         assert difference.flatten().quantile(0.98) < 2e-3  # 3.8e-4 seen, of all pixels: float16
-        assert difference.max() < 0.02  # another processor may decide otherwise about a pixel at 1/255
-        # Inherited geometry with no colour renders nothing, so the first composed image is what lies below.
+        assert difference.max() < 0.02  # on another processor a pixel at 1/255 may differ
+        # Inherited geometry without colour renders zeros, so the first composed image is the upsampled prediction.
         assert torch.equal(image, context.accumulated)
 
 
 @pytest.mark.parametrize("name", ["fastgs", "taming"])
 def test_score_functions_compare_composed_images(name: str, scene: Path, tmp_path: Path) -> None:
-    """Seen at the function that makes their error maps, in both stages."""
+    """The function that makes error maps gets the images to check, in both stages."""
     seen: dict[tuple[int, ...], list[float]] = {}
     module, function = {"fastgs": ("fast_utils", "get_loss"), "taming": ("taming_utils", "get_loss_map")}[name]
     with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
@@ -185,7 +185,7 @@ def test_any_number_of_levels(name: str, levels: int, scene: Path, big: Path, tm
 @pytest.mark.parametrize("supervision", ["online_residual", "gt_laplacian"])
 @pytest.mark.parametrize("name", NAMES)
 def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene: Path, tmp_path: Path) -> None:
-    """Seen at the checkout's L1, at the first iteration of the second stage."""
+    """The checkout's L1 gets the images to check, at the first iteration of the second stage."""
     compared: list[tuple[Tensor, Tensor]] = []
     recorder = Recorder()
     with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
@@ -218,7 +218,7 @@ def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene
 @pytest.mark.parametrize("inherit", ["geometry", "xyz", "full"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene: Path, tmp_path: Path) -> None:
-    """The checkout's model at the first iteration of the second stage."""
+    """Return the checkout's model at the first iteration of the second stage."""
     at_start: list[dict[str, Tensor]] = []
     parts = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc")
     with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
@@ -265,7 +265,7 @@ def test_a_run_stopped_between_stages_goes_on(
 
 
 class StopInside(StageHook):
-    """Ctrl-C at an iteration of a stage."""
+    """Press Ctrl-C at an iteration of a stage."""
 
     def __init__(self, level: int, iteration: int) -> None:
         self._place = (level, iteration)
@@ -276,13 +276,13 @@ class StopInside(StageHook):
 
 
 def noted(archive: RunArchive) -> list[tuple[int, int, set[str]]]:
-    """Where in the run each entry of a history belongs, and what it says."""
+    """Return the place in the run of each history entry, and its values."""
     return [(entry["level"], entry["iteration"], set(entry)) for entry in archive.history()]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(name: str, scene: Path, tmp_path: Path) -> None:
-    """Stopped in both, and resumed once more when it was complete."""
+    """A run is stopped in both stages, and resumed once more when it is complete."""
     folder = tmp_path / "run"
 
     def train(*hooks: StageHook, folder: Path = folder, resume: bool = True) -> RunArchive:

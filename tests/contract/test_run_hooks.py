@@ -1,4 +1,4 @@
-"""In which order hooks are called in a checkout's training, and what is logged of the symbols replaced for it."""
+"""Test the order of hooks in a checkout's training, and the log of replaced symbols."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TINY = ("--iterations", 9, "--densify_from_iter", 0, "--densification_interval",
 
 
 class Recording(StageHook):
-    """Every call, by level and iteration; a view's name only in so far as it has one."""
+    """Record every call with its level and iteration."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
@@ -82,14 +82,14 @@ def test_renders_for_scores_are_no_iterations(name: str, scene: Path, tmp_path: 
         expected += [f"start {level}", *(c for i in range(1, 10) for c in iteration(level, i)), f"end {level}"]
     assert calls == expected
     densified = [call for call in hook.calls if call.startswith("densify")]
-    # FastGS also prunes late, which is told before the iteration after it; the residual starts with nothing to densify.
+    # FastGS also prunes late, and calls hooks before the next iteration; the residual has nothing to densify at first.
     assert {"densify 1 2", "densify 1 4"} <= set(densified)
     if name == "fastgs":
         assert densified[-4:] == [f"densify 0 {i}" for i in (5, 6, 7, 8)]
 
 
 class Term(StageHook):
-    """A loss that prefers dark images."""
+    """Add a loss that prefers dark images."""
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
         return 100 * image.mean()
@@ -97,7 +97,7 @@ class Term(StageHook):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path, tmp_path: Path) -> None:
-    """The first gradient, with the term by a hook and with the same term added to the checkout's L1."""
+    """The first gradients are equal with a hook's term and with the same term added to the checkout's L1."""
     gradients = {}
     for how in ("hook", "loop"):
         folder = tmp_path / how

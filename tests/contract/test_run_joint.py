@@ -1,4 +1,4 @@
-"""The finished fields of a driven run, trained along: what they learn from, how fast, what is archived of them."""
+"""Test joint training of finished fields: their gradients, their learning rates, and their archived fields."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
 
 
 class FieldsAt(StageHook):
-    """The archived fields when the finest stage begins."""
+    """Keep the archived fields at the start of the finest stage."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,11 +55,14 @@ class FieldsAt(StageHook):
 def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
     name: str, scene: Path, tmp_path: Path
 ) -> None:
-    """The checkout's own report is of the composed hierarchy as it was at the last iteration."""
+    """The checkout's own report is about the composed hierarchy of the last iteration."""
     before = FieldsAt(tmp_path / "run")
     more: tuple[Any, ...] = ("--test_iterations", ITERATIONS) if name != "fastgs" else ()
     if name == "taming":
-        more += ("--ho_iteration", 40)  # before: its optimizer then holds opacities that its model has no longer
+        more += (
+            "--ho_iteration",
+            40,
+        )  # afterwards its optimizer has opacities that its model has not
     archive, result = run_residuals(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.3)
     after = archive.field(1).parameters
     assert before.fields.keys() == {1}
@@ -73,7 +76,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 
 @pytest.mark.parametrize("options", [{"joint": 0.0}, {"supervision": "online_residual"}, {"joint": 0.001}])
 def test_without_a_share_they_stay_as_they_are(options: dict[str, Any], scene: Path, tmp_path: Path) -> None:
-    """A share of less than an iteration is none; and what supervises residuals alone composes nothing."""
+    """There is no joint training for less than an iteration, or where residuals are supervised alone."""
     before = FieldsAt(tmp_path / "run")
     archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before,), **options)
     for part, value in archive.field(1).parameters.items():
@@ -82,14 +85,14 @@ def test_without_a_share_they_stay_as_they_are(options: dict[str, Any], scene: P
 
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene for three levels, its sizes odd at the second."""
+    """Make a scene for three levels with odd sizes at the second."""
     path = tmp_path_factory.mktemp("odd") / "scene"
     make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
     return path
 
 
 class Inspected:
-    """What is made of joint levels when they begin to follow a stage, in the place of `JointLevels.follow`."""
+    """Inspect joint levels when they begin to follow a stage, in place of `JointLevels.follow`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, inspect: Any) -> None:
         self.results: list[Any] = []
@@ -103,9 +106,9 @@ class Inspected:
 
 
 def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before the first joint step, against fields that were archived, rendered by code that knows no checkout.
+    """Predictions before the first joint step are those of the archived fields, rendered without the checkout's code.
 
-    By then nothing is left of the predictions that were kept.
+    The cached predictions are dropped by then.
     """
 
     def differences(levels: JointLevels) -> list[float]:
@@ -120,7 +123,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
             level = min(renderer.fields)
             composed = renderer.render(view.camera, level).composed[level]
             difference = (image - Pyramid("camera").up(composed, image.shape[1:])).detach().abs()
-            # Another processor may decide otherwise about a pixel of a coarse level, which Up spreads over some of 16.
+            # On another processor a pixel of a coarse level may differ, which Up spreads over some of 16.
             found.append(float(difference.flatten().quantile(0.98)))
             assert difference.max() < 0.02
         return found
@@ -135,7 +138,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
 def test_gradients_reach_every_finished_field(
     name: str, odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of any weighing of the composed image by the colours, in which it is linear, against differences."""
+    """Gradients by colour of a weighted sum of the composed image, linear in colours, equal differences."""
 
     def relative_errors(levels: JointLevels) -> list[float]:
         generator = torch.Generator().manual_seed(0)
@@ -164,7 +167,7 @@ def test_gradients_reach_every_finished_field(
 
 
 def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The base's colours do not learn at the raised rate of residuals; the rest learns as the options say."""
+    """The base's colours are not optimized at the higher rate of residuals."""
     rates: list[dict[str, float]] = []
     original = joint._Follow.__call__
 
@@ -185,7 +188,7 @@ def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize("name", NAMES)
 def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> None:
-    """Of the training views, by the archive: what joint training is for."""
+    """Joint training reduces the error of the training views."""
     errors = {}
     for share in (0.0, 0.5):
         archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), joint=share)
@@ -197,7 +200,7 @@ def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> No
 
 
 def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_path: Path) -> None:
-    """They are archived with their residual or not at all."""
+    """Fields that are trained jointly are archived with their residual or not at all."""
 
     class StopLate(StopAt):
         def before_render(self, context: StageContext) -> None:
@@ -216,9 +219,9 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
 def three_levels(
     scene: Path, folder: Path, *hooks: StageHook, name: str = "graphdeco", resume: bool = True
 ) -> RunArchive:
-    """A short run, its last two stages half joint.
+    """Run three short stages, half of the last two joint.
 
-    Predictions in float32: a resumed run makes them anew level by level, which in float16 rounds once more.
+    Predictions are float32: a resumed run makes them again level by level, which would round once more in float16.
     """
     iterations = 60 if name == "taming" else 12
     archive, _ = run_residuals(
@@ -236,7 +239,7 @@ def three_levels(
 
 
 def two_finished(scene: Path, folder: Path, name: str = "graphdeco") -> Path:
-    """The same without its last stage."""
+    """Run it without its last stage."""
     with captured(folder, []), pytest.raises(KeyboardInterrupt):
         three_levels(scene, folder, StopAt(0), name=name, resume=False)
     return folder
@@ -249,7 +252,7 @@ def plys(archive: RunArchive) -> list[bytes]:
 def test_a_run_killed_while_it_archives_them_ends_as_others(
     odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed at any write after the last stage, and resumed."""
+    """A run is killed at any write after the last stage, and resumed."""
     whole = three_levels(odd, tmp_path / "whole", resume=False)
     begun = two_finished(odd, tmp_path / "begun")
     base = plys(RunArchive.open(begun))

@@ -1,4 +1,4 @@
-"""What a person can get wrong with `lapgs run`: one line each, before training starts, and nothing written over."""
+"""Test mistakes with `lapgs run`: one line each, before training starts, and nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lapgs_plugin.cli import app
 from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.runner.installed_rasterizer import explained
+from lapgs_plugin.runner.installed_rasterizer import explain_import_error
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from tests.contract.stub_runs import (
@@ -43,7 +43,7 @@ from tests.contract.stub_runs import (
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """The stub checkouts, to be changed."""
+    """Copy the stub checkouts for a test to change."""
     return Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
 
 
@@ -138,7 +138,7 @@ def test_folders_that_are_no_checkout(tmp_path: Path) -> None:
 def test_the_wrong_rasterizer_is_said_before_training(
     name: str, stand_in: str, message: str, scene: Path, tmp_path: Path
 ) -> None:
-    """Several code bases call different rasterizers by one name."""
+    """Several code bases have different rasterizers of one name."""
     with (
         captured(tmp_path, []),
         loaded(STUBS[name], scene, tmp_path / "run", stand_in=stand_in) as adapter,
@@ -162,16 +162,16 @@ def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, absent, None)  # which makes importing it fail
     with pytest.raises(ImportError) as caught:
         importlib.import_module(absent)
-    line = explained(caught.value, "train.py")
+    line = explain_import_error(caught.value, "train.py")
     assert line is not None
     for part in (f"train.py needs {absent.partition('.')[0]}", purpose, "--device cpu"):
         assert part in one_line(line)
-    assert explained(ModuleNotFoundError("no", name="numpy"), "train.py") is None
+    assert explain_import_error(ModuleNotFoundError("no", name="numpy"), "train.py") is None
 
 
 @pytest.mark.parametrize("stub", [Stub("graphdeco", "graphdeco-aa", ("--disable_viewer",)), STUBS["fastgs"]])
 def test_sparse_adam_that_is_not_installed(stub: Stub, scene: Path, tmp_path: Path) -> None:
-    """FastGS looks for it in a module that is not its own rasterizer."""
+    """FastGS imports it from a module that is not its own rasterizer."""
     with pytest.raises(UserInputError, match="found no SparseGaussianAdam to import") as caught:
         run_hierarchy(stub, scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
     one_line(caught.value)
@@ -316,14 +316,14 @@ def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp
     for part in ("out of GPU memory at level 0", "finished levels (1) are kept", "--resume", "images", "2.00 GiB"):
         assert part in message
     assert RunArchive.open(folder).available_levels == (1,)
-    # Where images lie is what the message offers to change.
+    # The message suggests another place for images.
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, resume=True, images_on="disk")
     assert archive.manifest.complete
     assert not archive.path(CACHE).exists()
 
 
 def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
-    """From inside a checkout: the words after the script are its own, what it prints too."""
+    """`lapgs run` inside a checkout passes on the script's arguments and output."""
     stub = STUBS["graphdeco"]
     words = arguments(stub, scene, tmp_path / "run", ("--iterations", 30))
     command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "run", "--device", "cpu"]
@@ -337,7 +337,7 @@ def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def lapgs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """`lapgs run` in this process: words -> exit code, lines of stderr."""
+    """Return a function that runs `lapgs run` in this process and returns exit code and lines of stderr."""
     root = logging.getLogger()
     before = root.handlers[:], logging.getLogger("lapgs_plugin").level
 
@@ -368,10 +368,9 @@ def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_
         (["--hierarchy", "flat"], "--hierarchy flat: expected nested or laplacian"),
         *(
             (
-                [*words, *option.split()],
+                ["--hierarchy", "nested", *option.split()],
                 f"{option}: is about residuals, and nested levels have none; leave it out, or add --hierarchy lap",
             )
-            for words in ((), ("--hierarchy", "nested"))
             for option in (
                 "--supervision online_residual",
                 "--inherit full",
@@ -396,12 +395,13 @@ def test_what_nested_levels_cannot_honour_is_refused(
 @pytest.mark.parametrize(
     ("words", "settings", "iterations"),
     [
-        ((), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [15, 15]),
-        (("--hierarchy", "laplacian"), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [10, 20]),
+        ((), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [15, 15]),
+        (("--hierarchy", "nested"), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [15, 15]),
+        (("--protocol", "paper"), {"joint": 0.0, "residual_color_rate": 1.0, "inherit": "xyz"}, [10, 20]),
         (
-            ("--hierarchy", "laplacian", "--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
+            ("--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
             {"joint": 0.0, "coarse_threshold": 2.0, "residual_color_rate": 1.0},
-            [10, 20],
+            [15, 15],
         ),
     ],
 )
@@ -413,14 +413,14 @@ def test_defaults_go_with_the_hierarchy(
     scene: Path,
     tmp_path: Path,
 ) -> None:
-    """As the manifest has them. Levels are nested unless residuals are asked for."""
+    """The manifest has the defaults of the hierarchy. Residuals are the default hierarchy."""
     of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
     code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert code == 0
     manifest = RunArchive.open(tmp_path / "run").manifest
-    assert {name: manifest.settings[name] for name in settings} == settings
+    assert {name: {"inherit": manifest.inherit, **manifest.settings}[name] for name in settings} == settings
     assert [record.iterations for record in manifest.records] == iterations
-    assert [record.signed for record in manifest.records] == [False, "laplacian" in words]
+    assert [record.signed for record in manifest.records] == [False, "nested" not in words]
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:

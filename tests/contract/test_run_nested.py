@@ -1,4 +1,4 @@
-"""Nested levels, the default, in a driven run of each stub: what a level starts from, renders and leaves."""
+"""Test nested levels in a run of each stub: a level's first field, its renders and its archived field."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from tests.contract.stub_runs import (
 )
 
 DEGREE = 2
-"""Of the base's SH when it ends: the checkouts raise it every 1,000 iterations, which no stage here has."""
+"""SH degree of the base at its end: the checkouts raise it every 1,000 iterations, which no stage here has."""
 
 
 @dataclass
 class State:
-    """Of a checkout's model when an iteration begins."""
+    """Hold the state of a checkout's model at the start of an iteration."""
 
     parameters: dict[str, Tensor]
     moments: dict[tuple[str, str], Tensor]
@@ -65,13 +65,13 @@ class State:
 
 @dataclass
 class Seen(StageHook):
-    """What a run went through.
+    """Hold states and calls of a run.
 
     Attributes:
-        starts: at the first iteration of each stage.
-        last: at the last iteration of the base, which neither steps nor densifies.
-        contexts: what hooks were told of the second stage's images.
-        rendered: width, sum of the background and SH degree of all that was rasterized.
+        starts: state at the first iteration of each stage.
+        last: state at the last iteration of the base, which neither steps nor densifies.
+        contexts: contexts of hooks in the second stage.
+        rendered: width, sum of the background and SH degree of every call of the rasterizer.
     """
 
     starts: list[State] = field(default_factory=list)
@@ -117,7 +117,7 @@ def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = F
 
 @pytest.fixture(scope="module")
 def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[RunArchive, Seen]]:
-    """The nested run of a stub over white, made once, on a rasterizer that must not be asked for signed colour."""
+    """Run nested levels of a stub over white once, on a rasterizer without signed colour."""
     made: dict[str, tuple[RunArchive, Seen]] = {}
 
     def unasked(*_: Any, **__: Any) -> None:
@@ -167,7 +167,7 @@ def test_a_level_goes_on_where_the_coarser_one_ended(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_images_are_compared_whole(name: str, run_of: Callable[[str], tuple[RunArchive, Seen]], scene: Path) -> None:
-    """The second stage's targets are the photos, and nothing lies below what is rendered."""
+    """The second stage's targets are the photos, and its renders are not composed."""
     photos = {Path(view.name).stem: view.image for view in load_scene(scene, progress=False).train}
     told = run_of(name)[1].contexts
     assert len(told) == 60
@@ -180,7 +180,7 @@ def test_images_are_compared_whole(name: str, run_of: Callable[[str], tuple[RunA
 def test_the_finest_field_alone_makes_the_held_out_views(
     name: str, run_of: Callable[[str], tuple[RunArchive, Seen]]
 ) -> None:
-    """Its PLY, rendered by code that knows no checkout, is as good as the history says."""
+    """The final PLY, rendered without the checkout's code, has the PSNR of the history."""
     archive, _ = run_of(name)
     (noted,) = [entry for entry in archive.history() if "psnr" in entry]
     alone = GaussianField.load_ply(archive.field_path(0))
@@ -190,7 +190,7 @@ def test_the_finest_field_alone_makes_the_held_out_views(
         values = [
             psnr(rasterizer(alone, view.camera, background=white).image, view.image) for view in run_scene(archive).test
         ]
-    # 4e-9 seen; the cameras round apart, and a pixel at 1/255 that another processor decides otherwise makes 5e-5.
+    # 4e-9 seen; cameras differ by rounding, and a pixel at 1/255 that differs on another processor makes 5e-5.
     assert sum(values) / len(values) == pytest.approx(noted["psnr"], abs=1e-3)
 
 
@@ -211,7 +211,7 @@ def test_a_stopped_run_starts_its_finest_level_the_same(
 
 
 def test_tamings_budget_is_shared_by_levels_that_go_on(run_of: Callable[[str], tuple[RunArchive, Seen]]) -> None:
-    """300 points times 4: half for the base; the finest level grows from that to the whole. Seen: 580 and 1189."""
+    """The budget is 300 points times 4: half for the base, all for the finest level. Seen: 580 and 1189."""
     coarse, fine = (record.num_gaussians for record in run_of("taming")[0].manifest.records)
     assert 300 < coarse <= 600 < fine <= 1200
 
@@ -223,7 +223,7 @@ def test_three_levels(tmp_path: Path) -> None:
 
 
 def test_backgrounds_may_be_random(scene: Path, tmp_path: Path) -> None:
-    """Nothing is composed that was rendered over another one."""
+    """Renders over another background would not compose."""
     more = ("--random_background", "--iterations", 30)
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more)
     assert archive.manifest.complete

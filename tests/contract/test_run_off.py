@@ -1,4 +1,4 @@
-"""`lapgs run --off` is the bare run to the bit, and so is one level of the plain backbone; nothing stays replaced."""
+"""Test `lapgs run --off` and one level: both equal the bare run to the bit, and no symbol stays replaced."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import torch
 import typer
 
 from lapgs_plugin.checkouts.script import loaded_script
-from lapgs_plugin.cli.run import run
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (
     NAMES,
@@ -31,7 +32,7 @@ SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Contents by name below the folder, which is not named in them."""
+    """Return the files' contents by name, with the folder's own name replaced."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     name = str(folder).encode()
     return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
@@ -40,10 +41,9 @@ def files(folder: Path) -> dict[str, bytes]:
 def run_off(name: str, scene: Path, folder: Path, *more: Any) -> Result:
     results: list[Result] = []
     stub = STUBS[name]
-    app = typer.Typer()
-    app.command()(run)
-    with forgetting_stubs(), captured(folder, results), typer.Context(typer.main.get_command(app)) as context:
-        run(context, stub.script, arguments(stub, scene, folder, more), off=True, device="cpu")
+    words = ["run", "--off", "--device", "cpu", str(stub.script), *arguments(stub, scene, folder, more)]
+    with forgetting_stubs(), captured(folder, results):
+        typer.main.get_command(app)(words, standalone_mode=False)
     return results[0]
 
 
@@ -73,7 +73,7 @@ def test_one_level_is_the_backbone_alone(name: str, scene: Path, tmp_path: Path)
 
 
 def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
-    """Everything that a replacement could have touched: modules of the checkout and the classes in them."""
+    """Return all symbols of the checkout's modules and their classes."""
     modules = {"__main__": adapter.train}
     modules |= {
         name: module
@@ -90,7 +90,7 @@ def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
 
 
 class Failing(StageHook):
-    """Breaks in the second stage."""
+    """Raise an error in the second stage."""
 
     def on_densify(self, context: StageContext) -> None:
         if context.stage.level == 0:
@@ -128,7 +128,7 @@ def test_process_state_is_that_of_before(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
-    """Exit codes and exceptions come out as they are."""
+    """Exit codes and exceptions are passed on."""
     for statement, raised in (("sys.exit(3)", SystemExit), ("1 / 0", ZeroDivisionError)):
         script = tmp_path / "train.py"
         script.write_text(f'import sys\nif __name__ == "__main__":\n    {statement}\n')
@@ -139,7 +139,7 @@ def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
 
 
 def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
-    """Packages put objects into `sys.modules` that answer to any name, and end a finished run when they are asked."""
+    """Some packages put objects with any attribute into `sys.modules`; these must not break the end of a run."""
     script = tmp_path / "train.py"
     script.write_text(
         "import sys\nimport beside\n"
@@ -154,3 +154,16 @@ def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
         assert "beside" not in sys.modules
     finally:
         del sys.modules["lapgs_anything"]
+
+
+def test_on_a_gpu_a_script_of_no_known_checkout_runs_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    script = tmp_path / "train.py"
+    script.write_text('import sys\nif __name__ == "__main__":\n    print(sys.argv[1:])\n')
+    command = typer.main.get_command(app)
+    command(["run", "--off", str(script), "-s", "scene"], standalone_mode=False)
+    assert capsys.readouterr().out == "['-s', 'scene']\n"
+    with pytest.raises(UserInputError, match="not the root of a checkout"):
+        command(["run", str(script), "-s", "scene"], standalone_mode=False)

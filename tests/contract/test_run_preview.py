@@ -1,4 +1,4 @@
-"""`lapgs run` leaves the picture that `lapgs view` begins with."""
+"""Test that `lapgs run` leaves the picture that `lapgs view` shows first."""
 
 from __future__ import annotations
 

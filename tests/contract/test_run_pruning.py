@@ -1,4 +1,4 @@
-"""What a checkout's field loses when densification ends, against the run folder's own cameras and rasterizer."""
+"""Test pruning at the end of densification against the run folder's own cameras and rasterizer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
-from lapgs_plugin.runner import active_stage
+from lapgs_plugin.runner import stage_pruning
 from lapgs_plugin.runner.active_stage import ActiveStage
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, run_hierarchy, run_residuals
 
@@ -40,7 +40,7 @@ def test_what_is_least_seen_goes(
         prune(stage, gaussians)
         fields[stage.stage.level] = before, stage._adapter.snapshot(gaussians, signed=False)
 
-    monkeypatch.setattr(active_stage, "least_blended", noting)
+    monkeypatch.setattr(stage_pruning, "least_blended", noting)
     monkeypatch.setattr(ActiveStage, "_prune", watched)
     archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, hierarchy=hierarchy, **THIRDS)
     assert archive.manifest.complete
@@ -57,10 +57,11 @@ def test_what_is_least_seen_goes(
         cameras = [level_camera(view.camera, level) for view in views]
         images = (rasterizer(plain, camera, background=torch.zeros(3)).image for camera in cameras)
         expected = blended_pixels(images, grey)
-        # The same sums in another order: relative, worst seen 9.2e-6. Not so for Gaussians in pixels where rounding,
-        # and so the processor, decides about alpha = 1/255, the last one, or which of two is in front. (The bounds of
-        # `threshold_mask` leave 4 % of the pixels of 7000 Gaussians.) Worst seen with cameras and parameters moved by
-        # one to five roundings, 16 to 60 times for each field: 2.6 % of the Gaussians, together 2.6e-4 of the sum.
+        # The same sums in another order: worst relative difference 9.2e-6. Gaussians in some pixels differ by more:
+        # where rounding, and so the processor, decides about alpha = 1/255, the last Gaussian, or which of two is in
+        # front. (The bounds of `threshold_mask` leave 4 % of the pixels of 7000 Gaussians.) Worst seen with cameras and
+        # parameters moved by one to five roundings, 16 to 60 times for each field: 2.6 % of the Gaussians, together
+        # 2.6e-4 of the sum.
         decided = torch.isclose(pixels, expected, rtol=3e-5, atol=1e-6)
         assert decided.float().mean() > 0.95
         assert (pixels - expected).abs().sum() < 1e-3 * expected.sum()
@@ -73,14 +74,14 @@ def test_what_is_least_seen_goes(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_looking_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing is found, training ends at the bits that it ends at without looking."""
+    """If no Gaussian is pruned, the fields have the same bits as without --prune."""
     calls = []
 
     def none(pixels: Tensor, share: float) -> Tensor:
         calls.append(len(pixels))
         return torch.zeros_like(pixels, dtype=torch.bool)
 
-    monkeypatch.setattr(active_stage, "least_blended", none)
+    monkeypatch.setattr(stage_pruning, "least_blended", none)
     plys = []
     for share in (0.0, SHARE):
         archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), prune=share, joint=0.25)

@@ -1,4 +1,4 @@
-"""`lapgs run --off --record` changes nothing in a script's own run, and says what it took."""
+"""Test that `lapgs run --off --record` measures a script's own run and does not change it."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
     assert (level.train_seconds, level.mean_gaussians) == (values["train_seconds"], values["mean_gaussians"])
     assert level.overhead_seconds["saving"] == values["saving_seconds"]
     assert len(archive.history()) == ITERATIONS
-    # The script's own render against our rasterizer over the saved field: rounding alone, worst seen 7e-8 dB; where
-    # another processor decides otherwise about a pixel at 1/255, 5e-5.
+    # The script's own render against our rasterizer on the saved field: rounding, worst seen 7e-8 dB; where
+    # a pixel at 1/255 differs on another processor, 5e-5.
     measured = evaluate_run(archive)
     assert measured["psnr"] == pytest.approx(values["psnr"], abs=1e-3)
     assert measured["ssim"] == pytest.approx(values["ssim"], abs=1e-4)

@@ -1,4 +1,4 @@
-"""Backgrounds, transparent images, depths, exposures, and the other options that act on a hierarchy."""
+"""Test backgrounds, transparent images, depths, exposures, and other options of checkouts in a hierarchy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SHORT = ("--iterations", 30)
 
 @pytest.fixture(scope="module")
 def blender(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample scene as NeRF's Blender scenes are: transforms, RGBA without a background, train and test folders."""
+    """Write the sample scene as a Blender scene: transforms, RGBA without a background, train and test folders."""
     path = tmp_path_factory.mktemp("blender")
     source = load_scene(scene, eval=True, progress=False)
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -71,7 +71,7 @@ def blender(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any) -> list[Any]:
-    """The settings of every call of the checkout's rasterizer in a run."""
+    """Collect the settings of every call of the checkout's rasterizer in a run."""
     found = []
     with captured(folder, []), loaded(stub, scene, folder, *more) as adapter:
         renderer = sys.modules["gaussian_renderer"]
@@ -99,7 +99,7 @@ def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, t
 
 @pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
 def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_path: Path) -> None:
-    """Blender images are blended over the background by the checkout, and by us when the run is rendered again."""
+    """The checkout blends Blender images over the background, and so do we when the run is rendered again."""
     more = ("--test_iterations", ITERATIONS, *["--white_background"] * white)
     archive, result = run_residuals(STUBS["taming"], blender, tmp_path / "run", *more)
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
@@ -108,7 +108,7 @@ def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_p
 
 
 def test_grey_photos_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
-    """The checkouts read one channel of them, and fail in the first loss."""
+    """The checkouts read one channel of grey images, and would fail in the first loss."""
     grey = tmp_path / "scene"
     shutil.copytree(scene, grey)
     for path in (grey / "images").iterdir():
@@ -119,7 +119,7 @@ def test_grey_photos_are_refused_before_anything_is_written(scene: Path, tmp_pat
 
 
 def test_photos_on_end_between_photos_across(blender: Path, tmp_path: Path) -> None:
-    """Evaluation asks the scene for the size that a run was planned at, as the run asked the checkout's cameras."""
+    """Evaluation plans by the scene's smallest size, as the run did by the checkout's cameras."""
     mixed = tmp_path / "scene"
     shutil.copytree(blender, mixed)
     for path in (mixed / "train" / "r_1.png", mixed / "test" / "r_0.png"):
@@ -147,7 +147,7 @@ def test_transparent_images_train(name: str, hierarchy: str, blender: Path, tmp_
         drive(adapter, hierarchy=hierarchy)
     assert RunArchive.open(tmp_path / "run").manifest.complete
     for image, photo in compared:
-        clear = photo.shape[1] // 3 - 2  # the rows of the pyramid's blur left out
+        clear = photo.shape[1] // 3 - 2  # without the rows of the pyramid's blur
         if name == "graphdeco":
             assert not image[:, :clear].any()
         else:
@@ -156,7 +156,7 @@ def test_transparent_images_train(name: str, hierarchy: str, blender: Path, tmp_
 
 @pytest.fixture(scope="module")
 def deep(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample scene with inverse depths; one photo's scale is not to be believed."""
+    """Write the sample scene with inverse depths, one of them with an implausible scale."""
     path = tmp_path_factory.mktemp("deep") / "scene"
     shutil.copytree(scene, path)
     (path / "depths").mkdir()
@@ -186,7 +186,7 @@ def test_depths_supervise_every_nested_level(deep: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("hierarchy", KINDS)
 def test_exposures_go_on_from_stage_to_stage(hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    """What the base saves at its last iteration is what the next level saves at its first one, before it steps."""
+    """The next level saves at its first iteration, before it steps, what the base saves at its last one."""
     more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30, hierarchy=hierarchy, **THIRDS)
     base = json.loads(archive.path("level_1", "exposure.json").read_text())
@@ -234,7 +234,7 @@ def test_sparse_adam_trains_a_hierarchy(name: str, scene: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_where_images_lie_changes_nothing(name: str, scene: Path, tmp_path: Path) -> None:
-    """On a GPU or not, in memory or on the disk, and wherever the checkout was told to keep its images."""
+    """The place of images does not change the result, ours or the checkout's."""
     (_, memory), (_, disk), (_, told) = (
         run_residuals(STUBS[name], scene, tmp_path / how, *more, images_on=where)
         for how, where, more in (
@@ -247,7 +247,7 @@ def test_where_images_lie_changes_nothing(name: str, scene: Path, tmp_path: Path
 
 
 def test_colours_evaluated_by_the_checkout_train_the_same(scene: Path, tmp_path: Path) -> None:
-    """--convert_SHs_python holds for the base; a residual has signed colours, which that code does not know."""
+    """--convert_SHs_python applies to the base; for residuals it is off, since that code has no signed colour."""
     stub = Stub("graphdeco", "graphdeco-aa", STUBS["graphdeco"].options)
     (_, raster), (_, python) = (
         run_residuals(stub, scene, tmp_path / str(len(more)), *SHORT, *more) for more in ((), ("--convert_SHs_python",))

@@ -1,4 +1,4 @@
-"""What a stage's training is told, and what it does: schedules of the whole run, scaled or mapped to stages."""
+"""Test schedules of the whole run, scaled or mapped to stages: a stage's arguments, and what its training does."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, driv
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
-FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0, 1.5)
+FINEST = StageWindow(Stage(0, (800, 600), 20_000, True), 10_000, TOTAL, 2, 4.0, 1.0)
 
 
 def published_call(name: str, adapter: Any, **changes: Any) -> TrainingCall:
-    """The call that a checkout's main block makes with its defaults, parsed by its own parser."""
+    """Return the call that a checkout's main block makes with its defaults, parsed by its own parser."""
     arguments = sys.modules["arguments"]
     parser = ArgumentParser()
     groups = [kind(parser) for kind in (arguments.ModelParams, arguments.OptimizationParams, arguments.PipelineParams)]
@@ -121,7 +121,7 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
 
 
 def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
-    """Bare, a start between two intervals makes the last densification look beyond the table."""
+    """In a bare run, a start between two intervals makes the last densification read past the table's end."""
     schedule = ("--densify_from_iter", 7, "--densification_interval", 5, "--densify_until_iter", 60)
     archive, _ = run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *schedule)
     assert archive.manifest.complete
@@ -148,7 +148,7 @@ def test_taming_releases_opacities_at_the_iteration_of_each_stage(scene: Path, t
 
 
 def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict[str, list[tuple[int, int]]]:
-    """(stage by its iterations, iteration) of what FastGS's model is asked to do."""
+    """Collect (iterations of the stage, iteration) of calls of FastGS's model."""
     found: dict[str, list[tuple[int, int]]] = {"prune": [], "step": [], "sh_step": []}
     with captured(folder, []), loaded(STUBS["fastgs"], scene, folder, *more) as adapter:
         model = adapter.train.GaussianModel
@@ -178,8 +178,8 @@ def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict
 
 
 def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_stage(scene: Path, tmp_path: Path) -> None:
-    """Published for 30,000 iterations: pruning at 18,000, 21,000, 24,000 and 27,000; all steps until 15,000, higher SH
-    every 16th. A stage's last iteration does not step."""
+    """The published schedule for 30,000 iterations prunes at 18,000, 21,000, 24,000 and 27,000. All iterations until
+    15,000 step, higher SH every 16th. A stage's last iteration does not step."""
     more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0)
     found = record_fastgs(scene, tmp_path / "run", *more, **THIRDS)
     assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
@@ -204,7 +204,7 @@ def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Pat
 @pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_stages_after_the_first_reset_no_opacities(name: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    """Neither at the interval nor, over white, where densification may begin."""
+    """Resets are skipped at the interval and, over white, where densification begins."""
     more = ("--opacity_reset_interval", 8, "--white_background")
     asked: dict[int, int] = {}
     with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *more) as adapter:

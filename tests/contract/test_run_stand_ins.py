@@ -1,4 +1,4 @@
-"""Which stand-in takes the place of a checkout's rasterizer under `--device cpu`."""
+"""Test the choice of the stand-in for a checkout's rasterizer with `--device cpu`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_the_stand_in_is_that_of_checkout_and_options(name: str, arguments: tupl
 
 
 def test_a_checkout_from_before_antialiasing(tmp_path: Path) -> None:
-    """Its renderer knows no such setting, so its rasterizer has none either."""
+    """The renderer lacks the setting, so its rasterizer does, too."""
     checkout = Path(shutil.copytree(STUBS["graphdeco"].script.parent, tmp_path / "graphdeco"))
     renderer = checkout / "gaussian_renderer" / "__init__.py"
     text = renderer.read_text(encoding="utf-8")

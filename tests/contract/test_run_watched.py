@@ -1,4 +1,4 @@
-"""A run that is watched: what a watcher is shown, when, and that it changes nothing."""
+"""Test watchers of a run: the fields that they see, when, and that the run does not change."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.watcher import Watcher
 from tests.contract.stub_runs import KINDS, NAMES, STUBS, run_hierarchy
 
 EVERY = 4
@@ -21,7 +21,7 @@ SHORT = ("--iterations", 45, "--densify_until_iter", 40)
 
 
 class Diary(Watcher):
-    """Looks after every fourth iteration and notes what it sees."""
+    """Look after every fourth iteration and note the fields."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -70,13 +70,13 @@ def test_a_watcher_sees_every_stage_and_changes_nothing(
         watched, _ = run_hierarchy(STUBS[name], scene, tmp_path / "watched", *SHORT, watcher=diary, hierarchy=hierarchy)
         said = len(caplog.records)
         alone, _ = run_hierarchy(STUBS[name], scene, tmp_path / "alone", *SHORT, hierarchy=hierarchy)
-    assert len(caplog.records) == 2 * said  # a look says nothing that archiving does not
+    assert len(caplog.records) == 2 * said  # looking warns of nothing that archiving does not
     first, coarse, lines = diary.lines.index("stage 1"), diary.lines.index("stage 0"), diary.lines
     assert lines[0] == "run 2"
     assert lines[first + 1] == f"iteration {EVERY - 1} of level 1: [1]"
     assert lines[coarse - 1] == "finished 1: [1]"
     assert lines[coarse + 1] == f"iteration {EVERY - 1} of level 0: [0]"
-    # The base of a residual was trained along at the end.
+    # The base of a residual was trained jointly at the end.
     assert lines[-1] == f"finished 0: {[0] if hierarchy == 'nested' else [0, 1]}"
     assert max(diary.counts) > min(diary.counts)
     for level in (1, 0):
@@ -88,7 +88,7 @@ def test_a_watcher_sees_every_stage_and_changes_nothing(
 
 
 def test_the_viewer_shows_a_checkout_on_the_cpu(scene: Path, tmp_path: Path) -> None:
-    """The real watcher, inside of what makes "cuda" mean the CPU, and a client that looks at every stage."""
+    """The real watcher works inside `cuda_on_cpu` with a client that looks at every stage."""
     pytest.importorskip("viser", reason="needs the extra 'viewer'")
     from lapgs_plugin.viewer.live import LiveView
     from lapgs_plugin.viewer.page import Page

@@ -1,4 +1,4 @@
-"""The stub checkouts by themselves: they train."""
+"""Test that the stub checkouts train by themselves."""
 
 from __future__ import annotations
 

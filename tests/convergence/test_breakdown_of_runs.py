@@ -1,4 +1,4 @@
-"""The runtime breakdown of the built-in trainer: known delays land in their parts, which add up to the optimization."""
+"""The runtime breakdown of the built-in trainer: known delays are in their parts, which add up to the whole."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
-from lapgs_plugin.runs.breakdown import PARTS
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -63,9 +64,7 @@ def make_archive(path: Path, settings: TrainSettings) -> RunArchive:
     return RunArchive.create(path, Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest()))
 
 
-def test_delays_land_in_their_parts_and_all_parts_are_the_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step = TrainableField.step
 
     def slow_step(*inputs: Any, **options: Any) -> None:
@@ -116,10 +115,10 @@ def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
             assert said == []
         else:
             assert record.breakdown_seconds == {}
-            assert "level 0 was begun without --breakdown" in said[0]
+            assert "level 0 was started without --breakdown" in said[0]
 
 
-def test_fields_that_are_trained_along_count(tmp_path: Path) -> None:
+def test_jointly_trained_fields_count(tmp_path: Path) -> None:
     settings = replace(SETTINGS, hierarchy="laplacian", joint=0.5)
     with make_archive(tmp_path / "run", settings) as archive:
         Trainer(ring_scene(), settings, archive, CpuRasterizer()).run()

@@ -1,8 +1,9 @@
-"""Runs of the built-in trainer: they learn, they repeat bit for bit, and they continue where they stopped."""
+"""Runs of the built-in trainer learn, repeat to the same bits, and continue where they stopped."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import shutil
 import signal
@@ -22,7 +23,8 @@ from lapgs_plugin.interrupt import stop_request
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -64,7 +66,7 @@ def plys(archive: RunArchive) -> list[bytes]:
 
 
 class StopAt(Monitor):
-    """Asks the run to stop, as Ctrl-C does, when a level reaches an iteration."""
+    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
 
     def __init__(self, level: int, iteration: int) -> None:
         self._place = (level, iteration)
@@ -92,7 +94,7 @@ def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path:
 
 
 def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Path) -> None:
-    """The same one in every hierarchy."""
+    """The same field in every hierarchy."""
     archive = train(tmp_path / "run", scene, replace(SETTINGS, levels=1, split=None))
     assert plys(archive) == plys(train(tmp_path / "nested", scene, replace(nested(), levels=1, split=None)))
     (record,) = archive.manifest.records
@@ -108,7 +110,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(scene: Scen
 
 @pytest.fixture(scope="module", params=["geometry", "full"])
 def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
-    """An uninterrupted run; from iteration 23 of level 0 on the base is trained along."""
+    """Return an uninterrupted run; from iteration 23 of level 0 on the base is trained jointly."""
     settings = replace(SETTINGS, inherit=request.param)
     return train(tmp_path_factory.mktemp("whole") / "run", scene, settings)
 
@@ -129,15 +131,36 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
 
 
+def test_an_older_run_with_residuals_still_resets_opacities_in_them(scene: Scene, tmp_path: Path) -> None:
+    """Manifests of that time have no `residual_resets`, and the options of all strategies beside the rest."""
+    density = Densification(until=420, every=20)
+    settings = replace(SETTINGS, iterations=480, split="1/4,3/4", densification=density, residual_resets=True)
+    whole = train(tmp_path / "whole", scene, settings)
+    run = tmp_path / "older"
+    with make_archive(run, settings) as archive, pytest.raises(TrainingStoppedError):
+        Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(0, 200)).run()
+    manifest = json.loads((run / "manifest.json").read_text())
+    assert manifest["settings"].pop("residual_resets")
+    flat = manifest["settings"]["densification"]
+    flat |= flat.pop("options") | {"cap_max": 1_000_000, "base_cap_max": None, "error_pixels": 0.1}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    with RunArchive.open(run, resume=True) as archive:
+        older = TrainSettings.from_manifest(archive.manifest)
+        Trainer(scene, older, archive, CpuRasterizer()).run(resume=True)
+        assert plys(archive) == plys(whole)
+    without = train(tmp_path / "without", scene, replace(settings, residual_resets=False))
+    assert plys(without) != plys(whole), "the reset after 300 of the residual's 360 iterations makes a difference"
+
+
 @pytest.fixture(scope="module")
 def large() -> Scene:
-    """Of three levels."""
+    """Return a scene that is large enough for three levels."""
     return ring_scene(size=(96, 64))
 
 
 @pytest.fixture(scope="module")
 def two_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three levels, stopped in its last and without a checkpoint: all of that level will be trained again."""
+    """Return a run of three levels that was stopped in its last and lost its checkpoint."""
     path = tmp_path_factory.mktemp("two") / "run"
     with make_archive(path, SHORT) as archive:
         with pytest.raises(TrainingStoppedError):
@@ -156,10 +179,10 @@ def files(folder: Path) -> set[Path]:
     return {path.relative_to(folder) for path in folder.rglob("*")}
 
 
-def test_a_run_killed_while_it_archives_fields_trained_along_ends_as_others(
+def test_a_run_killed_while_it_archives_jointly_trained_fields_ends_as_others(
     large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed at any write after the last stage, and resumed."""
+    """Kill it at any write after the last stage, and resume it."""
     whole = train(tmp_path / "whole", large, SHORT)
     base = [(two_finished / f"level_{level}" / "point_cloud.ply").read_bytes() for level in (2, 1)]
     assert plys(whole)[0] != base[0], "the coarser fields were trained along"
@@ -181,7 +204,7 @@ def test_a_run_killed_while_it_archives_fields_trained_along_ends_as_others(
     assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
 
 
-def test_a_disk_that_is_full_when_a_stage_ends_leaves_the_fields_before_it(
+def test_a_disk_that_is_full_when_a_stage_ends_keeps_the_fields_before_it(
     large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = train(tmp_path / "whole", large, SHORT)
@@ -195,8 +218,8 @@ def test_a_disk_that_is_full_when_a_stage_ends_leaves_the_fields_before_it(
 
 
 @pytest.mark.parametrize("levels", [2, 3])
-def test_finished_fields_trained_along_match_the_photos_better(levels: int, tmp_path: Path) -> None:
-    """And what the run measured of held-out views at its end is what the archive renders."""
+def test_jointly_trained_fields_match_the_photos_better(levels: int, tmp_path: Path) -> None:
+    """And the run's last PSNR of held-out views is that of the archived fields."""
     scene = ring_scene(size=(96, 64))
     calm = Densification(start=20, until=100, every=20, reset_every=10_000)
     fits, fields = {}, {}
@@ -222,7 +245,7 @@ def test_finished_fields_trained_along_match_the_photos_better(levels: int, tmp_
     assert not torch.equal(fields[0.5].means, fields[0.0].means)
 
 
-def test_residuals_supervised_alone_leave_finished_fields_alone(scene: Scene, tmp_path: Path) -> None:
+def test_residuals_supervised_alone_do_not_change_finished_fields(scene: Scene, tmp_path: Path) -> None:
     settings = replace(SETTINGS, supervision="online_residual")
     with_share = train(tmp_path / "a", scene, settings)
     assert plys(with_share) == plys(train(tmp_path / "b", scene, replace(settings, joint=0.0)))
@@ -244,7 +267,7 @@ def nested(settings: TrainSettings = SETTINGS) -> TrainSettings:
 
 
 class FirstImage(StageHook):
-    """Keeps what each stage rendered first, and what it was to be added to."""
+    """Keep the first image of each stage, and the prediction that it is added to."""
 
     def __init__(self) -> None:
         self.images: dict[int, tuple[str, torch.Tensor, torch.Tensor | None]] = {}
@@ -254,8 +277,8 @@ class FirstImage(StageHook):
         return image
 
 
-def test_a_nested_level_goes_on_with_the_coarser_field(scene: Scene, tmp_path: Path) -> None:
-    """Its first image is the archived field's, at the finer size; what was measured at the end is the last field's."""
+def test_a_nested_level_continues_the_coarser_field(scene: Scene, tmp_path: Path) -> None:
+    """Its first image is the archived field's at the finer size; the last PSNR is the last field's."""
     first = FirstImage()
     archive = train(tmp_path / "run", scene, nested(), user_hooks=[first])
     assert [(record.level, record.signed) for record in archive.manifest.records] == [(1, False), (0, False)]
@@ -288,8 +311,8 @@ def test_nested_levels_learn(scene: Scene, tmp_path: Path) -> None:
     assert fits[0] > fits[1] + 1.0  # the gain was 2.8 dB
 
 
-def test_adam_goes_on_where_the_coarser_level_left_it(scene: Scene, tmp_path: Path) -> None:
-    """With its moments and its count of steps; and a run that lost its checkpoint does the same."""
+def test_adam_continues_from_the_coarser_level(scene: Scene, tmp_path: Path) -> None:
+    """With its moments and count of steps, also in a run that lost its checkpoint."""
     whole = train(tmp_path / "whole", scene, nested())
     with make_archive(tmp_path / "parts", nested()) as archive:
         with pytest.raises(TrainingStoppedError):
@@ -304,7 +327,7 @@ def test_adam_goes_on_where_the_coarser_level_left_it(scene: Scene, tmp_path: Pa
 
 
 class Below(StageHook):
-    """Notes what lies below each stage's first view, and the bytes of all that is kept of it and at the stage's end."""
+    """Keep the prediction below each stage's first view, and its stored bytes then and at the stage's end."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -326,8 +349,8 @@ class Below(StageHook):
 
 
 @pytest.mark.parametrize("joint", [0.0, 0.25])
-def test_predictions_are_kept_at_their_own_size(joint: float, tmp_path: Path) -> None:
-    """And hooks see Up of them. Once finished fields are trained along, they are rendered and nothing is kept."""
+def test_predictions_are_stored_at_their_own_size(joint: float, tmp_path: Path) -> None:
+    """Hooks get Up of them. During joint training they are rendered, and none are stored."""
     scene, folder = ring_scene(size=(97, 65)), tmp_path / "run"
     below = Below(folder)
     settings = replace(SETTINGS, levels=3, split=None, images_on="disk", joint=joint)
@@ -372,7 +395,7 @@ def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, ob
     assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
 
 
-def test_what_is_least_seen_goes_when_densification_ends(scene: Scene, tmp_path: Path) -> None:
+def test_the_least_visible_gaussians_are_removed_when_densification_ends(scene: Scene, tmp_path: Path) -> None:
     counts = {}
     for share in (0.0, 0.05):
         settings = replace(SETTINGS, levels=1, split=None, prune=share)
@@ -408,7 +431,7 @@ def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, 
     assert checkpoint["progress"]["iteration"] == 20
 
 
-def test_stop_requests_are_honoured_once_and_handlers_restored() -> None:
+def test_a_stop_request_counts_once_and_handlers_are_restored() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with stop_request() as request:
         signal.raise_signal(signal.SIGTERM)

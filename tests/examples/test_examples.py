@@ -1,4 +1,4 @@
-"""The examples run, their loss falls, and what they leave behind is what they saw."""
+"""The examples run, their loss falls, and their run folder renders what they measured."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fell(losses: list[float]) -> bool:
-    """Single views differ too much: tenths of the run are compared."""
+    """Compare tenths of the run, because single views differ too much."""
     tenth = len(losses) // 10
     return sum(losses[-tenth:]) < sum(losses[:tenth])
 
 
 def code_lines(name: str) -> list[str]:
-    """An example's lines without its docstring and empty ones."""
+    """Return an example's lines without its docstring and empty ones."""
     text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
     docstring = ast.parse(text).body[0]
     return [line for line in text.splitlines()[docstring.end_lineno :] if line.strip()]

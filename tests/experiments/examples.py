@@ -13,7 +13,8 @@ from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 
 SMALL: dict[str, Any] = {
     "name": "small",

@@ -1,14 +1,15 @@
-"""Ways to say that two renderings or two gradients agree. Each catches what the others let through.
+"""Compare two renderings or two gradients. Each function catches errors that the others miss.
 
 - `assert_elements_close`: no element is off by more than a bound relative to the largest one.
-- `assert_same_zero_rows`: the same Gaussians receive nothing at all.
-- `assert_aligned`: the whole points the same way (cosine) and has the same length (relative L2), whatever a few
-  elements do; catches a small error everywhere, which an element bound forgives.
-- `assert_rows_close`: each Gaussian's row on its own scale; catches a wrong gradient of a Gaussian that hardly matters.
-- `assert_close_outside`: equal outside a mask; and the mask may not excuse more than a stated share.
-- `assert_radii_close`: integers that may differ by one where rounding up is open.
+- `assert_same_zero_rows`: the same Gaussians have no gradient.
+- `assert_aligned`: the vectors of all elements have the same direction (cosine) and length (relative L2). It catches a
+  small error everywhere, which an element bound allows.
+- `assert_rows_close`: each Gaussian's row is compared on its own scale. It catches a wrong gradient of a Gaussian with
+  little influence.
+- `assert_close_outside`: values are equal outside of a mask, and the mask has at most a given share.
+- `assert_radii_close`: integers are equal, or differ by one where rounding up is open.
 
-All return the worst value they saw, so that a test can state it, and all fail on NaN.
+All return the worst value that they saw, for the test to state, and all fail on NaN.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from torch import Tensor
 
 
 def assert_elements_close(actual: Tensor, expected: Tensor, bound: float, *, name: str = "values") -> float:
-    """Every |actual - expected| is at most `bound` times the largest |expected| (or 1e-30)."""
+    """Assert that every |actual - expected| is at most `bound` times the largest |expected| (or 1e-30)."""
     _assert_comparable(actual, expected, name)
     if expected.numel() == 0:
         return 0.0
@@ -37,7 +38,7 @@ def assert_elements_close(actual: Tensor, expected: Tensor, bound: float, *, nam
 
 
 def assert_rows_close(actual: Tensor, expected: Tensor, bound: float, *, floor: float, name: str = "values") -> float:
-    """Every row's error is at most `bound` times that row's norm, which counts as at least `floor` of the largest."""
+    """Assert that each row's error is at most `bound` times its norm, taken as at least `floor` of the largest."""
     _assert_comparable(actual, expected, name)
     if expected.numel() == 0:
         return 0.0
@@ -50,7 +51,7 @@ def assert_rows_close(actual: Tensor, expected: Tensor, bound: float, *, floor: 
 
 
 def assert_same_zero_rows(actual: Tensor, expected: Tensor, *, name: str = "values") -> int:
-    """A row is zero in one exactly where it is in the other; returns how many are."""
+    """Assert that both have the same zero rows; return how many."""
     _assert_comparable(actual, expected, name)
     zero, should = (_rows(t).eq(0).all(dim=1) for t in (actual, expected))  # (n,) each
     wrong = (zero != should).nonzero()[:, 0].tolist()
@@ -61,7 +62,7 @@ def assert_same_zero_rows(actual: Tensor, expected: Tensor, *, name: str = "valu
 def assert_aligned(
     actual: Tensor, expected: Tensor, *, min_cosine: float, max_relative_l2: float, name: str = "values"
 ) -> float:
-    """As one long vector each, the two agree in direction and length; returns the relative L2 distance."""
+    """Assert that both, as one vector, have the same direction and length; return the relative L2 distance."""
     _assert_comparable(actual, expected, name)
     a, e = actual.double().flatten(), expected.double().flatten()
     length = float(e.norm())
@@ -78,7 +79,7 @@ def assert_aligned(
 def assert_close_outside(
     actual: Tensor, expected: Tensor, mask: Tensor, bound: float, *, max_masked: float = 1.0, name: str = "values"
 ) -> float:
-    """Every |actual - expected| outside the mask is at most `bound` (absolute), and the mask covers a limited share.
+    """Assert that |actual - expected| is at most `bound` outside of the mask, and that the mask has a limited share.
 
     Args:
         actual, expected: (..., h, w), or (n, ...) with an (n,) mask.
@@ -99,14 +100,14 @@ def assert_close_outside(
 
 
 def assert_radii_close(actual: Tensor, expected: Tensor, is_open: Tensor) -> int:
-    """Radii are equal; where `is_open` they may differ by a pixel, or one of the two may be culled.
+    """Assert that radii are equal; where `is_open`, they may differ by a pixel, or one may be culled.
 
     Args:
         actual, expected: (n,) whole pixels, 0 where culled.
         is_open: (n,) bool.
 
     Returns:
-        How many differ.
+        The number that differ.
     """
     _assert_comparable(actual, expected, "radii")
     difference = (actual.long() - expected.long()).abs()  # (n,)
@@ -120,7 +121,7 @@ def assert_radii_close(actual: Tensor, expected: Tensor, is_open: Tensor) -> int
 
 @dataclass(frozen=True)
 class GradientBounds:
-    """How closely gradients have to agree; see the functions of the same words.
+    """Hold the bounds of `assert_gradients_match`; see the functions of the same words.
 
     Attributes:
         element: largest error relative to the largest element.
@@ -142,11 +143,11 @@ def assert_gradients_match(
     *,
     excused: Tensor | None = None,
 ) -> dict[str, float]:
-    """All gradients of a field agree in every way above.
+    """Assert that all gradients of a field agree in every way above.
 
     Args:
         actual, expected: (n, ...) gradients by name; `actual` has at least the names of `expected`.
-        bounds: how closely.
+        bounds: of each comparison.
         excused: (n,) bool, Gaussians left out of the comparison.
 
     Returns:
@@ -166,7 +167,7 @@ def assert_gradients_match(
 
 
 def _rows(values: Tensor) -> Tensor:
-    """(n, ...) as (n, m), also for n = 0."""
+    """Return (n, ...) as (n, m), also for n = 0."""
     return values.flatten(1) if values.ndim > 1 else values[:, None]
 
 

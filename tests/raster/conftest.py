@@ -1,4 +1,4 @@
-"""What all raster tests share."""
+"""Share fixtures between the raster tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_torch_thread() -> Iterator[None]:
-    """The tensors of these tests are small: a second OpenMP thread only spins, ten times slower on a busy machine."""
+    """Use one PyTorch thread: on small tensors a second one only spins."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

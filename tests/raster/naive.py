@@ -1,8 +1,8 @@
-"""A rasterizer as a triple loop over plain floats: rows, columns, Gaussians. It shares no formula with the oracle.
+"""Render with a triple loop over plain floats: rows, columns, Gaussians. It shares no formula with the oracle.
 
-Where the oracle multiplies matrices this file adds up rank-one terms, where it has polynomials this file recurs over
-associated Legendre functions, and where it evaluates many pixels at once this file looks at one. Slow and in double
-precision only. It knows nothing of gradients, so finite differences of it witness those of others.
+The oracle multiplies matrices, this file adds up rank-one terms; the oracle has polynomials, this file uses recurrences
+of associated Legendre functions; the oracle evaluates many pixels at once, this file one. It is slow, in double
+precision, and has no gradients: those of other rasterizers are compared with its finite differences.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Pin = tuple[float | None, float | None]
 
 @dataclass(frozen=True)
 class NaiveResult:
-    """image (3, h, w), transmittance (h, w), radii (n,) int32, as a rasterizer's `RenderResult` has them."""
+    """Hold image (3, h, w), transmittance (h, w), radii (n,) int32, as in `RenderResult`."""
 
     image: Tensor
     transmittance: Tensor
@@ -32,7 +32,7 @@ class NaiveResult:
 
 @dataclass(frozen=True)
 class Splat:
-    """One Gaussian on the image plane: everything a pixel needs to know of it."""
+    """Hold one Gaussian on the image plane."""
 
     depth: float
     center: tuple[float, float]
@@ -50,7 +50,7 @@ def render(case: Case, *, shifts: Sequence[Vector] | None = None, pins: Sequence
     Args:
         case: any dtype; computed in double precision.
         shifts: n (x, y) pixels by which each centre is moved when blending, after its tiles were chosen.
-        pins: n fixed points for the Jacobians, as `jacobian_pins` finds them; None takes the 1.3 tan(fov / 2) limit.
+        pins: n fixed points for the Jacobians, from `jacobian_pins`; None uses the 1.3 tan(fov / 2) limit.
     """
     camera, n = case.camera, len(case.field)
     splats = project(case, pins or [(None, None)] * n)
@@ -70,7 +70,7 @@ def render(case: Case, *, shifts: Sequence[Vector] | None = None, pins: Sequence
 def blend_pixel(
     x: int, y: int, front_to_back: Sequence[tuple[Splat, Vector]], background: Vector
 ) -> tuple[list[float], float]:
-    """Colour and remaining transmittance of one pixel."""
+    """Return the colour and the remaining transmittance of one pixel."""
     color = [0.0, 0.0, 0.0]
     transmittance = 1.0
     for splat, shift in front_to_back:
@@ -94,7 +94,7 @@ def blend_pixel(
 
 
 def project(case: Case, pins: Sequence[Pin]) -> list[Splat | None]:
-    """Every Gaussian's splat, None where it is culled."""
+    """Return every Gaussian's splat, None where it is culled."""
     field = case.field
     degree = field.sh_degree if case.sh_degree is None else case.sh_degree
     pose = case.camera.world_to_camera.double().tolist()
@@ -122,13 +122,13 @@ def turn(pose: Sequence[Vector], vector: Vector) -> list[float]:
 
 
 def jacobian_limits(case: Case) -> tuple[float, float]:
-    """Largest |x / z| and |y / z| at which a Jacobian is taken."""
+    """Return the largest |x / z| and |y / z| at which a Jacobian is taken."""
     camera = case.camera
     return 1.3 * camera.width / (2 * camera.fx), 1.3 * camera.height / (2 * camera.fy)
 
 
 def jacobian_pins(case: Case) -> list[Pin]:
-    """Where the limited Jacobians are taken now: what the CUDA code's gradient holds constant."""
+    """Return the points of the clamped Jacobians, which the gradient of the CUDA code holds constant."""
     pose = case.camera.world_to_camera.double().tolist()
     pins = []
     for mean in case.field.means.detach().double().tolist():
@@ -143,7 +143,7 @@ def jacobian_pins(case: Case) -> list[Pin]:
 
 
 def footprint(case: Case, point: Vector, axes: Sequence[Vector], pin: Pin) -> Splat | None:
-    """The splat, still without opacity and colour, of a centre and three semi-axes in camera coordinates."""
+    """Return the splat, without opacity and colour, of a centre and three semi-axes in camera coordinates."""
     camera = case.camera
     x, y, z = point
     if z <= 0.2:
@@ -153,7 +153,7 @@ def footprint(case: Case, point: Vector, axes: Sequence[Vector], pin: Pin) -> Sp
         max(-bound, min(bound, c / z)) if fixed is None else fixed / z
         for c, bound, fixed in zip((x, y), jacobian_limits(case), pin, strict=True)
     )
-    # Each semi-axis as a difference of pixel positions, to first order; they add up to the covariance.
+    # Each semi-axis as a difference of pixel positions, to first order; the covariance is the sum of their squares.
     flat = [(camera.fx * (a - slope_x * c) / z, camera.fy * (b - slope_y * c) / z) for a, b, c in axes]
     xx, yy = sum(u * u for u, _ in flat) + 0.3, sum(v * v for _, v in flat) + 0.3
     xy = sum(u * v for u, v in flat)
@@ -174,7 +174,7 @@ def footprint(case: Case, point: Vector, axes: Sequence[Vector], pin: Pin) -> Sp
 
 
 def rotate(quaternion: Vector, axis: int) -> list[float]:
-    """The unit vector along `axis` turned by a wxyz quaternion of any length: v + 2 r x (r x v + w v) with r = xyz."""
+    """Rotate the unit vector along `axis` by a wxyz quaternion of any length: v + 2 r x (r x v + w v) with r = xyz."""
     length = math.sqrt(sum(c * c for c in quaternion))
     w, *r = (c / length for c in quaternion)
     v = [1.0 if k == axis else 0.0 for k in range(3)]
@@ -187,7 +187,7 @@ def cross(a: Vector, b: Vector) -> list[float]:
 
 
 def harmonics(direction: Vector, degree: int) -> list[float]:
-    """Real spherical harmonics with the Condon-Shortley phase, from angles, l by l and m from -l to l."""
+    """Return real spherical harmonics with the Condon-Shortley phase, from angles, l by l and m from -l to l."""
     x, y, z = direction
     cosine, azimuth = z / math.sqrt(x * x + y * y + z * z), math.atan2(y, x)
     values = []
@@ -201,7 +201,7 @@ def harmonics(direction: Vector, degree: int) -> list[float]:
 
 
 def legendre(degree: int, order: int, x: float) -> float:
-    """Associated Legendre function P_l^m(x) with the phase (-1)^m, by the usual recurrence in l."""
+    """Return the associated Legendre function P_l^m(x) with the phase (-1)^m, by the usual recurrence in l."""
     previous, current = 0.0, 1.0
     for k in range(order):
         current *= -(2 * k + 1) * math.sqrt(max(0.0, 1 - x * x))

@@ -17,7 +17,7 @@ def backgrounds() -> st.SearchStrategy[tuple[float, float, float]]:
 
 @st.composite
 def cameras(draw: st.DrawFn, max_side: int = 40) -> Camera:
-    """Any size from one pixel on, focal lengths from wide angle to tele, any pose, principal point anywhere in view."""
+    """Draw cameras of any size, from wide angle to tele, with any pose and any principal point in view."""
     width, height = draw(st.integers(1, max_side)), draw(st.integers(1, max_side))
     focal = draw(st.floats(0.4, 4.0)) * max(width, height)
     stretch = draw(st.sampled_from([1.0, 0.7, 1.6]))
@@ -33,7 +33,7 @@ def cameras(draw: st.DrawFn, max_side: int = 40) -> Camera:
 
 @st.composite
 def random_cases(draw: st.DrawFn, max_gaussians: int = 40, max_side: int = 40) -> Case:
-    """Ordinary scenes of every size, degree, sign and background, with Gaussians from sub-pixel to screen-filling."""
+    """Draw scenes of any size, degree, sign and background, with Gaussians from sub-pixel to screen-filling."""
     camera = draw(cameras(max_side))
     smallest = draw(st.sampled_from([0.01, 0.3, 1.0, 3.0]))
     case = random_case(
@@ -51,6 +51,6 @@ def random_cases(draw: st.DrawFn, max_gaussians: int = 40, max_side: int = 40) -
 
 
 def cases(max_gaussians: int = 40, max_side: int = 40) -> st.SearchStrategy[Case]:
-    """Random scenes, and now and then an adversarial one."""
+    """Draw random scenes, and sometimes an adversarial one."""
     named = st.sampled_from(sorted(ADVERSARIAL)).map(lambda name: ADVERSARIAL[name]())
     return st.one_of(random_cases(max_gaussians, max_side), random_cases(max_gaussians, max_side), named)

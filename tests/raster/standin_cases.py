@@ -1,4 +1,4 @@
-"""Calls of the CUDA modules that backbones import: made on a GPU to record what they return, and on the CPU to compare.
+"""Call the CUDA modules that backbones import: on a GPU to record their results, on the CPU to compare stand-ins.
 
 Each case is one call of one module with the same inputs, named in CASES; `outputs` gives all that it returns and the
 gradients of a fixed random combination of its differentiable results. Needs PyTorch only, as the recorder has no more.
@@ -20,12 +20,12 @@ WIDTH, HEIGHT, TAN_X = 33, 19, 0.6
 GAUSSIANS = 24
 SPLIT = {"fastgs", "taming", "taming-rasterizer", "graphdeco-accel"}
 WITHOUT_GRADIENTS = {"graphdeco-accel"}
-"""The copies in circulation leave out Gaussians of the backward pass by chance; see the stand-in."""
+"""The copies in circulation skip Gaussians of the backward pass at random; see `variants`."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """One rasterizer call.
+    """Describe one rasterizer call.
 
     Attributes:
         degree: SH degree.
@@ -93,7 +93,7 @@ def covariances(inputs: dict[str, Tensor]) -> Tensor:
 
 
 def outputs(module: ModuleType, variant: str, name: str, inputs: dict[str, Tensor], device: str) -> dict[str, Tensor]:
-    """What the case `name` returns, on the CPU: `out0` ... in the module's order, and `grad_` of each input."""
+    """Return the results of a case, on the CPU: `out0` ... in the module's order, and `grad_` of each input."""
     case = CASES[name]
     given = {key: value.to(device) for key, value in inputs.items()}
     values: dict[str, Any] = {

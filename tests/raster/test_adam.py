@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 
 SH_SHAPE = (37, 16, 3)
 
@@ -34,7 +35,7 @@ def sh_scale(dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def gradients(shape: tuple[int, ...], steps: int, dtype: torch.dtype) -> Iterator[Tensor]:
-    """As training makes them: of very different sizes, and exactly zero for rows no view saw."""
+    """Yield gradients like those of training: of very different sizes, and zero for rows that no view saw."""
     generator = torch.Generator().manual_seed(1)
     for _ in range(steps):
         row = (shape[0],) + (1,) * (len(shape) - 1)
@@ -48,7 +49,7 @@ def parameter(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> tor
 
 
 def descend(optimizer: torch.optim.Optimizer, values: list[Tensor]) -> Tensor:
-    """The optimizer's one parameter after a step on each gradient."""
+    """Return the optimizer's one parameter after a step on each gradient."""
     param: Tensor = optimizer.param_groups[0]["params"][0]
     for gradient in values:
         param.grad = gradient.clone()
@@ -57,7 +58,7 @@ def descend(optimizer: torch.optim.Optimizer, values: list[Tensor]) -> Tensor:
 
 
 def difference_from_torch(shape: tuple[int, ...], steps: int, dtype: torch.dtype, lr: float, eps: float) -> float:
-    """Largest difference of the parameters after some steps, in units of lr."""
+    """Return the largest difference of the parameters after some steps, in units of lr."""
     values = list(gradients(shape, steps, dtype))
     ours = descend(FieldAdam([parameter(shape, dtype)], lr=lr, eps=eps), values)
     theirs = descend(torch.optim.Adam([parameter(shape, dtype)], lr=lr, eps=eps, foreach=False), values)
@@ -69,6 +70,36 @@ def test_equals_torch_adam_over_many_steps(shape: tuple[int, ...]) -> None:
     # Rounding alone, summed over 300 steps. Worst seen: 9e-14 and 7.2e-5.
     assert difference_from_torch(shape, 300, torch.float64, lr=1e-2, eps=1e-15) < 1e-12
     assert difference_from_torch(shape, 300, torch.float32, lr=1e-2, eps=1e-15) < 3e-4
+
+
+def stepped(values: list[Tensor], rates: tuple[float, float], views: int = 1) -> Tensor:
+    """Return the tensor after a step of the PyTorch version on each gradient."""
+    start = parameter(SH_SHAPE, torch.float64).detach()
+    slot = AdamSlot(start.clone(), *(torch.zeros_like(start) for _ in range(3)), torch.zeros(()), *rates)
+    for gradient in values:
+        slot.step.add_(views)
+        step_torch([slot._replace(gradient=gradient)], views)
+    return slot.values
+
+
+def test_the_version_in_plain_pytorch_is_torch_adam_by_columns() -> None:
+    values = list(gradients(SH_SHAPE, 50, torch.float64))
+    found = stepped(values, (1e-2, 5e-4))
+    for columns, lr in ((slice(0, 1), 1e-2), (slice(1, None), 5e-4)):
+        part = torch.nn.Parameter(parameter(SH_SHAPE, torch.float64).detach()[:, columns].clone())
+        theirs = descend(torch.optim.Adam([part], lr=lr, eps=1e-15), [value[:, columns] for value in values])
+        torch.testing.assert_close(
+            found[:, columns], theirs, rtol=0, atol=1e-12 * lr * len(values)
+        )  # worst seen: 2e-13
+
+
+@pytest.mark.parametrize("views", [1, 4])
+def test_equals_the_version_in_plain_pytorch_for_several_views(views: int) -> None:
+    values = list(gradients(SH_SHAPE, 50, torch.float64))
+    optimizer = FieldAdam([parameter(SH_SHAPE, torch.float64)], lr=1e-2, column_scale=sh_scale(torch.float64))
+    optimizer.param_groups[0]["views"] = views
+    expected = stepped(values, (1e-2, 5e-4), views)
+    torch.testing.assert_close(descend(optimizer, values), expected, rtol=0, atol=1e-12)  # worst seen: 4e-16
 
 
 @settings(deadline=None, max_examples=30)
@@ -92,7 +123,7 @@ def test_column_scale_multiplies_the_learning_rate_of_each_column() -> None:
 
 
 def test_columns_that_become_active_later_train_as_if_they_always_had_been() -> None:
-    """The SH schedule: bands above the current degree have zero gradients until it rises."""
+    """Follow the SH schedule: bands above the current degree have zero gradients until it rises."""
     values = list(gradients(SH_SHAPE, 40, torch.float32))
     schedule = [1] * 10 + [4] * 10 + [9] * 10 + [16] * 10
     for value, active in zip(values, schedule, strict=True):

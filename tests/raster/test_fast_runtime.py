@@ -1,4 +1,4 @@
-"""How the fast rasterizer runs: the same bits always, many threads, memory used again, compiled once."""
+"""Check how the fast rasterizer runs: the same bits always, many threads, reused memory, one compilation."""
 
 from __future__ import annotations
 
@@ -245,14 +245,14 @@ def test_only_some_parameters_require_gradients() -> None:
 
 # ------------------------------------------------------------------------------------------------ compilation
 
-MESSAGE = "compiling the CPU rasterizer"
+MESSAGE = "compiling CPU kernels"
 PACKAGE = Path(__file__).parents[2] / "lapgs_plugin"
 
 
 def run_python(code: str, path: Path) -> str:
-    """What a fresh process, with `path` first among the places to import from, writes to stderr."""
+    """Return the stderr of a fresh process that imports from `path` first."""
     environment = dict(os.environ)
-    if path != PACKAGE.parent:  # a copy is compiled anew, whatever an earlier one at the same place left
+    if path != PACKAGE.parent:  # a copy is compiled again, even if an earlier one was at the same place
         environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
@@ -282,7 +282,7 @@ def test_a_second_process_does_not_compile() -> None:
 
 @pytest.fixture
 def copied_package(tmp_path: Path) -> Path:
-    """A folder with the kernels' sources, not compiled yet, and nothing that imports torch on the way to them."""
+    """Copy the kernels' sources, without compiled code and with an `__init__` that does not import torch."""
     shutil.copytree(PACKAGE, tmp_path / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / PACKAGE.name / "reference_raster" / "__init__.py").write_text("")
     return tmp_path
@@ -299,11 +299,11 @@ for kind in (np.int32, np.int64):
 """
 
 
-def test_compiling_is_announced_once_and_happens_again_only_after_a_change(copied_package: Path) -> None:
+def test_compilation_is_reported_once_and_repeated_only_after_a_change(copied_package: Path) -> None:
     assert run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package).count(MESSAGE) == 1
     assert run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package) == ""
-    with (copied_package / "lapgs_plugin" / "reference_raster" / "lanes.py").open("a") as file:
-        file.write("# a module that the kernel's own does not even import\n")
+    with (copied_package / "lapgs_plugin" / "jit" / "lanes.py").open("a") as file:
+        file.write("# a change\n")
     assert MESSAGE in run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
 
 

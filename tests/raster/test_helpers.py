@@ -1,4 +1,4 @@
-"""The helpers of the raster tests fail when they should: a helper that forgives everything proves nothing."""
+"""Check that the helpers of the raster tests fail when they should."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_match_needs_every_expected_name(gradient: Tensor) -> None:
 
 
 class _Painter:
-    """A rasterizer whose gradients are known without any rendering: the image is the sum of all it is given."""
+    """Rasterize without rendering, with known gradients: the image is the sum of all inputs."""
 
     name = "painter"
 
@@ -214,7 +214,7 @@ def test_scenes_are_the_same_every_time(name: str) -> None:
 
 
 def test_scenes_do_what_their_names_say() -> None:
-    """The adversarial scenes really reach the case they are there for, as the naive loop sees it."""
+    """Check with the naive loop that the adversarial scenes reach their case."""
     built = {name: builder() for name, builder in scenes.ADVERSARIAL.items()}
 
     def splats(name: str) -> list[naive.Splat]:
@@ -256,7 +256,7 @@ def test_naive_harmonics_are_the_textbook_ones() -> None:
 
 
 def test_naive_rotation_is_the_textbook_one() -> None:
-    """A quarter turn about z takes x to y, whatever the length of the quaternion."""
+    """Rotate x to y by a quarter turn about z, with a quaternion of any length."""
     half = math.sqrt(0.5)
     assert naive.rotate([3 * half, 0, 0, 3 * half], 0) == pytest.approx([0, 1, 0], abs=1e-15)
 

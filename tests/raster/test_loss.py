@@ -1,4 +1,4 @@
-"""The fused photometric loss against PyTorch convolutions, finite differences, closed forms and kornia."""
+"""Check the fused photometric loss against PyTorch convolutions, finite differences, closed forms and kornia."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def restored_threads() -> Iterator[None]:
 
 
 def conv_ssim_map(p: Tensor, t: Tensor) -> Tensor:
-    """SSIM by its definition: five moments, each a dense 11x11 convolution with zeros around the image."""
+    """Compute SSIM by its definition: five moments, each a dense 11x11 convolution with zeros around the image."""
     offsets = torch.arange(-5, 6, dtype=p.dtype)
     squared_radius = offsets[:, None] ** 2 + offsets[None, :] ** 2  # (11, 11)
     window = torch.exp(-squared_radius / (2 * 1.5**2))
@@ -47,7 +47,7 @@ def conv_loss(p: Tensor, t: Tensor, weight: float) -> Tensor:
 
 
 def images(shape: tuple[int, int, int], seed: int = 0, low: float = 0.0, high: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Two related images of values in [low, high], float64."""
+    """Make two related images of values in [low, high], float64."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(shape, generator=generator, dtype=torch.float64)
     noise = torch.rand(shape, generator=generator, dtype=torch.float64)

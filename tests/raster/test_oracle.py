@@ -112,7 +112,7 @@ def test_background_is_blended_last(case: Case) -> None:
 @given(scenes.random_cases(), st.floats(-3, 3), st.integers(0, 1000))
 @settings(deadline=None, max_examples=20)
 def test_signed_images_are_linear_in_the_harmonics(case: Case, factor: float, seed: int) -> None:
-    """What makes residuals add up: no clamp and no shift anywhere, at any degree."""
+    """Residuals add up because nothing is clamped or shifted, at any degree."""
     other = torch.randn(case.field.sh.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
     def image(sh: torch.Tensor) -> torch.Tensor:
@@ -262,7 +262,7 @@ def test_refuses_a_background_that_is_no_color() -> None:
 
 
 def test_a_gaussian_with_numbers_that_are_not_finite_is_culled() -> None:
-    """As in the CUDA code, where it touches no tile; whoever trains has to look for NaN."""
+    """As in the CUDA code, a NaN centre touches no tile; training has to look for NaN itself."""
     case = scenes.random_case(20, 30, 20, seed=31)
     field: GaussianField = case.field.with_parameters({"means": case.field.means.clone()})
     field.means[4] = math.nan

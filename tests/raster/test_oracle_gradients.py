@@ -27,7 +27,7 @@ STEP = 1e-5
 DIFFERENCE_NOISE = 2e-9
 """Differences of losses of about 10 are rounded by this."""
 STEP_TOLERANCE = 4e-5
-"""A step moves what is compared with a threshold by no more than this, relatively."""
+"""Relative bound on the change of quantities compared with thresholds in one step."""
 
 # Worst seen: element 6.4e-8, row 2.4e-7, L2 5.4e-8, all of them errors of the differences.
 DIFFERENCE_BOUNDS = GradientBounds(element=5e-7, row=3e-6, row_floor=1e-5, relative_l2=5e-7)
@@ -36,7 +36,7 @@ FLOAT32_BOUNDS = GradientBounds(element=5e-3, row=0.1, row_floor=1e-3, relative_
 
 
 def small(case: Case) -> Case:
-    """The case at a smaller size and with its first six Gaussians, so that differences take a moment only."""
+    """Shrink a case and keep its first six Gaussians, so that finite differences are fast."""
     camera = case.camera.resized(min(case.camera.width, 18), min(case.camera.height, 13))
     field = case.field.with_parameters({name: value[:6] for name, value in case.field.parameters.items()})
     return replace(case, field=field, camera=camera)
@@ -95,13 +95,13 @@ def finite_differences(
 
 
 def without_noise(actual: Tensor, expected: Tensor) -> Tensor:
-    """The expected differences, replaced by the actual values where only the rounding of the loss tells them apart."""
+    """Replace expected differences by the actual values where they differ only by the rounding of the loss."""
     return torch.where((actual - expected).abs() <= DIFFERENCE_NOISE, actual, expected)
 
 
 @pytest.mark.parametrize("name", SMALL_CASES)
 def test_equals_finite_differences(name: str) -> None:
-    """Every Gaussian's parameters, with the limited Jacobians held where the CUDA code holds them."""
+    """Differentiate by every parameter, with the clamped Jacobians held constant as in the CUDA code."""
     case = SMALL_CASES[name]
     weights, mask = masked_weights(case, STEP_TOLERANCE)
     assert mask.pixels.double().mean() < 0.3
@@ -218,7 +218,7 @@ def test_jacobian_limit_holds_the_clamped_coordinate_constant() -> None:
 
 
 def test_jacobian_limit_departs_from_the_textbook_by_a_visible_amount() -> None:
-    """The derivative of the image itself is another one, so the test against pinned differences is not idle."""
+    """The derivative of the image itself differs, so the test against pinned differences can fail."""
     case = SMALL_CASES["outside_frustum"]
     weights, _ = masked_weights(case, STEP_TOLERANCE)
     actual = scenes.gradients(ORACLE, case, weights)

@@ -1,4 +1,4 @@
-"""The mask covers what rounding can turn, names each kind of decision, and covers next to nothing else."""
+"""Check that the mask covers decisions that rounding can change, of every kind, and hardly anything else."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_a_centre_at_the_limit_of_the_jacobian_is_a_kink() -> None:
 
 
 def needle_at_45_degrees(length: float) -> Case:
-    """A needle across the image with a standard deviation of `length` pixels along, and next to none across."""
+    """Make a needle across the image with a standard deviation of `length` pixels, and almost none across."""
     case = round_gaussians([[15.5, 9.5, 2.0]], 1.0, [0.5])
     turn = torch.tensor([[math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]], dtype=torch.float64)
     log_scales = torch.tensor([[length * 2 / 100, 1e-9, 1e-9]], dtype=torch.float64).log()
@@ -219,7 +219,7 @@ def test_mask_is_small_on_ordinary_scenes(seed: int) -> None:
 
 
 def training_case(width: int, height: int, n: int, *, seed: int = 0) -> Case:
-    """A scene as training sees it: SH degree 3, about 40 Gaussians blended a pixel, in float32."""
+    """Make a scene like those of training: SH degree 3, about 40 Gaussians blended a pixel, in float32."""
     camera = scenes.make_camera(width, height)
     spread = math.sqrt(width * height / n)  # distance in pixels of neighbours, were they in one plane
     case = scenes.random_case(

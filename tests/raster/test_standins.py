@@ -25,7 +25,7 @@ SPLIT = {"graphdeco-accel", "taming", "taming-rasterizer", "fastgs"}
 
 
 def settings_of(module: ModuleType, camera: Camera, background: tuple[float, ...], degree: int, **more: Any) -> Any:
-    """Settings as the checkouts make them: transposed matrices, half fields of view."""
+    """Make settings like the checkouts: transposed matrices, half fields of view."""
     tanx, tany = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
     projection = torch.zeros(4, 4, dtype=torch.float64)
     projection[0, 0], projection[1, 1], projection[3, 2] = 1 / tanx, 1 / tany, 1
@@ -46,7 +46,7 @@ def settings_of(module: ModuleType, camera: Camera, background: tuple[float, ...
 
 
 def activated(case: Case) -> dict[str, Tensor]:
-    """What checkouts pass to the rasterizer, differentiable by the field's parameters."""
+    """Return the arguments that checkouts pass to the rasterizer, differentiable by the field's parameters."""
     field = case.field
     return {
         "means3D": field.means, "opacities": field.opacity_logits.sigmoid()[:, None],
@@ -68,7 +68,7 @@ def call(module: ModuleType, variant: str, case: Case, inputs: dict[str, Tensor]
 
 
 def module_of(variant: str) -> ModuleType:
-    return stand_ins(variant)[VARIANTS[variant][0]]
+    return stand_ins(variant)[VARIANTS[variant].module]
 
 
 def case_of(*, signed: bool = False, sh_degree: int = 3, n: int = 60, **more: Any) -> Case:
@@ -278,7 +278,7 @@ def test_round_gaussians_may_come_as_covariances() -> None:
 
 
 def dimmed(case: Case) -> Case:
-    """The case with opacities as antialiasing dims them, and its gradient as the CUDA code has it."""
+    """Return the case with opacities dimmed by antialiasing, with the gradient of the CUDA code."""
     seen = project(case.field, case.camera)
     xx, xy, yy = (seen.conics[:, i] * seen.determinants * sign for i, sign in ((2, 1), (1, -1), (0, 1)))
 
@@ -293,7 +293,7 @@ def dimmed(case: Case) -> Case:
 
 
 def by_inverse_depth(case: Case) -> Case:
-    """The case in shades of 1 / depth over black."""
+    """Return the case in shades of 1 / depth over black."""
     pose = case.camera.world_to_camera
     depth = case.field.means @ pose[2, :3] + pose[2, 3]
     sh = (1 / depth)[:, None, None].expand(-1, 1, 3) * math.sqrt(4 * math.pi)
@@ -345,10 +345,10 @@ def test_scale_modifier_multiplies_scales_but_not_their_gradient() -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_training_loop_written_for_the_cuda_module_learns(variant: str) -> None:
-    """The calls of a checkout's train.py in their order: render, SSIM, statistics of densification, optimizer."""
+    """Call like a checkout's train.py: render, SSIM, densification statistics, optimizer."""
     case = case_of(sh_degree=1, n=80)
     with install(variant) as found, torch.no_grad():
-        module = found[VARIANTS[variant][0]]
+        module = found[VARIANTS[variant].module]
         fused_ssim = found["fused_ssim"].fused_ssim
         target = call(module, variant, case, activated(case))[0]
         start = case.field.with_parameters({"sh": torch.zeros_like(case.field.sh)})

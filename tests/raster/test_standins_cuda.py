@@ -43,7 +43,7 @@ def assert_close(actual: Tensor, expected: Tensor, name: str, bound: float) -> N
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_rasterizer_returns_what_its_cuda_module_does(variant: str, case: str) -> None:
-    module = stand_ins(variant)[VARIANTS[variant][0]]
+    module = stand_ins(variant)[VARIANTS[variant].module]
     found = outputs(module, variant, case, load("inputs"), "cpu")
     recorded = {key.split("/")[1]: value for key, value in load(variant).items() if key.startswith(f"{case}/")}
     assert found.keys() == recorded.keys()

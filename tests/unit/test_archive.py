@@ -19,14 +19,9 @@ from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runs.archive import (
-    FORMAT_VERSION,
-    MANIFEST,
-    LevelRecord,
-    Manifest,
-    RunArchive,
-    SceneReference,
-)
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import FORMAT_VERSION, LevelRecord, Manifest, SceneReference
 from tests.mishaps import FailingWrites, Killed, disk_full
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals, limits and permissions")
@@ -83,7 +78,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_a_run_comes_back_as_it_was_written(tmp_path: Path) -> None:
+def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path / "deep" / "run", manifest()) as archive:
         assert (archive.available_levels, archive.manifest.complete, archive.manifest.next_level) == ((), False, 1)
         finish(archive, 1)
@@ -159,7 +154,7 @@ def test_an_existing_run_is_refused_and_unharmed(tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
 
 
-def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
+def test_overwrite_removes_only_files_of_a_run(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path, manifest()) as archive:
         archive.finish_level(record(1), level_field(1), {"x": 1})
         archive.append_history({"level": 0, "iteration": 1})
@@ -190,7 +185,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, name: str, overwrite
     assert snapshot(tmp_path) == before
 
 
-def test_a_file_in_the_runs_place_is_refused(tmp_path: Path) -> None:
+def test_a_file_of_the_runs_name_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("x")
     with pytest.raises(RunFolderError, match="is a file, expected a folder"):
         RunArchive.create(tmp_path / "run", manifest(), overwrite=True)
@@ -219,7 +214,7 @@ def edit_manifest(folder: Path, **changes: Any) -> None:
     (folder / "manifest.json").write_text(json.dumps({k: v for k, v in values.items() if v is not ...}, default=str))
 
 
-def test_opening_what_is_no_run(tmp_path: Path) -> None:
+def test_opening_a_folder_without_a_run(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="does not exist"):
         RunArchive.open(tmp_path / "nowhere")
     with pytest.raises(RunFolderError, match=r"has no manifest\.json"):
@@ -283,7 +278,7 @@ def test_values_damaged_after_opening_are_found_on_reading(tmp_path: Path) -> No
 # Crashes
 
 
-def test_a_run_killed_at_any_write_opens_with_what_was_finished(
+def test_a_run_killed_at_any_write_opens_with_its_finished_levels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writes = FailingWrites(monkeypatch, Killed)
@@ -319,7 +314,7 @@ def test_a_run_killed_at_any_write_opens_with_what_was_finished(
 
 
 def thawed_fields(seed: int = 9) -> dict[int, GaussianField]:
-    """What the two finished levels of three become along with the third."""
+    """Return both finished fields of three after joint training with the third."""
     return {level: replace(level_field(level, 3), means=torch.full((4 + level, 3), float(seed))) for level in (2, 1)}
 
 
@@ -335,7 +330,7 @@ def finish_with_others(archive: RunArchive) -> None:
 
 
 def assert_all_or_nothing(archive: RunArchive) -> None:
-    """Either the last level is there and with it what the others became, or none of it."""
+    """Check that the run has the last level and the jointly trained fields, or none of them."""
     for level, thawed in thawed_fields().items():
         expected = thawed if archive.manifest.complete else level_field(level, 3)
         assert torch.equal(archive.field(level).means, expected.means)
@@ -344,7 +339,7 @@ def assert_all_or_nothing(archive: RunArchive) -> None:
 SETTLED = {"manifest.json", ".lock", *(f"level_{level}/point_cloud.ply" for level in range(3))}
 
 
-def test_fields_trained_along_take_their_predecessors_places(tmp_path: Path) -> None:
+def test_jointly_trained_fields_replace_their_predecessors(tmp_path: Path) -> None:
     with two_of_three(tmp_path) as archive:
         finish_with_others(archive)
         assert set(snapshot(tmp_path)) == SETTLED
@@ -353,10 +348,10 @@ def test_fields_trained_along_take_their_predecessors_places(tmp_path: Path) -> 
     assert_all_or_nothing(RunArchive.open(tmp_path))
 
 
-def test_fields_trained_along_are_kept_with_their_level_or_not_at_all(
+def test_jointly_trained_fields_are_kept_with_their_level_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed at any write and between any two: who reads, who goes on, and what lies there in the end."""
+    """Kill at any write and between any two; then read, resume, and check the remaining files."""
     writes = FailingWrites(monkeypatch, Killed)
     complete: list[bool] = []
     done = False
@@ -383,7 +378,7 @@ def test_fields_trained_along_are_kept_with_their_level_or_not_at_all(
     assert complete == [False] * 11 + [True] * 4
 
 
-def test_a_disk_that_is_full_at_any_write_leaves_the_fields_and_a_second_attempt(
+def test_a_disk_that_is_full_at_any_write_keeps_the_fields_and_a_second_attempt_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writes = FailingWrites(monkeypatch, disk_full)
@@ -402,7 +397,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_the_fields_and_a_second_attempt
         assert set(snapshot(folder)) == SETTLED
 
 
-def test_nan_in_a_field_trained_along_leaves_everything(tmp_path: Path) -> None:
+def test_nan_in_a_jointly_trained_field_changes_nothing(tmp_path: Path) -> None:
     with two_of_three(tmp_path) as archive:
         before = snapshot(tmp_path)
         thawed = thawed_fields()
@@ -412,7 +407,7 @@ def test_nan_in_a_field_trained_along_leaves_everything(tmp_path: Path) -> None:
         assert snapshot(tmp_path) == before
 
 
-def test_only_finished_levels_can_have_been_trained_along(tmp_path: Path) -> None:
+def test_only_finished_levels_can_be_trained_jointly(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path, manifest(3)) as archive:
         before = snapshot(tmp_path)
         with pytest.raises(RunFolderError, match="level 1 is not in this run"):
@@ -420,8 +415,8 @@ def test_only_finished_levels_can_have_been_trained_along(tmp_path: Path) -> Non
         assert snapshot(tmp_path) == before
 
 
-def test_what_waits_for_a_level_never_comes_into_another_run(tmp_path: Path) -> None:
-    """Neither when that run is replaced, nor when replacing it is interrupted before it is removed."""
+def test_fields_of_an_unfinished_level_never_get_into_another_run(tmp_path: Path) -> None:
+    """Whether that run is replaced, or its replacement is interrupted."""
     for remove_at_once in (True, False):
         folder = tmp_path / str(remove_at_once)
         two_of_three(folder).close()
@@ -471,7 +466,7 @@ def test_two_writers_in_one_process_are_refused(tmp_path: Path) -> None:
     RunArchive.open(tmp_path, resume=True).close()
 
 
-def test_writing_needs_the_hold(tmp_path: Path) -> None:
+def test_writing_needs_the_lock(tmp_path: Path) -> None:
     complete_run(tmp_path)
     archive = RunArchive.open(tmp_path)
     with pytest.raises(AssertionError, match="resume=True"):
@@ -509,7 +504,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path, monkeypatch: 
 
 @posix_only
 def test_a_disk_that_fills_in_the_middle_of_a_file(tmp_path: Path) -> None:
-    """A limit on the size of files makes the kernel itself refuse, with half of the bytes written."""
+    """With a limit on file sizes, the kernel itself refuses after half of the bytes."""
     script = f"""
 import resource, sys
 sys.path.insert(0, {str(Path(__file__).parents[2])!r})
@@ -572,7 +567,7 @@ def test_a_damaged_line_of_history_is_numbered(tmp_path: Path) -> None:
             archive.history()
 
 
-def test_rewinding_drops_what_comes_later_in_training(tmp_path: Path) -> None:
+def test_rewinding_drops_later_entries(tmp_path: Path) -> None:
     order = [(2, 5), (2, 10), (1, 5), (1, 10), (0, 5), (0, 10)]  # (level, iteration) as training visits them
     for place, (level, iteration) in enumerate(order):
         with RunArchive.create(tmp_path / str(place), manifest(3)) as archive:
@@ -627,7 +622,7 @@ def test_optimizer_state_waits_for_the_next_level(tmp_path: Path) -> None:
         assert torch.equal(archive.optimizer_state(2)["means"]["exp_avg"], moments["means"]["exp_avg"])
         finish(archive, 1)
         for level in (2, 1):
-            with pytest.raises(RunFolderError, match=r"does not exist, and the next level goes on with it"):
+            with pytest.raises(RunFolderError, match=r"does not exist, and the next level continues from it"):
                 archive.optimizer_state(level)
         assert_level_is_whole(archive, 2)
 

@@ -1,4 +1,4 @@
-"""The runtime breakdown: parts are what was spent in them, add up to the whole, and cost nothing when not measured."""
+"""The runtime breakdown: parts have the time spent in them, and add up to the whole."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.runs.breakdown import (
+from lapgs_plugin.runs.profiling import (
     PARTS,
     UNREAD_EVENTS,
     Breakdown,
@@ -24,14 +24,14 @@ from lapgs_plugin.runs.breakdown import (
 
 @dataclass
 class LaggingClock(Clock[int]):
-    """A GPU's: stamps are tickets, whose moments come only after the work before them, in whole seconds.
+    """Stand in for a GPU's clock: stamps are tickets, reached only after the work before them, in whole seconds.
 
     Attributes:
-        now: when the work given so far will be done.
-        done: up to when it is.
+        now: time when the work given so far will be done.
+        done: time up to which it is done.
         times: moment of each ticket.
-        waits: how often somebody waited.
-        held: tickets neither released nor never given.
+        waits: number of waits.
+        held: tickets given and not released.
     """
 
     now: int = 0
@@ -100,7 +100,7 @@ def test_every_second_belongs_to_the_part_that_was_marked_last(steps: list[tuple
     assert len(clock.held) == 1  # the last mark; all others were released
 
 
-def test_marks_are_read_without_waiting_once_the_work_has_passed() -> None:
+def test_marks_are_read_without_waiting_after_the_work() -> None:
     clock = LaggingClock()
     breakdown = TimedBreakdown(clock)
     for _ in range(10 * UNREAD_EVENTS):
@@ -131,7 +131,7 @@ def test_parts_of_known_sleeps() -> None:
     assert found["optimizer"] == found["other"] == 0.0
 
 
-def test_what_was_measured_before_is_continued() -> None:
+def test_an_earlier_measurement_is_continued() -> None:
     clock = LaggingClock()
     breakdown = TimedBreakdown(clock, {"forward": 2.5, "other": 1.0})
     breakdown.mark("forward")
@@ -170,7 +170,7 @@ def test_a_gpu_is_timed_without_waiting_for_it(monkeypatch: pytest.MonkeyPatch) 
 
     # A GPU's queue takes about a thousand commands before it makes the processor wait: few marks, read early.
     unread, rounds, bursts = 16, 40, 2
-    monkeypatch.setattr("lapgs_plugin.runs.breakdown.UNREAD_EVENTS", unread)
+    monkeypatch.setattr("lapgs_plugin.runs.profiling.UNREAD_EVENTS", unread)
     lengths = {"forward": 2.0, "backward": 4.0, "optimizer": 1.0}  # milliseconds
     cycles = 1e6
     seconds(10.0)

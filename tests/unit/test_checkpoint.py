@@ -1,4 +1,4 @@
-"""Damaged checkpoints and optimizer states: one line, and the run is as it was."""
+"""Damaged checkpoints and optimizer states give one line and leave the run unchanged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ import torch
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.runs.archive import CHECKPOINT, Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -39,7 +40,7 @@ Saved = dict[str, Any]
 
 
 class StopInTheEnd(Monitor):
-    """Asks the run to stop one iteration before its end, when the base is trained along."""
+    """Stop the run one iteration before its end, during joint training."""
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         if (tick.level, tick.iteration) == (0, stage.iterations - 1):
@@ -53,7 +54,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def stopped(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that was stopped in its last stage."""
+    """Return a run that was stopped in its last stage."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
     reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="cpu", **SETTINGS.for_manifest())
@@ -68,7 +69,7 @@ def resume(folder: Path, scene: Scene) -> None:
 
 
 def put(saved: Any, value: Any, *keys: Any) -> Any:
-    """`saved` with another value somewhere in it."""
+    """Return `saved` with another value at a path of keys."""
     at = saved
     for key in keys[:-1]:
         at = at[key]
@@ -85,7 +86,7 @@ def drop(saved: Saved, *keys: Any) -> Saved:
 
 
 def cut(saved: Saved, *keys: Any) -> Saved:
-    """One tensor without its last row."""
+    """Return `saved` with one tensor that lacks its last row."""
     at = saved
     for key in keys[:-1]:
         at = at[key]
@@ -111,7 +112,7 @@ DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     ),
     "iteration too large": (
         lambda saved: put(saved, 999, "state", "progress", "iteration"),
-        "progress.iteration is 999, expected at most 16",
+        "progress.iteration is 999, expected at most 12",
     ),
     "unknown": (lambda saved: put(saved, 1, "state", "colour"), "it has an unknown key colour"),
     "overhead": (lambda saved: put(saved, [], "state", "overhead"), "overhead is"),
@@ -189,7 +190,7 @@ def test_a_damaged_checkpoint_is_one_line(name: str, stopped: Path, scene: Scene
         path.write_bytes(whole)
 
 
-def test_a_checkpoint_of_a_finished_level_is_said(
+def test_a_checkpoint_of_a_finished_level_is_reported(
     stopped: Path, scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = stopped / CHECKPOINT
@@ -204,7 +205,7 @@ def test_a_checkpoint_of_a_finished_level_is_said(
 
 
 def bomb() -> bytes:
-    """A zip file whose contents are a thousand times as large."""
+    """Return a zip file with contents a thousand times as large."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("checkpoint/data.pkl", pickle.dumps({"level": 0}))
@@ -262,6 +263,6 @@ def test_a_damaged_optimizer_state_is_one_line(
 
 
 def test_the_checkpoint_itself_is_fine(stopped: Path, scene: Scene) -> None:
-    """Last in this file: the run ends."""
+    """Last in this file, because the run ends."""
     resume(stopped, scene)
     assert RunArchive.open(stopped).manifest.complete

@@ -9,7 +9,7 @@ import pytest
 
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.reports.comparison import Cell, comparison_rows, setup_differences
-from lapgs_plugin.runs.archive import LevelRecord, Manifest, SceneReference
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.runs.training_figures import training_figures
 from tests.training_scene import blob_field
 

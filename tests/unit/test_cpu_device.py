@@ -1,4 +1,4 @@
-"""Inside of `cuda_on_cpu` a script that says "cuda" runs here; outside, nothing is as it was not before."""
+"""Test `cuda_on_cpu`: a script for "cuda" runs inside, and everything is restored afterwards."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def on_cpu(tensor: Tensor) -> bool:
 
 
 def missing(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """Let packages be absent, whether this machine has them or not."""
+    """Hide packages, whether this machine has them or not."""
     for name in [key for key in sys.modules if key.partition(".")[0] in names]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(absent, "find_spec", lambda name: None if name in names else find_spec(name))
@@ -62,7 +62,7 @@ def test_every_way_to_name_a_device_means_the_cpu(device: Any) -> None:
 
 
 def calls_that_work(function: Any) -> Any:
-    """Arguments that a function of torch takes, beside a device; None if none of a few common ones do."""
+    """Return arguments for a function of torch that takes a device; None if no common ones fit."""
     ones = torch.ones(2, 2)
     options = (
         (),
@@ -86,11 +86,11 @@ def calls_that_work(function: Any) -> Any:
 
 
 def test_every_factory_of_torch_takes_cuda() -> None:
-    """torch's own list of functions that make tensors on a device, and those that make them like another."""
+    """All functions of torch that make tensors take a device, by its own list."""
     likes = [getattr(torch, name) for name in dir(torch) if name.endswith("_like")]
     arguments = {function: calls_that_work(function) for function in [*_device_constructors(), *likes]}
     tried = {function: given for function, given in arguments.items() if given is not None}
-    assert len(tried) >= 25  # 34 of 43 in torch 2.13; the others want what is not common
+    assert len(tried) >= 25  # 34 of 43 in torch 2.13; the others take uncommon arguments
     with cuda_on_cpu("graphdeco"):
         for function, given in tried.items():
             made = function(*given, device="cuda")
@@ -173,7 +173,7 @@ def test_same_random_numbers_as_without() -> None:
 
 
 def state() -> dict[str, Any]:
-    """What a context could leave behind: the modules, names of torch and of torch.cuda, and whether torch is hooked."""
+    """Return all state that the context changes: modules, names of torch and torch.cuda, and torch's modes."""
     found = {f"torch.cuda.{name}": value for name, value in vars(torch.cuda).items()}
     found |= {f"torch.autograd.{name}": value for name, value in vars(torch.autograd).items()}
     found |= {f"torch.{name}": value for name, value in vars(torch).items()}
@@ -187,7 +187,7 @@ def state() -> dict[str, Any]:
 def test_everything_is_restored_by_identity(monkeypatch: pytest.MonkeyPatch) -> None:
     missing(monkeypatch, "torchvision", "cv2", "websockets", "tqdm")
     with cuda_on_cpu("taming"):
-        assert on_cpu(torch.ones(1, device="cuda"))  # what is imported when it is first used, is imported now
+        assert on_cpu(torch.ones(1, device="cuda"))  # torch imports some modules at first use
     before = state()
     with cuda_on_cpu("taming"):
         inside = state()
@@ -241,7 +241,7 @@ def test_packages_that_are_not_there_are_named_when_they_are_called(monkeypatch:
 
 
 def test_edges_are_those_of_eight_bit_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two transforms against what they are defined to be: whole steps of 255 cut off, and back by a division."""
+    """The two transforms multiply by 255 and round down, and divide by 255."""
     missing(monkeypatch, "torchvision")
     levels = np.random.default_rng(0).integers(0, 256, (3, 4, 5))
     between = torch.from_numpy((levels + 0.4) / 255.4).float()

@@ -13,7 +13,9 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.strategies import Default
 from tests.training_scene import blob_field, ring_camera
 
 EXTENT = 2.0
@@ -35,12 +37,12 @@ def rendered(n: int, seed: int) -> RenderResult:
 def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
     settings = TrainSettings(
         iterations=100,
-        densification=Densification(start=2, until=60, every=10, reset_every=1000, grow_grad2d=2e-4, absgrad=absgrad),
+        densification=Densification(start=2, until=60, every=10, reset_every=1000),
     )
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)
     fields = [TrainableField.create(blob_field(200), settings.learning_rates, EXTENT) for _ in range(2)]
-    ours = Densifier(schedule, settings.densification, EXTENT)
+    ours = Densifier(schedule, Default(grow_grad2d=2e-4, absgrad=absgrad), EXTENT)
     theirs = DefaultStrategy(
         refine_start_iter=2, refine_stop_iter=60, refine_every=10, reset_every=1000, absgrad=absgrad
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.adapters.registry import recognise_checkout
+from lapgs_plugin.cli.doctor import current_folder
 from lapgs_plugin.environment import findings, probes
 from lapgs_plugin.environment.findings import Finding, Requirement
 from lapgs_plugin.environment.probes import Probe
@@ -155,7 +155,7 @@ GRAPHDECO = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.
 @pytest.mark.parametrize(
     ("files", "name"),
     [
-        (GRAPHDECO, "graphdeco 3DGS or a fork of it"),
+        (GRAPHDECO, "graphdeco 3DGS"),
         ((*GRAPHDECO, "utils/taming_utils.py"), "Taming-3DGS"),
         ((*GRAPHDECO, "utils/taming_utils.py", "utils/fast_utils.py"), "FastGS"),
         (("gsplat/rendering.py", "examples/simple_trainer.py"), "gsplat"),
@@ -166,5 +166,6 @@ def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
-    found = recognise_checkout(tmp_path)
-    assert (found.name if found else None) == name
+    found = current_folder(tmp_path, has_gpu=False)
+    assert found.detail.startswith(f"a checkout of {name}" if name else "not a known 3DGS checkout")
+    assert ("lapgs run" in found.detail) == (name not in (None, "gsplat"))

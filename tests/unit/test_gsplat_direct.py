@@ -16,7 +16,8 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.backend import training_rasterizer
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
@@ -51,7 +52,7 @@ def test_it_is_used() -> None:
 
 
 def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
-    direct_works.cache_clear()
+    direct_works.forget()
     with torch.inference_mode():
         assert direct_works()
 

@@ -1,4 +1,4 @@
-"""Hooks: their order as one literal list, chaining, and what is refused when they are attached."""
+"""Test hooks: their order as one literal list, chaining, and errors when they are attached."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def context(stage: Stage = RESIDUAL) -> StageContext:
 
 
 class Recorder(StageHook):
-    """Notes every call, and what it sees in the ones that return something."""
+    """Note every call, and the image of calls that return something."""
 
     name = "recorder"
 
@@ -103,7 +103,7 @@ class NoisySupervision(SupervisionLoss):
 
 
 def register(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
-    """Pretend that installed packages registered these hooks, in this order."""
+    """Register hooks as installed packages would, in this order."""
     group = [EntryPoint(name=name, value=value, group="lapgs_plugin.hooks") for name, value in entries.items()]
 
     def find(*, group: str, _entries: list[EntryPoint] = group) -> list[EntryPoint]:
@@ -345,7 +345,7 @@ def test_entry_points_that_cannot_be_used_are_named(monkeypatch: pytest.MonkeyPa
 
 
 def test_an_installed_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The real mechanism: a distribution's metadata on the path."""
+    """Hooks are found by a distribution's metadata on the path."""
     info = tmp_path / "my_hooks-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_hooks\nVersion: 1.0\n")

@@ -1,4 +1,4 @@
-"""Images that come back as they were put, wherever they were kept; on a GPU also while it is busy."""
+"""Stored images are returned as they were put, from every place, also while a GPU is busy."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def eight_bit(*shape: int) -> Tensor:
 @in_every_precision
 @settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(values=arrays(np.float32, array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.floats(-3, 3, width=32)))
-def test_images_come_back_within_their_precision(
+def test_images_are_returned_within_their_precision(
     tmp_path: Path, device: str, where: str, precision: str, values: np.ndarray
 ) -> None:
     with store(tmp_path, where, precision, device) as kept:
@@ -68,7 +68,7 @@ def test_images_come_back_within_their_precision(
 
 
 @on_every_device
-def test_photographs_come_back_as_codebases_decode_them(tmp_path: Path, device: str, where: str) -> None:
+def test_photographs_are_returned_as_codebases_decode_them(tmp_path: Path, device: str, where: str) -> None:
     every = torch.arange(256, dtype=torch.uint8).view(1, 16, 16)
     for number, stored in enumerate(
         [every, eight_bit(3, 7, 9), every[:, 3:4], torch.zeros(3, 1, 1, dtype=torch.uint8)]
@@ -83,7 +83,7 @@ def test_photographs_come_back_as_codebases_decode_them(tmp_path: Path, device: 
             assert torch.equal(kept.get("decoded there").cpu(), image), number
 
 
-def test_images_that_are_nearly_photographs_are_not_taken_for_some() -> None:
+def test_images_that_are_nearly_eight_bit_are_not_taken_for_photographs() -> None:
     image = eight_bit(3, 8, 8) / 255
     image[1, 2, 3] += 0.4 / 255
     with ImageStore("memory", "uint8") as kept:
@@ -104,7 +104,7 @@ def test_a_constant_image_is_exact(tmp_path: Path, device: str, where: str, prec
 
 @on_every_device
 @in_every_precision
-def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, where: str, precision: str) -> None:
+def test_an_image_is_copied_and_can_be_replaced(tmp_path: Path, device: str, where: str, precision: str) -> None:
     with store(tmp_path, where, precision, device) as kept:
         image = torch.ones(3, 2, 2, requires_grad=True, device=device)
         kept.put("a", image)
@@ -120,7 +120,7 @@ def test_a_put_image_may_be_changed_and_replaced(tmp_path: Path, device: str, wh
 
 
 @on_every_device
-def test_prefetching_changes_nothing_but_when_it_is_brought(tmp_path: Path, device: str, where: str) -> None:
+def test_prefetching_changes_no_image(tmp_path: Path, device: str, where: str) -> None:
     images = {f"{i}": torch.rand(3, 6 + i, 5) for i in range(4 * AHEAD)}
     with store(tmp_path, where, "float32", device) as kept:
         for name, image in images.items():
@@ -145,7 +145,7 @@ def test_prefetching_changes_nothing_but_when_it_is_brought(tmp_path: Path, devi
 
 @on_every_device
 @in_every_precision
-def test_bytes_are_counted_where_they_lie(tmp_path: Path, device: str, where: str, precision: str) -> None:
+def test_bytes_are_counted_by_place(tmp_path: Path, device: str, where: str, precision: str) -> None:
     each = 3 * 4 * 5 * ITEM_SIZE[precision]
     with store(tmp_path, where, precision, device) as kept:
         assert "a" not in kept
@@ -166,7 +166,7 @@ def test_bytes_are_counted_where_they_lie(tmp_path: Path, device: str, where: st
 
 
 def test_the_disk_is_read_in_the_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While a reader that never ends by itself holds one image, another one can be announced and fetched."""
+    """While one reader is blocked, another image can be prefetched and returned."""
     reading, go_on = threading.Event(), threading.Event()
     read = imagestore._read_file
 
@@ -250,7 +250,9 @@ def test_a_cpu_keeps_images_in_memory() -> None:
 
 
 @pytest.mark.parametrize(("memory", "limit"), [(8 << 30, (8 << 30) // 10), (80 << 30, 1 << 30)])
-def test_a_gpu_keeps_what_is_small_beside_it(monkeypatch: pytest.MonkeyPatch, memory: int, limit: int) -> None:
+def test_a_gpu_keeps_images_that_are_small_beside_its_memory(
+    monkeypatch: pytest.MonkeyPatch, memory: int, limit: int
+) -> None:
     class Properties:
         total_memory = memory
 
@@ -259,10 +261,10 @@ def test_a_gpu_keeps_what_is_small_beside_it(monkeypatch: pytest.MonkeyPatch, me
 
 
 class Runtime:
-    """CUDA's, as it is about page-locked memory: it remembers an error until a launch of this thread asks for it.
+    """Stand in for the CUDA runtime: it keeps an error until a launch of this thread reads it.
 
     Attributes:
-        full: it refuses to register any more.
+        full: whether it refuses to register more memory.
         registered: bytes by address.
         last_error: 0 for none.
     """
@@ -306,7 +308,7 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Runtime:
 
 
 @pytest.mark.parametrize("num_bytes", [1, mmap.PAGESIZE - 1, mmap.PAGESIZE, mmap.PAGESIZE + 1, 1_000_003])
-def test_whole_pages_are_locked_and_let_go_once(runtime: Runtime, num_bytes: int) -> None:
+def test_whole_pages_are_locked_and_released_once(runtime: Runtime, num_bytes: int) -> None:
     every = [_PageLocked(num_bytes, torch.device("cpu")) for _ in range(4)]
     addresses = [each.view(torch.Size([num_bytes]), torch.uint8).data_ptr() for each in every]
     assert list(runtime.registered) == addresses
@@ -316,7 +318,7 @@ def test_whole_pages_are_locked_and_let_go_once(runtime: Runtime, num_bytes: int
     assert (runtime.registered, runtime.last_error) == ({}, 0)
 
 
-def test_a_refusal_of_the_driver_is_one_line_and_forgotten(runtime: Runtime) -> None:
+def test_a_refusal_of_the_driver_is_one_line_and_its_error_is_cleared(runtime: Runtime) -> None:
     runtime.full = True
     with pytest.raises(
         UserInputError, match=r"5,000 more bytes .* \(out of memory\); expected room .* lower precision$"
@@ -337,7 +339,7 @@ def test_a_refusal_of_the_driver_is_one_line_and_forgotten(runtime: Runtime) -> 
 @pytest.mark.parametrize("where", ["memory", "disk", "gpu"])
 @in_every_precision
 def test_a_busy_gpu_gets_no_torn_and_no_stale_image(tmp_path: Path, where: str, precision: str) -> None:
-    """The processor runs far ahead of the GPU, so memory of fetched images is asked for again before it was used."""
+    """The processor runs far ahead of the GPU and reuses the memory of images before the GPU has read them."""
     size, names = (3, 600, 800), [f"{i}" for i in range(24)]
     base = eight_bit(*size).cuda()
     load = torch.rand(2048, 2048, device="cuda")
@@ -365,7 +367,7 @@ def test_a_busy_gpu_gets_no_torn_and_no_stale_image(tmp_path: Path, where: str, 
 
 @pytest.mark.gpu
 @needs_cuda
-def test_images_are_handed_to_the_current_stream(tmp_path: Path) -> None:
+def test_images_are_returned_to_the_current_stream(tmp_path: Path) -> None:
     image = eight_bit(3, 600, 800) / 255
     for where in ("gpu", "memory", "disk"):
         with store(tmp_path, where, "uint8", "cuda") as kept:
@@ -380,7 +382,7 @@ def test_images_are_handed_to_the_current_stream(tmp_path: Path) -> None:
 
 @pytest.mark.gpu
 @needs_cuda
-def test_memory_is_page_locked_and_let_go(tmp_path: Path) -> None:
+def test_memory_is_page_locked_and_released(tmp_path: Path) -> None:
     with store(tmp_path, "memory", "uint8", "cuda") as kept:
         kept.put("a", eight_bit(3, 1001, 701) / 255)
         image = kept._images["a"]
@@ -395,7 +397,7 @@ def test_memory_is_page_locked_and_let_go(tmp_path: Path) -> None:
 
 @pytest.mark.gpu
 @needs_cuda
-def test_what_the_driver_refused_is_not_reported_by_what_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_of_the_driver_is_not_reported_by_the_next_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     device = torch.device("cuda")
     kept = _PageLocked(10_000, device)
     pages = kept.view(torch.Size([10_000]), torch.uint8)
@@ -414,7 +416,7 @@ def is_page_locked(stored: Tensor) -> bool:
     return torch.from_numpy(stored.numpy()).is_pinned()
 
 
-def test_images_lie_on_a_gpu_while_they_are_a_small_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_on_a_gpu_while_they_are_a_small_part_of_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     for memory, limit in ((80 << 30, 1 << 30), (6_000_000_000, 600_000_000)):
         properties = SimpleNamespace(total_memory=memory)
         monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _, properties=properties: properties)

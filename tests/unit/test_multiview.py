@@ -1,4 +1,4 @@
-"""Scores of several views: against images of one Gaussian at a time, and what density control makes of them."""
+"""Scores of several views, against images of single Gaussians, and density control by them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,21 @@ from lapgs_plugin.hierarchy.inheritance import SH_C0
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import (
     LATE_OPACITY,
     MultiviewDensifier,
     ScoredView,
     ViewScores,
-    badly_shown,
+    large_errors,
     view_scores,
 )
-from lapgs_plugin.training.settings import Densification, StageSchedule, TrainSettings
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.strategies import Multiview
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
@@ -46,16 +49,16 @@ def schedule(settings: TrainSettings = SETTINGS) -> StageSchedule:
     return StageSchedule.create(settings, stage)
 
 
-def test_marks_are_where_the_error_is_above_a_share_of_its_range() -> None:
+def test_large_errors_are_above_a_share_of_the_range() -> None:
     target = torch.zeros(3, 1, 4)
     image = torch.tensor([[[0.2, 0.3, 0.6, 1.2]], [[0.2, 0.3, 0.6, 1.2]], [[-0.2, 0.3, 0.6, 1.2]]])
-    assert badly_shown(image, target, 0.3).tolist() == [[False, False, True, True]]
-    assert badly_shown(image, target, 0.0).tolist() == [[False, True, True, True]]
-    assert not badly_shown(target, target, 0.1).any()
+    assert large_errors(image, target, 0.3).tolist() == [[False, False, True, True]]
+    assert large_errors(image, target, 0.0).tolist() == [[False, True, True, True]]
+    assert not large_errors(target, target, 0.1).any()
 
 
 @pytest.mark.parametrize("signed", [False, True])
-def test_scores_are_what_an_image_of_one_white_gaussian_makes_up_of_marked_pixels(signed: bool) -> None:
+def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_are_large(signed: bool) -> None:
     field = replace(blob_field(30), signed=signed)
     cameras = [ring_camera(angle) for angle in (0.0, 0.8, 2.5)]
     oracle, rasterizer = OracleRasterizer(), CpuRasterizer()
@@ -89,7 +92,7 @@ def test_scores_are_what_an_image_of_one_white_gaussian_makes_up_of_marked_pixel
 
 
 def rendered(by_centre: Tensor, by_absolute: Tensor) -> RenderResult:
-    """What a render might have left after `backward()`, in normalised device coordinates along x."""
+    """Return a render after `backward()`, its gradients in normalised device coordinates along x."""
     scale = torch.tensor([2 / CAMERA.width, 0.0])
     means2d = torch.zeros(len(by_centre), 2, requires_grad=True)
     means2d.grad = by_centre[:, None] * scale
@@ -98,15 +101,15 @@ def rendered(by_centre: Tensor, by_absolute: Tensor) -> RenderResult:
 
 
 def refined(edit: Callable[[GaussianField], GaussianField], scores: ViewScores) -> tuple[TrainableField, bool]:
-    """A field of eight: 0 to 3 have a gradient, 4 to 7 an absolute one; every second is badly shown."""
+    """A field of eight: 0 to 3 have a gradient, 4 to 7 an absolute one; every second has large errors."""
     field = edit(blob_field(8))
     model = TrainableField.create(field, SETTINGS.learning_rates, EXTENT)
-    control = MultiviewDensifier(schedule(), replace(SETTINGS.densification, grow_grad2d=2e-4), EXTENT)
+    control = MultiviewDensifier(schedule(), Multiview(grow_grad2d=2e-4), EXTENT)
     by_centre, by_absolute = torch.zeros(8), torch.zeros(8)
     by_centre[:4], by_absolute[4:] = 3e-4, 1e-3
     changed = False
     for iteration in range(1, 11):
-        assert control.scored_at(iteration) == (iteration == 10)
+        assert control.score_threshold(iteration) == (0.1 if iteration == 10 else None)
         given = scores if iteration == 10 else None
         changed = control.after_step(model, iteration, rendered(by_centre, by_absolute), CAMERA, given)
         assert changed == (iteration == 10)
@@ -126,7 +129,7 @@ def with_sizes(size: float) -> Callable[[GaussianField], GaussianField]:
 BAD = ViewScores(torch.tensor([0.3, 0.05] * 4), torch.zeros(8))
 
 
-def test_small_ones_are_cloned_by_gradient_and_large_ones_split_by_absolute_gradient_where_badly_shown() -> None:
+def test_small_ones_are_cloned_by_gradient_and_large_ones_split_by_absolute_gradient() -> None:
     small, _ = refined(with_sizes(0.001 * EXTENT), BAD)  # clones of 0 and 2
     assert len(small) == 10
     assert torch.equal(small.params["means"][8:], small.params["means"][[0, 2]])
@@ -138,18 +141,18 @@ def test_small_ones_are_cloned_by_gradient_and_large_ones_split_by_absolute_grad
     assert (sizes[6:] < sizes[:6].min()).all()
 
 
-def test_nothing_grows_where_nothing_is_badly_shown_and_opacities_are_lowered() -> None:
+def test_nothing_grows_without_large_errors_and_opacities_are_lowered() -> None:
     model, _ = refined(with_sizes(0.001 * EXTENT), ViewScores(torch.zeros(8), torch.zeros(8)))
     assert len(model) == 8
     torch.testing.assert_close(model.params["opacities"].sigmoid(), torch.full((8,), 0.8))
 
 
-def test_what_is_faint_or_to_blame_goes_late() -> None:
+def test_faint_and_harmful_gaussians_are_removed_late() -> None:
     opacities = torch.tensor([0.05, 0.2, 0.9, 0.09, 0.11, 0.5, 0.5, 0.5])
     field = blob_field(8).with_parameters({"opacity_logits": torch.logit(opacities)})
     model = TrainableField.create(field, SETTINGS.learning_rates, EXTENT)
-    control = MultiviewDensifier(schedule(), replace(SETTINGS.densification, grow_grad2d=2e-4), EXTENT)
-    assert [i for i in range(61, 101) if control.scored_at(i)] == [61, 70, 80, 90]
+    control = MultiviewDensifier(schedule(), Multiview(grow_grad2d=2e-4), EXTENT)
+    assert [i for i in range(61, 101) if control.score_threshold(i) is not None] == [61, 70, 80, 90]
     blame = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.95, 1.0, 0.85])
     assert not control.after_step(model, 75, None, CAMERA)
     assert control.after_step(model, 80, None, CAMERA, ViewScores(torch.ones(8), blame))
@@ -180,17 +183,23 @@ def train(path: Path, settings: TrainSettings, **options: Any) -> RunArchive:
 @pytest.mark.parametrize(
     "hierarchy", [{"levels": 1}, {"hierarchy": "laplacian", "joint": 0.5}, {"hierarchy": "nested"}]
 )
-def test_runs_grow_learn_and_ask_for_what_training_compares(
+def test_runs_grow_learn_and_score_the_same_views_again(
     hierarchy: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    density = Densification(start=3, until=80, every=5, error_pixels=0.2, strategy="multiview", split_absgrad2d=1e-4)
+    density = Densification(
+        start=3,
+        until=80,
+        every=5,
+        strategy="multiview",
+        options=Multiview(error_pixels=0.2, split_absgrad2d=1e-4),
+    )
     settings = TrainSettings(iterations=160, sh_degree=1, sh_every=10, densification=density, **hierarchy)
     scored: list[tuple[int, int]] = []
     ask = StageRun._scores
 
-    def scores(run: StageRun, iteration: int) -> ViewScores:
-        found = ask(run, iteration)
-        again = ask(run, iteration)
+    def scores(run: StageRun, iteration: int, threshold: float) -> ViewScores:
+        found = ask(run, iteration, threshold)
+        again = ask(run, iteration, threshold)
         assert torch.equal(found.pixels, again.pixels), "the same views"
         assert len(found.pixels) == len(run.model)
         assert float(found.blame.max()) <= 1.0
@@ -206,7 +215,7 @@ def test_runs_grow_learn_and_ask_for_what_training_compares(
     assert last < first
 
 
-def test_a_view_is_compared_with_what_its_residual_is_added_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_of_a_residual_are_of_the_composed_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A residual of zero colour, scored before anything is learned, predicts what the base does."""
     seen: list[Tensor] = []
     import lapgs_plugin.training.stage as module
@@ -216,7 +225,7 @@ def test_a_view_is_compared_with_what_its_residual_is_added_to(tmp_path: Path, m
         seen.extend(view.prediction - view.target for view in listed)
         return view_scores(listed, grey, threshold)
 
-    density = Densification(start=0, until=80, every=1, strategy="multiview", error_pixels=1e6)
+    density = Densification(start=0, until=80, every=1, strategy="multiview", options=Multiview(error_pixels=1e6))
     settings = TrainSettings(iterations=40, split="39/40,1/40", hierarchy="laplacian", densification=density)
     monkeypatch.setattr(module, "view_scores", noted)
     monkeypatch.setattr(module.StageSchedule, "late_prunes", frozenset())

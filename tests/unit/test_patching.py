@@ -1,7 +1,7 @@
-"""The patch engine on source trees of our own writing, and the recipes that come with the plugin.
+"""Test the patch engine on source trees of our own writing, and the recipes of this package.
 
-The programs below are lists of tokens, written with a space between any two; a test lays them out as it likes (line
-endings, indentation, comments, spliced lines) and knows by index where an edit belongs, without asking our tokeniser.
+The programs below are lists of tokens with a space between any two. A test lays them out in any way (line endings,
+indentation, comments, spliced lines) and knows the place of an edit by its index, without our tokeniser.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ RECIPE = Recipe(
 
 @dataclass
 class Program:
-    """The tokens of one file, each directive one token, and where its anchors begin and end."""
+    """Hold the tokens of one file, each directive one token, and the ranges of its anchors."""
 
     tokens: list[str]
     anchors: dict[str, range]
@@ -140,7 +140,7 @@ TRIVIA = (
 
 
 def lay_out(tokens: list[str], trivia: Iterator[str]) -> bytes:
-    """The program as a file, with the next piece of trivia between any two tokens; directives get their own lines."""
+    """Return the program as a file with trivia between any two tokens; directives get their own lines."""
     out = []
     for token in tokens:
         gap = next(trivia)
@@ -158,7 +158,7 @@ def plain() -> Iterator[str]:
 
 @st.composite
 def trees(draw: st.DrawFn, programs: dict[str, Program] = PARSED) -> dict[str, bytes]:
-    """The files of the small shader, laid out in any way, cut off without a final newline or not."""
+    """Draw the files of the small shader in any layout, with or without a final newline."""
     tree = {}
     for file, program in programs.items():
         choices = draw(st.lists(st.integers(0, len(TRIVIA) - 1), min_size=8, max_size=8))
@@ -192,13 +192,13 @@ def revert(target: Target, *sets: str) -> dict[str, bytes]:
 
 
 def bare(data: bytes) -> str:
-    """A file without comments, spliced lines and white space."""
+    """Return a file without comments, spliced lines and white space."""
     text = re.sub(r"\\\r?\n", "", data.decode("latin-1"))
     return re.sub(r"\s", "", re.sub(r"//[^\n]*|/\*.*?\*/", " ", text, flags=re.DOTALL))
 
 
 def expected(file: str, sets: set[str]) -> str:
-    """What is left of a patched file without comments and white space: each text put in by token index."""
+    """Return a patched file without comments and white space, made by inserting each text by token index."""
     program = PARSED[file]
     tokens = list(program.tokens)
     edits = [edit for edit in EDITS.values() if edit.anchor.file == file and edit.set in sets]
@@ -568,7 +568,7 @@ for command in planners:
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: Path, tmp_path: Path) -> None:
     checkout = rasterizer.parents[1]
-    (rasterizer / "cuda_rasterizer/.forward.cu.notes.lapgs").write_text("mine")  # no temporary of ours
+    (rasterizer / "cuda_rasterizer/.forward.cu.notes.lapgs").write_text("mine")  # not a temporary file of ours
     before = read_tree(checkout)
     write_all(plan_apply(find_targets(checkout)[0], [ALL_SETS]))
     after = read_tree(checkout)
@@ -617,7 +617,7 @@ def test_temporary_files_of_a_process_that_lives_stay(rasterizer: Path, monkeypa
     assert not theirs.exists()
 
 
-# --- the recipes that come with the plugin, on a rasterizer of our own writing ----------------------------------------
+# --- the recipes of this package, on a rasterizer of our own writing --------------------------------------------------
 
 RASTERIZER = {
     "diff_gaussian_rasterization/__init__.py": "",
@@ -713,7 +713,7 @@ int main(int, char** argv)
 
 @pytest.fixture
 def rasterizer(tmp_path: Path) -> Path:
-    """A checkout with one rasterizer that has what the recipes look for, in functions that do next to nothing."""
+    """Write a checkout with one rasterizer that has all places of the recipes, in functions that do next to nothing."""
     folder = tmp_path / "checkout" / "submodules" / "diff-gaussian-rasterization"
     for file, text in RASTERIZER.items():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -773,7 +773,7 @@ def test_patched_code_is_signed_when_asked_and_otherwise_what_it_was(rasterizer:
         assert clamped[:3] == pytest.approx([max(value + 0.5, 0) for value in raw], rel=1e-5, abs=1e-5)
         assert signed[6:] == [weights[i] if i in used else 0 for i in range(16) for _ in range(3)]
         clamped_somewhere = clamped_somewhere or any(clamped[3:6])
-        # A build that does not know the flag must not read coefficients that a field of degree 0 does not have.
+        # A build without the flag must not read coefficients that a field of degree 0 lacks.
         assert before(signed_degree(degree)) == before(0)
     assert clamped_somewhere
 
@@ -781,7 +781,7 @@ def test_patched_code_is_signed_when_asked_and_otherwise_what_it_was(rasterizer:
 def test_a_rasterizer_where_something_else_reads_the_degree_is_refused(rasterizer: Path) -> None:
     path = rasterizer / "cuda_rasterizer/forward.cu"
     path.write_text(path.read_text().replace("{ colour =", "{ if (D > 3) return; colour ="))
-    with pytest.raises(PatchError, match=r"preprocessCUDA but found it 3 times.*something else reads the degree"):
+    with pytest.raises(PatchError, match=r"preprocessCUDA but found it 3 times.*other code uses the degree"):
         plan_apply(find_targets(rasterizer)[0], ["signed-color"])
 
 
@@ -909,7 +909,7 @@ def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> 
 
 
 def lapgs_patch(*arguments: str | Path) -> str:
-    """What `lapgs patch ...` prints; errors are raised."""
+    """Return the output of `lapgs patch ...`; errors are raised."""
     result = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
     assert result.exit_code == 0
     return result.output
@@ -971,7 +971,7 @@ def test_nothing_is_imported_for_the_help() -> None:
 
 @pytest.mark.upstream
 def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
-    """Every extension in the checkouts below $LAPGS_UPSTREAM, as it is and with its line endings turned to CRLF."""
+    """Copy every extension in the checkouts below $LAPGS_UPSTREAM, as it is and with CRLF line endings."""
     folder = os.environ.get("LAPGS_UPSTREAM")
     if not folder:
         pytest.skip("needs checkouts of the backbones: set LAPGS_UPSTREAM to a folder that holds them")

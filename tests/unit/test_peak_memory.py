@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lapgs_plugin.runs.peak_memory import PeakMemory
+from lapgs_plugin.runs.profiling import PeakMemory
 
 
 class Statistics:
-    """A GPU's, in the place of `torch.cuda`'s."""
+    """Stand in for `torch.cuda`'s statistics."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.used = self.highest = 0

@@ -16,7 +16,8 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 
 SIZES = [(37, 52), (64, 48), (1, 1), (2, 2), (1, 2), (3, 5), (2, 7), (5, 1), (4, 4), (17, 16)]

@@ -26,7 +26,7 @@ from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.reference_raster.standins import install, stand_ins
-from lapgs_plugin.runs.archive import Manifest, SceneReference
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 
 FASTGS, GRAPHDECO = "diff_gaussian_rasterization_fastgs", "diff_gaussian_rasterization"
 LOGGER = "lapgs_plugin.rasterizers.choice"

@@ -24,7 +24,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
 from lapgs_plugin.rasterizers import signed_color
-from lapgs_plugin.rasterizers.extensions import SEMANTICS, CudaExtension, _ScreenPoints, installed_extensions
+from lapgs_plugin.rasterizers.extensions import CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
     SignedColorRasterizer,
@@ -153,7 +153,7 @@ def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: P
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             scene(signed=True).render(rasterizer)
-    assert len(extension.calls) == 5  # three scenes, and two of the probe
+    assert len(extension.calls) == 5  # three scenes, and two by the probe
     (record,) = caplog.records
     assert "some_extension has no signed colour" in record.getMessage()
     assert "lapgs patch apply" in record.getMessage()
@@ -215,16 +215,16 @@ def test_precomputed_colours_of_an_ordinary_field_are_clamped() -> None:
 def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> None:
     """Compare matrices, units of the screen gradient, separate DC, degree 0, no Gaussians and none in view.
 
-    The stand-ins take what the CUDA modules take.
+    The stand-ins have the arguments of the CUDA modules.
     """
     names = ("off_centre", "non_square_pixels", "invisible", "no_gaussians", "lower_degree", "degree_0_white")
     chosen = [case for case in conformance_cases() if case.name in names]
     with install(variant):
-        module = VARIANTS[variant][0]
+        module = VARIANTS[variant].module
         assert module in installed_extensions()
         extension = CudaExtension(module, device="cpu")
         assert SignedColorRasterizer(extension).path is ColorPath.NATIVE
-        subject = Subject(variant, SignedColorRasterizer(extension), semantics=SEMANTICS[module])
+        subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
         found = list(check(subject, chosen))
     assert len(found) == 2 * len(names)
     assert [(outcome.case, outcome.problems) for outcome in found if outcome.problems] == []
@@ -262,7 +262,7 @@ def _in_some_tile(view: Any, inputs: dict[str, Tensor]) -> bool:
 def brittle(variant: str) -> Iterator[CudaExtension]:
     """A stand-in that refuses calls in which no tile has a Gaussian, like CUDA rasterizers that blend in buckets."""
     with install(variant) as modules:
-        module = modules[VARIANTS[variant][0]]
+        module = modules[VARIANTS[variant].module]
 
         class Brittle(module.GaussianRasterizer):  # type: ignore[misc, name-defined]  # a class made at run time
             @wraps(module.GaussianRasterizer.forward)  # the wrapper reads the arguments' names
@@ -271,7 +271,7 @@ def brittle(variant: str) -> Iterator[CudaExtension]:
                 return super().forward(**inputs)
 
         module.GaussianRasterizer = Brittle
-        yield CudaExtension(VARIANTS[variant][0], device="cpu")
+        yield CudaExtension(VARIANTS[variant].module, device="cpu")
 
 
 def sparse_case(places: list[tuple[float, float, float]], opacities: list[float], camera: Camera) -> Case:
@@ -306,8 +306,8 @@ def test_some_tile_always_has_a_gaussian_and_the_image_is_the_oracles(
     with brittle(variant) as extension:
         subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
         problems = check_case(subject, case).problems
-    # Of a sphere in the middle of a pixel most gradients are zero, and only rounding is left of them; of any sphere the
-    # one by its rotation is.
+    # Most gradients of a sphere in the middle of a pixel are zero but for rounding, and of any sphere the
+    # gradient of its rotation.
     rounding = ("is off by", "gradient of quaternions")
     assert [line for line in problems if "gradient" not in line or not any(words in line for words in rounding)] == []
 

@@ -19,7 +19,7 @@ from tests.unit.test_rasterizers import WithoutCuda, faint
 
 
 def render(module: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any], dict[str, Tensor]]:
-    """The faint scene by `module`'s functions: image, alpha, info and gradients by name."""
+    """Render the faint scene with `module`'s functions: image, alpha, info and gradients by name."""
     case = faint(False).with_leaves()
     field, camera = case.field, case.camera
     colors = module.spherical_harmonics(field.sh_degree, field.means - camera.position, field.sh)

@@ -1,4 +1,4 @@
-"""What trains and where, and the parts of training on a GPU that do not need one."""
+"""The choice of rasterizer and device, and the parts of training on a GPU that do not need one."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.level_images import ImageStores, LevelImages
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
-from lapgs_plugin.training import views as training_views
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.strategies import Default, Mcmc
 from lapgs_plugin.training.trainer import Trainer, check_storage
-from lapgs_plugin.training.views import LevelImages
 from tests.training_scene import blob_field, ring_scene
 
 SETTINGS = TrainSettings(
@@ -65,7 +66,7 @@ def losses(archive: RunArchive) -> list[tuple[int, int, float]]:
 # ------------------------------------------------------------------------------------------------------- the choice
 
 
-def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_trains_if_there_is_a_gpu_and_nothing_falls_back_silently(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(backend, "driver_version", lambda: "")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -90,7 +91,7 @@ def test_gsplat_trains_where_it_can_and_nothing_falls_back_in_silence(monkeypatc
     assert (placed.rasterizer.name, placed.device.type) == ("gsplat", "cuda")
 
 
-def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
+def test_options_of_gsplat_are_refused_elsewhere() -> None:
     settings = replace(SETTINGS, packed=True, antialiased=True)
     with pytest.raises(UserInputError, match="--antialiased, --packed with --rasterizer cpu: only gsplat"):
         training_rasterizer("cpu", settings)
@@ -99,8 +100,8 @@ def test_what_only_gsplat_does_is_refused_elsewhere() -> None:
     check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cuda"))
 
 
-def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
-    strategy = replace(SETTINGS.densification, strategy="mcmc", cap_max=500, reset_every=None)
+def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
+    strategy = Densification(start=3, until=45, every=5, strategy="mcmc", options=Mcmc(cap_max=500))
     settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
@@ -109,7 +110,7 @@ def test_settings_of_gsplat_survive_the_manifest_and_older_manifests_are_read(sc
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
-    density = replace(SETTINGS.densification, grow_grad2d=2e-4)  # as it was written then
+    density = replace(SETTINGS.densification, options=Default(grow_grad2d=2e-4))  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
     found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
@@ -135,7 +136,7 @@ def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
     monkeypatch.setattr(gsplat, "rasterization", rasterization)
 
     class Deliver(StageHook):
-        """Calls the hooks of gsplat's centres once the backward pass has left their gradient."""
+        """Call the hooks of gsplat's centres after the backward pass."""
 
         def before_render(self, context: StageContext) -> None:
             hooks.clear()  # of renders that were not trained on
@@ -156,16 +157,16 @@ def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
 
 
 def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
-    """They do not cancel: at the same threshold more Gaussians are above it."""
+    """They do not cancel, so more Gaussians are above the same threshold."""
     counts = []
     for absgrad in (False, True):
-        density = replace(SETTINGS.densification, absgrad=absgrad, grow_grad2d=2e-4, reset_every=1000)
+        density = replace(SETTINGS.densification, reset_every=1000, options=Default(grow_grad2d=2e-4, absgrad=absgrad))
         archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
         counts.append(archive.manifest.records[0].num_gaussians)
     assert counts[1] > counts[0]
 
 
-def test_losses_that_are_read_later_are_the_same_losses(
+def test_losses_that_are_read_together_are_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_once = train(tmp_path / "a", scene, SETTINGS, CpuRasterizer())
@@ -210,7 +211,7 @@ def stepped(model: TrainableField, steps: int = 5) -> TrainableField:
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("signed", [False, True])
 def test_steps_on_a_gpu_are_those_on_a_cpu(degree: int, signed: bool) -> None:
-    """PyTorch's fused Adam, which exists for CPUs too."""
+    """By PyTorch's fused Adam, which a CPU has, too."""
     field = replace(blob_field(20), sh=torch.randn(20, (degree + 1) ** 2, 3), signed=signed)
     ours = stepped(TrainableField.create(field, LearningRates(), 4.0))
     theirs = stepped(TrainableField._in_two(field, LearningRates(), 4.0, sparse=False))
@@ -289,7 +290,7 @@ def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
             )
 
 
-def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
 
     def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
@@ -308,11 +309,14 @@ def test_a_gpus_state_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
     eight_bit = tuple(replace(view, image=(view.image * 255).round() / 255) for view in scene.train)
-    held = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
-    monkeypatch.setattr(training_views, "_wants_store", lambda device: True)
-    stored = LevelImages(eight_bit, level, 2, Pyramid(), True, torch.device("cpu"))
+    stores = ImageStores([(view.camera.width, view.camera.height) for view in eight_bit], torch.device("cpu"), True)
+    held = LevelImages(stores, level, Pyramid(), with_coarse=level == 0, exact=True)
+    stored = LevelImages(stores, level, Pyramid(), with_coarse=level == 0)
+    for view in eight_bit:
+        held.put(view.name, view.image)
+        stored.put(view.name, view.image)
     for view in eight_bit:
         stored.prefetch(view.name)
         (target, coarse), (expected, expected_coarse) = stored.get(view.name), held.get(view.name)
@@ -329,7 +333,7 @@ def test_images_that_come_one_by_one_are_the_targets(scene: Scene, level: int, m
 
 
 def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    """Kheradmand et al. 2024, equation 9, term by term: what gsplat's CUDA kernel computes."""
+    """Compute equation 9 of Kheradmand et al. 2024 term by term, as gsplat's CUDA kernel does."""
     new_opacities = 1 - (1 - opacities) ** (1 / ratios)
     denominators = torch.zeros_like(opacities)
     for row, count in enumerate(ratios.tolist()):
@@ -350,7 +354,7 @@ def test_mcmc_moves_adds_and_stays_under_its_limit(
         return _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], None
 
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
-    density = Densification(start=3, until=55, every=5, strategy="mcmc", cap_max=120, base_cap_max=110)
+    density = Densification(start=3, until=55, every=5, strategy="mcmc", options=Mcmc(cap_max=120, base_cap_max=110))
     settings = replace(SETTINGS, hierarchy=hierarchy, densification=density)
     archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
     assert [record.num_gaussians for record in archive.manifest.records] == [110, 120]

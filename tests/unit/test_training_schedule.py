@@ -14,18 +14,14 @@ from hypothesis import strategies as st
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.training.settings import (
-    Densification,
-    LearningRates,
-    StageSchedule,
-    TrainSettings,
-    views_per_step,
-)
+from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import Default, Mcmc, Multiview
 from lapgs_plugin.training.views import view_index
 
 
 def schedules(**values: Any) -> list[StageSchedule]:
-    """Of a base and its residuals."""
+    """Return the schedules of a base and its residuals."""
     if values.get("levels", 2) == 2:
         values.setdefault("split", "1/2,1/2")
     settings = TrainSettings(hierarchy="laplacian", **values)
@@ -34,7 +30,7 @@ def schedules(**values: Any) -> list[StageSchedule]:
 
 
 def steps(schedule: StageSchedule) -> list[int]:
-    """The iterations after which the optimizers step."""
+    """Return the iterations after which the optimizers step."""
     found = [0]
     while found[-1] < schedule.iterations:
         found.append(found[-1] + schedule.views_of_step(found[-1]))
@@ -104,13 +100,13 @@ def test_every_view_is_seen_once_an_epoch(count: int, seed: int, level: int, epo
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 20), st.integers(0, 100_000))
 def test_every_seed_orders_views(seed: int, level: int, epoch: int) -> None:
-    """A date, as 20240101, once asked the generator for more than 64 bits."""
+    """Dates such as 20240101 once gave the generator more than 64 bits."""
     assert sorted(view_index(epoch * 3 + i + 1, 3, seed, level) for i in range(3)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("until", "begins"), [(None, 22_501), (22_000, 22_501), (25_000, 25_001), (29_679, 29_680)])
 def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, begins: int) -> None:
-    """A refinement in between would throw the gradients away that wait for those of other views."""
+    """A refinement in between would lose gradients that wait for those of other views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
     stepping = steps(schedule)
     assert stepping[: begins - 1] == list(range(1, begins))
@@ -120,7 +116,7 @@ def test_views_are_gathered_once_nothing_densifies_any_more(until: int | None, b
 
 @pytest.mark.parametrize("until", [29_681, 30_000, 40_000])
 def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
-    """What is left is too short for 40 steps of 8 views."""
+    """The rest is too short for 40 steps of 8 views."""
     (schedule,) = schedules(levels=1, densification=Densification(until=until))
     assert steps(schedule) == list(range(1, 30_001))
 
@@ -246,12 +242,12 @@ def test_thresholds_and_limits_of_stages() -> None:
     density = Densification(strategy="multiview")
     settings = TrainSettings(levels=3, hierarchy="laplacian", residual_threshold=1.5, densification=density)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
-    found = [settings.densification_of(stage) for stage in plan]
+    found: Any = [settings.strategy_of(stage) for stage in plan]
     assert [one.grow_grad2d for one in found] == pytest.approx([2e-4, 3e-4, 3e-4])
     assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
-    mcmc = Densification(strategy="mcmc", cap_max=9, base_cap_max=5)
+    mcmc = Densification(strategy="mcmc", options=Mcmc(cap_max=9, base_cap_max=5))
     capped = replace(settings, residual_threshold=1.0, densification=mcmc)
-    assert [capped.densification_of(stage).cap_max for stage in plan] == [5, 9, 9]
+    assert [capped.strategy_of(stage) for stage in plan] == [Mcmc(cap, 5) for cap in (5, 9, 9)]
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
@@ -277,18 +273,20 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             "--opacity-reset-every with --strategy mcmc",
         ),
         (
-            {"coarse_threshold": 2.0, "densification": Densification(absgrad=True, strategy="mcmc")},
-            "--absgrad, --coarse-threshold with --strategy mcmc",
+            {"coarse_threshold": 2.0, "densification": Densification(reset_every=9, strategy="mcmc")},
+            "--coarse-threshold, --opacity-reset-every with --strategy mcmc",
         ),
-        ({"densification": Densification(cap_max=7)}, "--cap-max 7: only --strategy mcmc"),
-        ({"densification": Densification(base_cap_max=7)}, "--base-cap-max 7: only --strategy mcmc"),
-        ({"densification": Densification(error_pixels=7.0)}, "--error-pixels 7.0: only --strategy multiview"),
+        ({"densification": Densification(options=Mcmc(cap_max=7))}, "--strategy default with options of Mcmc"),
         (
-            {"densification": Densification(error_threshold=1.0, strategy="multiview")},
+            {"densification": Densification(strategy="mcmc", options=Mcmc(cap_max=0))},
+            "--cap-max 0: expected at least 1",
+        ),
+        (
+            {"densification": Densification(strategy="multiview", options=Multiview(error_threshold=1.0))},
             "--error-threshold 1.0: expected a share",
         ),
         (
-            {"densification": Densification(absgrad=True, strategy="multiview")},
+            {"densification": Densification(strategy="multiview", options=Multiview(absgrad=True))},
             "--absgrad with --strategy multiview",
         ),
         (
@@ -297,7 +295,10 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ),
         ({"hierarchy": "laplacian", "residual_threshold": 0.0}, "--residual-threshold 0"),
         ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
-        ({"densification": Densification(grow_grad2d=-1.0)}, "--densify-threshold -1.0: expected a positive gradient"),
+        (
+            {"densification": Densification(options=Default(grow_grad2d=-1.0))},
+            "--densify-threshold -1.0: expected a positive gradient",
+        ),
         ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
         ({"densification": Densification(base_share=0.5), "levels": 1}, "one level has no base"),
         ({"sh_rate_factor": math.inf}, "--sh-rate-factor inf"),
@@ -353,5 +354,5 @@ def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, u
 def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
     settings = TrainSettings(levels=3, hierarchy=hierarchy, coarse_threshold=given)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
-    found = [settings.densification_of(stage).grow_grad2d for stage in plan]
+    found = [settings.strategy_of(stage).grow_grad2d for stage in plan]
     assert found == pytest.approx([2e-4 * factor for factor in factors])

@@ -1,4 +1,4 @@
-"""Up and the sum in one pass, against Up and the sum."""
+"""Check upsampling in one pass against PyTorch's operations."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid, transposed_taps
-from lapgs_plugin.ops import upsample as raising
-from lapgs_plugin.ops.self_check import matches_reference
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
+from lapgs_plugin.hierarchy.settings import GRIDS
+from lapgs_plugin.ops.self_check import SelfCheck
+from lapgs_plugin.ops.upsample import triton_works, upsample, upsample_add
 
 TRITON = """
 import os
@@ -35,7 +35,7 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
         h, w = shape[-2:]
         coarse, fine = torch.randn(*shape[:-2], (h + 1) // 2, (w + 1) // 2), torch.randn(*shape)
         expected = Pyramid(grid).up(coarse, (h, w)) + fine
-        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as gsplat has them
+        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as from gsplat
         for images in ((coarse, fine), turned):
             torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
         gradients = []
@@ -48,7 +48,7 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
 
 
 def images(grid: str, shape: tuple[int, ...], dtype: torch.dtype, device: str = "cpu") -> tuple[torch.Tensor, ...]:
-    """Coarse, fine, and what is expected of them."""
+    """Return coarse, fine, and their expected sum."""
     height, width = shape[-2:]
     coarse = torch.randn(*shape[:-2], (height + 1) // 2, (width + 1) // 2, dtype=dtype, device=device)
     fine = torch.randn(shape, dtype=dtype, device=device)
@@ -77,7 +77,7 @@ def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     torch.testing.assert_close(upsample(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
 
 
-def test_what_is_not_half_of_the_size_is_refused() -> None:
+def test_an_image_that_is_not_half_of_the_size_is_refused() -> None:
     with pytest.raises(UserInputError, match=r"Up to 33x50 .* needs an image of 17x25, got 16x25"):
         upsample(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
 
@@ -104,7 +104,7 @@ def test_taps_are_few_and_averages(grid: str, size: int) -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(GRIDS), st.integers(1, 400))
-def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
+def test_transposed_taps_are_the_gradient(grid: str, size: int) -> None:
     first, weights = transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2)
     assert weights.shape[1] <= 12
     leaf, fine = torch.randn((size + 1) // 2, 1, dtype=torch.float64, requires_grad=True), torch.randn(size).double()
@@ -114,7 +114,7 @@ def test_transposed_taps_are_what_gradients_take(grid: str, size: int) -> None:
 
 
 def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
-    """What runs on a CPU in place of the kernels: PyTorch's operations, and of the sum so many times Up."""
+    """Replace the kernels by PyTorch's operations, with Up times `factor` in the sum."""
     kernels = ModuleType("kernels")
     vars(kernels).update(
         upsample_triton=lambda pyramid, coarse, size: pyramid.up(coarse, size),
@@ -124,10 +124,7 @@ def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
 
 
 def is_used() -> bool:
-    def difference() -> float:
-        return raising._difference_in_triton(Pyramid(), torch.device("cpu"))
-
-    return matches_reference("PyTorch's operations", difference, raising.LARGEST_DIFFERENCE)
+    return triton_works.passes_on(torch.device("cpu"))
 
 
 @pytest.mark.parametrize(("factor", "right"), [(1.0, True), (1.001, False), (math.nan, False)])
@@ -136,21 +133,21 @@ def test_a_kernel_that_is_off_is_not_used(
 ) -> None:
     put_in_place(monkeypatch, factor)
     assert is_used() == right
-    assert ("PyTorch's operations, because our kernels are off by" in caplog.text) != right
+    assert ("many small operations instead of one kernel, because our kernels are off by" in caplog.text) != right
 
 
 def test_a_kernel_that_does_not_compile_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
-    def difference() -> float:
+    def difference(device: torch.device) -> float:
         raise RuntimeError("Failed to find C compiler\nat length")
 
     caplog.set_level(logging.INFO)
-    assert not matches_reference("PyTorch's operations", difference, 1.0)
+    assert not SelfCheck(difference, "PyTorch's operations", 1.0).passes_on(torch.device("cpu"))
     assert "PyTorch's operations: Failed to find C compiler" in caplog.text
     assert "at length" not in caplog.text
 
 
 class _Asking(torch.autograd.Function):
-    """Asks while PyTorch is in a forward pass of ours, where gradients are off."""
+    """Run the check inside a forward pass, where gradients are off."""
 
     @staticmethod
     def forward(ctx: Any, answer: torch.Tensor) -> torch.Tensor:
@@ -178,9 +175,7 @@ def test_the_kernel_of_a_gpu_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
-    from lapgs_plugin.ops.upsample import _triton_works
-
-    assert _triton_works()
+    assert triton_works()
     coarse, fine, expected = images("camera", shape, torch.float32, "cuda")
     torch.testing.assert_close(upsample_add(Pyramid(), coarse, fine), expected, rtol=0, atol=5e-6)
     gradients = []

@@ -1,4 +1,4 @@
-"""Up of images that wait at half their size."""
+"""Images that are stored at half their size and upsampled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.pyramid import GRIDS, Pyramid
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.runs.image_store import ImageStore
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from tests.unit.test_imagestore import on_every_device
@@ -22,7 +23,7 @@ Seen: 1.8e-7, 2.1e-4 and 2.8e-3."""
 @pytest.mark.parametrize("grid", GRIDS)
 @on_every_device
 @pytest.mark.parametrize("precision", WORST)
-def test_it_is_up_of_what_was_put(grid: str, device: str, where: str, precision: str, tmp_path: Path) -> None:
+def test_images_are_up_of_the_stored_ones(grid: str, device: str, where: str, precision: str, tmp_path: Path) -> None:
     images = UpsampledImages(ImageStore(where, precision, device=device, folder=tmp_path / "images"), Pyramid(grid))
     coarse = {name: torch.rand(3, -(-h // 2), -(-w // 2)) * 1.5 - 0.5 for name, (h, w) in SIZES.items()}
     for name, size in SIZES.items():
@@ -37,14 +38,14 @@ def test_it_is_up_of_what_was_put(grid: str, device: str, where: str, precision:
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_kept_is_a_quarter() -> None:
+def test_a_quarter_of_the_bytes_is_stored() -> None:
     images = UpsampledImages(ImageStore("memory", "float16"), Pyramid())
     images.put("a", torch.rand(3, 8, 16), (16, 32))
     assert images.store.bytes_in_memory == 2 * 3 * 16 * 32 // 4
     assert images.get("a").shape == (3, 16, 32)
 
 
-def test_an_image_of_another_size_is_refused_and_not_kept() -> None:
+def test_an_image_of_another_size_is_refused_and_not_stored() -> None:
     images = UpsampledImages(ImageStore("memory", "float32"), Pyramid())
     with pytest.raises(UserInputError, match=r"Up to 16x32 .* got 16x32"):
         images.put("a", torch.rand(3, 16, 32), (16, 32))

@@ -1,4 +1,4 @@
-"""Several views a step: gradients, statistics and runs are those of single views, by stand-ins of gsplat on the CPU."""
+"""Steps of several views have the gradients and statistics of single views, by stand-ins of gsplat on the CPU."""
 
 from __future__ import annotations
 
@@ -25,14 +25,17 @@ from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.settings import Densification, LearningRates, StageSchedule, TrainSettings
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import Default
 from lapgs_plugin.training.trainer import Trainer
 from tests.convergence.test_training import StopAt, plys
 from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
@@ -59,10 +62,10 @@ def hand_over(place: Tensor) -> Callable[[Tensor], None]:
 
 
 class Batching(CpuRasterizer):
-    """The CPU's rasterizer, which takes several cameras one by one, with one result, as gsplat does on a GPU.
+    """Render several cameras on the CPU one by one, with one result, as gsplat does on a GPU.
 
     Args:
-        holds: how many cameras its memory holds.
+        holds: number of cameras that fit into its memory.
     """
 
     can_batch = True
@@ -118,7 +121,7 @@ def scene() -> Scene:
 
 
 class GsplatOnCpu(GsplatRasterizer):
-    """Called by its own functions or, `direct`, by its kernels."""
+    """Call gsplat's functions or, `direct`, its kernels."""
 
     can_batch = True
 
@@ -141,7 +144,7 @@ def kernels() -> Iterator[None]:
 @pytest.mark.parametrize("direct", [False, True])
 @pytest.mark.parametrize(("signed", "own_radii"), [(False, True), (True, False)])
 def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: bool) -> None:
-    """Images, what densification sees, and gradients, which are the sum of the views' own and the oracle's."""
+    """Images, statistics of densification, and gradients, which are the sum of the views' own and the oracle's."""
     rasterizer = GsplatOnCpu(direct, own_radii=own_radii, absgrad=not direct)
     generator = torch.Generator().manual_seed(1)
     blobs = blob_field(80)
@@ -204,8 +207,9 @@ def test_the_loss_of_several_views_is_their_mean() -> None:
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
-    """In two launches of three and one views, with the refinement that follows, against one after the other."""
-    density = Densification(start=2, until=60, every=4, reset_every=1000, grow_grad2d=2e-4, absgrad=absgrad)
+    """Two launches of three and one views and a refinement, against the views one after the other."""
+    density = Densification(start=2, until=60, every=4, reset_every=1000)
+    options = Default(grow_grad2d=2e-4, absgrad=absgrad)
     settings = TrainSettings(iterations=100, densification=density)
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)
@@ -226,7 +230,7 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     radii = torch.randint(0, 4, (b, n), generator=generator, dtype=torch.int32)
     gradients[radii == 0] = 0
     fields = [TrainableField.create(blob_field(n), settings.learning_rates, 2.0) for _ in range(2)]
-    ours, theirs = (Densifier(schedule, density, 2.0) for _ in range(2))
+    ours, theirs = (Densifier(schedule, options, 2.0) for _ in range(2))
     torch.manual_seed(7)
     ours.accumulate(result(slice(0, 3)), camera)
     assert ours.after_step(fields[0], 4, result(slice(3, 4)), camera)
@@ -236,7 +240,7 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     assert len(fields[0]) == len(fields[1]) != n
     for name, value in fields[0].params.items():
         assert torch.equal(value, fields[1].params[name]), name
-    again = Densifier(schedule, density, 2.0), Densifier(schedule, density, 2.0)
+    again = Densifier(schedule, options, 2.0), Densifier(schedule, options, 2.0)
     again[0].accumulate(result(slice(0, 4)), camera)
     for row in range(b):
         again[1].accumulate(result(slice(row, row + 1)), camera)
@@ -292,7 +296,7 @@ def test_steps_for_several_views_are_adams_with_scaled_rates(in_two: bool) -> No
 
 
 def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_path: Path) -> None:
-    """With base and residual, the base trained along at the end, gathered views, and SH that rise within steps."""
+    """With base and residual, joint training, gathered views, and an SH degree that rises within steps."""
     settings = replace(SETTINGS, iterations=340, joint=0.1, gather=2, sh_every=50)
     batching = Batching()
     runs = [
@@ -345,7 +349,7 @@ def test_two_views_a_step_learn_what_one_learns(tmp_path: Path) -> None:
 
 
 class Counter(StageHook):
-    """Notes what it is called for."""
+    """Record the calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, int, str]] = []
@@ -398,8 +402,8 @@ class Lines(Monitor):
         self.lines.append(text)
 
 
-def test_memory_that_runs_out_halves_what_is_rendered_together(scene: Scene, tmp_path: Path) -> None:
-    """In a line, and the run is the one that it would have been: steps take as many views."""
+def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_path: Path) -> None:
+    """One line is shown, and the run has the same result: steps take as many views."""
     settings = replace(SETTINGS, levels=1, views_per_step="4", iterations=30)
     lines, tight = Lines(), Batching(holds=1)
     found = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
@@ -450,7 +454,7 @@ def test_launches_stay_small_where_images_are_large(
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
 @pytest.mark.parametrize("precision", ["float32", "float16", "uint8"])
-def test_images_that_come_together_are_those_that_come_one_by_one(where: str, precision: str, tmp_path: Path) -> None:
+def test_a_batch_of_images_is_the_single_images(where: str, precision: str, tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     photos = [(torch.rand(3, 6, 9, generator=generator) * 255).round() / 255 for _ in range(2)]
     images = [*photos, 3 * torch.randn(3, 6, 9, generator=generator)]

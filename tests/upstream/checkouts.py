@@ -1,6 +1,6 @@
-"""The real checkouts, run in processes of their own on the CPU stand-ins, at a tiny size.
+"""Run the real checkouts in processes of their own on the CPU stand-ins, at a tiny size.
 
-Paths of the checkouts are in LAPGS_FASTGS, LAPGS_TAMING and LAPGS_GRAPHDECO; what is not named is skipped.
+Paths of the checkouts are in LAPGS_FASTGS, LAPGS_TAMING and LAPGS_GRAPHDECO; tests of others are skipped.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ sys.path[0] = str(Path(sys.argv[0]).parent)
 with cuda_on_cpu(variant):
     runpy.run_path(sys.argv[0], run_name="__main__")
 """
-"""The script as Python runs it."""
+"""Run the script as Python does."""
 
 COUNTING = """
 import json, sys
@@ -60,17 +60,17 @@ try:
 finally:
     Path(file).write_text(json.dumps(calls))
 """
-"""`lapgs run`, counting the calls of whatever takes a symbol's place."""
+"""Run `lapgs run` and count the calls of every replacement."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a run left.
+    """Hold the results of a run.
 
     Attributes:
-        folder: its -m.
-        progress: what it printed on stderr: progress bars, and lines of lapgs.
-        calls: (symbol, how often its replacement was called), one for each replacement.
+        folder: its -m folder.
+        progress: its stderr: progress bars, and lines of lapgs.
+        calls: (symbol, number of calls) for each replacement.
     """
 
     folder: Path
@@ -79,7 +79,7 @@ class Done:
 
     @property
     def losses(self) -> list[float]:
-        """The running mean of the loss that the progress bar shows every ten iterations."""
+        """Running mean of the loss, which the progress bar shows every ten iterations."""
         return _losses(self.progress)
 
     @property
@@ -88,7 +88,7 @@ class Done:
 
 
 def checkout(variable: str) -> Path:
-    """The folder that an environment variable names; skips the test where it names none."""
+    """Return the folder in an environment variable; skip the test without it."""
     named = os.environ.get(variable)
     if not named:
         pytest.skip(f"needs a checkout of the backbone: set {variable} to its folder")
@@ -96,24 +96,24 @@ def checkout(variable: str) -> Path:
 
 
 def knows_antialiasing(folder: Path) -> bool:
-    """Whether a graphdeco checkout is one for the rasterizers since October 2024."""
+    """Return whether a graphdeco checkout is for the rasterizers since October 2024."""
     return "antialiasing" in (folder / "gaussian_renderer" / "__init__.py").read_text(encoding="utf-8")
 
 
 def run_bare(script: Path, variant: str, arguments: list[str], folder: Path) -> Done:
-    """The script by itself, on a stand-in of that variant, writing to `folder`."""
+    """Run the script by itself on a stand-in of that variant, writing to `folder`."""
     return Done(folder, _python(BARE, variant, script, *arguments, "-m", folder))
 
 
 def run_lapgs(script: Path, options: list[str], arguments: list[str], folder: Path) -> Done:
-    """`lapgs run --device cpu OPTIONS SCRIPT ARGUMENTS`, writing to `folder`."""
+    """Run `lapgs run --device cpu OPTIONS SCRIPT ARGUMENTS`, writing to `folder`."""
     calls = folder.with_name(f"{folder.name}-calls.json")
     progress = _python(COUNTING, calls, "--device", "cpu", *options, script, *arguments, "-m", folder)
     return Done(folder, progress, tuple((label, count) for label, count in json.loads(calls.read_text())))
 
 
 def _python(code: str, *arguments: Any) -> str:
-    """What a program writes to stderr; it has to succeed."""
+    """Run a program that must succeed, and return its stderr."""
     done = subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
         env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},

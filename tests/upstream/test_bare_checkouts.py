@@ -1,4 +1,4 @@
-"""The real checkouts, unmodified, train without CUDA: on the stand-ins, at a tiny size, without hierarchy."""
+"""Test that the real checkouts train without CUDA, on the stand-ins, at a tiny size, without hierarchy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMON = (
     ("variable", "variant", "options"),
     [
         ("LAPGS_FASTGS", "fastgs", ""),
-        # It cannot clone none at all, and 1500 points in a room are nearly all too large to be cloned by default.
+        # It fails if none is cloned, and by default 1500 points in a room are nearly all too large to be cloned.
         ("LAPGS_TAMING", "taming", "--budget 2 --cams 5 --percent_dense 0.05"),
         ("LAPGS_GRAPHDECO", "graphdeco", ""),
         ("LAPGS_GRAPHDECO", "graphdeco-aa", "--disable_viewer --antialiasing"),

@@ -1,4 +1,4 @@
-"""The real checkouts, unmodified, trained as a hierarchy by `lapgs run --device cpu`, at a tiny size."""
+"""Test that `lapgs run --device cpu` trains the real checkouts as a hierarchy, at a tiny size."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCHEDULE = (
     f"--eval -r 2 --iterations {ITERATIONS} --densify_from_iter 10 --densification_interval 10 "
     f"--densify_until_iter {ITERATIONS} --opacity_reset_interval 115 --test_iterations -1"
 )
-"""60 and 120 iterations in two stages. Opacities are reset once, after FastGS's last pruning and the last loss but one
-that is shown: they would not recover in so few."""
+"""Options for 60 and 120 iterations in two stages. Opacities are reset once, after FastGS's last pruning and the last
+loss but one that is shown: they would not recover in so few iterations."""
 
 OPTIONS = {
     "LAPGS_FASTGS": "--dense 0.05",
@@ -67,7 +67,7 @@ def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
     assert archive.manifest.complete
     base, *residuals = done.losses_by_stage
     assert base[-1] < 0.95 * base[0]
-    # Of 30 iterations and 21 views that are not alike, the running mean says which views were drawn last.
+    # After 30 iterations on 21 different views, the running mean depends on the views drawn last.
     assert all(0 < loss < 1 for losses in residuals for loss in losses)
     for record in archive.manifest.records:
         parts = record.breakdown_seconds
@@ -78,7 +78,7 @@ def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("variable", ["LAPGS_TAMING", "LAPGS_GRAPHDECO"])
 def test_one_level_equals_the_bare_run(variable: str, scene: Path, tmp_path: Path) -> None:
-    """To every digit that is shown. FastGS's late pruning is rescaled, so its one level is not its bare run."""
+    """One level equals the bare run in every digit that is shown, except for FastGS, whose late pruning is rescaled."""
     assert run(variable, scene, tmp_path / "run", "--levels", "1").losses == bare(variable, scene, tmp_path).losses
 
 

@@ -13,8 +13,9 @@ import torch
 
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.runs.archive import Manifest, RunArchive, SceneReference
-from lapgs_plugin.runs.watching import Watcher
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import ring_scene

@@ -1,4 +1,4 @@
-"""Adam on the CPU for the parameters of a Gaussian field: one pass over memory, on all threads."""
+"""Take Adam's steps on the CPU in one pass over memory, on all threads."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, at, fetch_add, load, sqrt, store
 from lapgs_plugin.jit.threads import parallel
+from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS
 
-_FLAT_COLUMNS = 4096  # a parameter whose columns are all alike is cut into rows of this many elements
+_FLAT_COLUMNS = 4096  # length of the rows that a parameter is cut into if all its columns are treated alike
 _TASK_ELEMENTS = 16384
 
 Value = TypeVar("Value", Lanes, float)
@@ -24,14 +25,14 @@ Value = TypeVar("Value", Lanes, float)
 
 @inline
 def _moments(gradient: Value, mean: Value, square: Value, rates: Floats) -> tuple[Value, Value]:
-    """Both moments after this step."""
+    """Return both moments after this step."""
     blend, decay, square_blend = at(rates, 0), at(rates, 1), at(rates, 2)
     return mean + blend * (gradient - mean), decay * square + square_blend * (gradient * gradient)
 
 
 @inline
 def _moved(parameter: Value, scale: Value, mean: Value, root: Value, rates: Floats) -> Value:
-    """The parameter after this step; `root` is the square root of the second moment."""
+    """Return the parameter after this step; `root` is the square root of the second moment."""
     step_size, correction, eps = at(rates, 3), at(rates, 4), at(rates, 5)
     moved: Value = parameter - step_size * scale * mean / (correction * root + eps)
     return moved
@@ -39,19 +40,12 @@ def _moved(parameter: Value, scale: Value, mean: Value, root: Value, rates: Floa
 
 @jit
 def _adam_kernel(
-    counter: NDArray[np.int64],
-    p: Floats,
-    g: Floats,
-    m: Floats,
-    v: Floats,
-    columns: int,
-    active: int,
-    scale: Floats,
+    counter: NDArray[np.int64], p: Floats, g: Floats, m: Floats, v: Floats, columns: int, active: int, scale: Floats,
     rates: Floats,
-) -> None:
+) -> None:  # fmt: skip
     """Update the first `active` elements of each row of `columns`; all arrays flat, `scale` for one row.
 
-    No multiplication is fused with an addition, so that an element has the same bits in a vector and beside one.
+    No multiplication is fused with an addition, so that vector and scalar code give the same bits.
     """
     rows = (len(p) + columns - 1) // columns
     rows_of_task = max(_TASK_ELEMENTS // columns, 1)
@@ -76,22 +70,20 @@ def _adam_kernel(
 
 
 class FieldAdam(torch.optim.Optimizer):
-    """Adam with the formula and the state of `torch.optim.Adam`, for parameters of n Gaussians, (n, ...), on the CPU.
+    """Optimize parameters of n Gaussians, (n, ...), on the CPU with the formula and the state of `torch.optim.Adam`.
 
     The state has torch's keys 'step', 'exp_avg' and 'exp_avg_sq', so densification code that edits the state of torch's
     Adam edits this one. Updates have the same bits for any number of threads.
 
-    Each parameter group also has, and may change between steps:
-        column_scale: multiplies the learning rate, a tensor of the shape of one row, such as (k, 3) for SH; or None.
-        active_columns: only the first so many entries of dimension 1 are updated, such as the SH coefficients up to the
-            current degree; None for all. The rest costs nothing. While their gradients are and have been zero, skipping
-            them is exact: Adam would not move them either.
-        views: by how much a step raises the count of steps, and to which power it takes the betas; 1. See
-            `training.settings.StepScale`.
+    Each parameter group also has these options, which may change between steps:
+        column_scale: factors on the learning rate, a tensor of the shape of one row, such as (k, 3) for SH; or None.
+        active_columns: number of entries of dimension 1 that are updated, such as the SH coefficients up to the current
+            degree; None for all. Skipping the others is exact while their gradients have always been zero.
+        views: `StepScale.views`, 1 by default.
 
     Args:
         params: float32 or float64 tensors on the CPU.
-        lr, betas, eps: as in torch.optim.Adam; eps is 1e-15 as in 3DGS.
+        lr, betas, eps: as in torch.optim.Adam, with the epsilon of 3DGS.
 
     Raises:
         UserInputError: an argument out of range, or a parameter that is not a contiguous CPU tensor of a fitting shape.
@@ -101,8 +93,8 @@ class FieldAdam(torch.optim.Optimizer):
         self,
         params: Iterable[Tensor] | Iterable[dict[str, Any]],
         lr: float,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
+        betas: tuple[float, float] = BETAS,
+        eps: float = ADAM_EPS,
         column_scale: Tensor | None = None,
         active_columns: int | None = None,
     ) -> None:
@@ -122,7 +114,7 @@ class FieldAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # as torch's own
-        """Update every parameter that has a gradient; returns what `closure` returns, if there is one."""
+        """Update every parameter that has a gradient; return the loss of `closure`, if there is one."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -151,11 +143,11 @@ class FieldAdam(torch.optim.Optimizer):
         tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"])
         arrays = (tensor.detach().view(-1).numpy() for tensor in tensors)
         parallel(_adam_kernel, *arrays, columns, active, scale, rates)
-        torch.autograd.graph.increment_version(parameter)  # autograd does not see what a kernel wrote
+        torch.autograd.graph.increment_version(parameter)  # autograd does not see that a kernel wrote to it
 
 
 def _rows(parameter: Tensor, scale: Tensor | None, active_columns: int | None) -> tuple[int, int, Floats]:
-    """Elements in a row, how many of them to update, and the scale of each."""
+    """Return the elements in a row, how many of them are updated, and the scale of each."""
     if (
         parameter.device.type != "cpu"
         or parameter.dtype not in (torch.float32, torch.float64)

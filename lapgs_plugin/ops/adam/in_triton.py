@@ -1,44 +1,23 @@
-"""One Adam step of all tensors of a field in one kernel.
+"""Take one Adam step of all tensors of a field in one kernel.
 
-PyTorch's fused Adam takes a launch for each tensor, and has one learning rate for it: SH would have to be two tensors,
-put together for every render and taken apart in every backward pass.
+PyTorch's fused Adam launches a kernel for each tensor and has one learning rate for it. With it, SH have to be two
+tensors, which are concatenated for every render and split in every backward pass.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from lapgs_plugin.ops.adam import ADAM_EPS
+from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 
 BLOCK = 512
-BETAS = 0.9, 0.999
 EPS = tl.constexpr(ADAM_EPS)
-LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(0.9)), tl.constexpr(math.log(0.999))
-
-
-class AdamSlot(NamedTuple):
-    """A tensor under optimization; all float32 and contiguous on one CUDA device.
-
-    Attributes:
-        values, gradient, mean, square: (n, ...) the tensor, its gradient, and Adam's first and second moment.
-        step: scalar, how many steps there have been with this one; views, where steps are for several.
-        rate: step size of the first three columns.
-        rest: step size of all further columns.
-    """
-
-    values: Tensor
-    gradient: Tensor
-    mean: Tensor
-    square: Tensor
-    step: Tensor
-    rate: float
-    rest: float
+LOG_BETA1, LOG_BETA2 = tl.constexpr(math.log(BETAS[0])), tl.constexpr(math.log(BETAS[1]))
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -47,10 +26,10 @@ def _move(
     rate: float, rest: float, scale: float, keep1: float, take1: float, keep2: float, take2: float,
     n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    """The rows of this program of one tensor: `columns` times `block` numbers that lie beside each other.
+    """Step `block` rows of one tensor, `columns` contiguous numbers each.
 
-    keep1 and take1 are the shares of the first moment and of the gradient in the next one, keep2 and take2 those of the
-    second moment and of the gradient's square.
+    keep1 and take1 are the weights of the first moment and of the gradient in the next moment, keep2 and take2 those of
+    the second moment and of the gradient's square.
     """
     t = tl.load(step).to(tl.float64)
     unbias1 = 1.0 / (1.0 - tl.exp(t * LOG_BETA1)).to(tl.float32)
@@ -92,17 +71,12 @@ def _kernel(
     _move(values4, gradients4, means4, squares4, step4, rate4, rest4, scale, k1, t1, k2, t2, n, columns4, block)
 
 
-def step_five(tensors: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
-    """One step of the five tensors of a field, of n rows each, whose `step` has been counted up already.
-
-    Args:
-        tensors: what moves.
-        views, gradient: of a `StepScale`.
-    """
-    n = len(tensors[0].values)
+def step_triton(slots: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
+    """Do `step_torch` for the five float32 tensors of a field, n rows each, on one CUDA device."""
+    n = len(slots[0].values)
     keep1, keep2 = (beta**views for beta in BETAS)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
     launch(
-        *(value for one in tensors for value in (*one, one.values[:1].numel())),
+        *(value for slot in slots for value in (*slot, slot.values[:1].numel())),
         gradient, keep1, 1 - keep1, keep2, 1 - keep2, n, block=BLOCK,
     )  # fmt: skip

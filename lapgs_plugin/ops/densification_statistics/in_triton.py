@@ -1,4 +1,4 @@
-"""What densification sums up of every Gaussian in every iteration, in one kernel."""
+"""Sum up densification statistics in one kernel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _kernel(
     here = rows < n
     norm, count = tl.load(norms + rows, here, 0.0), tl.load(counts + rows, here, 0.0)
     for view in range(views):
-        seen = rows + view * n.to(tl.int64)  # in what there is of every view
+        seen = rows + view * n.to(tl.int64)
         shown = here & (tl.load(radii + seen, here, 0) > 0)
         x = tl.load(gradient + 2 * seen, shown, 0.0) * half_width
         y = tl.load(gradient + 2 * seen + 1, shown, 0.0) * half_height
@@ -30,15 +30,10 @@ def _kernel(
     tl.store(counts + rows, count, here)
 
 
-def add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor) -> None:
-    """Add the norms of screen-space gradients, in half images a pixel, and 1 where a Gaussian was shown; in place.
-
-    Args:
-        gradient: (n, 2) by the centre in pixels; of several views (b, n, 2).
-        radii: (n,) or (b, n) int32, above 0 where shown.
-        size: (width, height) of the image.
-        norms, counts: (n,) sums so far.
-    """
+def add_statistics_triton(
+    gradient: Tensor, radii: Tensor, size: tuple[int, int], norms: Tensor, counts: Tensor
+) -> None:
+    """Do `add_statistics` for contiguous float32 tensors on one CUDA device."""
     n = len(norms)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
     launch(gradient, radii, norms, counts, size[0] / 2.0, size[1] / 2.0, n, radii.numel() // n, block=BLOCK)

@@ -1,4 +1,4 @@
-"""The photometric loss of 3DGS, L1 + SSIM: which version computes it on which device."""
+"""Compute the photometric loss of 3DGS, L1 + SSIM, with its gradient."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from importlib import import_module
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, as_batch, photometric_loss_torch
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
 def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
-    """3DGS's loss, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable with respect to the prediction.
+    """Return the loss of 3DGS, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable by the prediction.
 
     On the CPU a fused kernel computes it together with its gradient. On a GPU SSIM comes from the package `fused_ssim`
-    where that is installed, else from plain PyTorch.
+    where that is installed, else from kornia.
 
     Args:
         prediction, target: (3, h, w), or (b, 3, h, w) of several views; the target without gradient.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
-        The loss, a scalar: of several views the mean of theirs.
+        The loss, a scalar; the mean over several views.
     """
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
@@ -36,39 +36,32 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     fused = fused_ssim()
     if fused is None or prediction.dtype != torch.float32:
         return photometric_loss_torch(prediction, target, ssim_weight)
-    if _l1_in_triton():
+    ssim = fused(as_batch(prediction), as_batch(target))
+    if triton_works(prediction):
         from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
 
-        # Numbers that only scale others cost a launch each, and another on the way back.
+        # The kernel also adds the constant: each scalar operation would cost a launch, and another for its gradient.
         rest = weighted_l1(prediction.contiguous(), target.contiguous(), 1.0 - ssim_weight, ssim_weight)
-        return torch.sub(rest, fused(*_batches(prediction, target)), alpha=ssim_weight)
+        return torch.sub(rest, ssim, alpha=ssim_weight)
     l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(*_batches(prediction, target)))
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim)
 
 
-def _batches(*images: Tensor) -> tuple[Tensor, ...]:
-    """Return each (3, h, w) or (b, 3, h, w) as (b, 3, h, w)."""
-    return tuple(image if image.ndim == 4 else image[None] for image in images)
+@matches_reference("L1 in several operations instead of one kernel", 1e-4)
+def triton_works(device: torch.device) -> float:
+    """Compare the loss and its gradient."""
+    from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
 
-
-@lru_cache(maxsize=1)
-def _l1_in_triton() -> bool:
-    def difference() -> float:
-        from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
-
-        target = torch.linspace(0, 1, 3000, device="cuda")
-        prediction = (2 * target.square()).requires_grad_()
-        losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
-        gradients = [torch.autograd.grad(3.0 * loss, prediction)[0] * len(target) for loss in losses]
-        pairs = (losses, gradients)
-        return largest((one - other).abs() for one, other in pairs)
-
-    return matches_reference("L1 in several operations instead of one kernel", difference, 1e-4)
+    target = torch.linspace(0, 1, 3000, device=device)
+    prediction = (2 * target.square()).requires_grad_()
+    losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
+    gradients = [torch.autograd.grad(3.0 * loss, prediction)[0] * len(target) for loss in losses]
+    return largest((one - other).abs() for one, other in (losses, gradients))
 
 
 @lru_cache(maxsize=1)
 def fused_ssim() -> Callable[[Tensor, Tensor], Tensor] | None:
-    """The function of that name from the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without it."""
+    """Return the function of the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without the package."""
     try:
         found: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
     except ImportError:

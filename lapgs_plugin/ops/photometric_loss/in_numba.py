@@ -1,8 +1,7 @@
-"""L1 + SSIM on the CPU, fused with its gradient: the photometric loss of 3DGS in one pass over the images.
+"""Compute the photometric loss of 3DGS and its gradient on the CPU in one pass over the images.
 
-SSIM is the one 3DGS trains with: an 11x11 Gaussian window of sigma 1.5, zeros outside the image, nothing clamped, the
-mean over all pixels and channels. As PyTorch convolutions it costs more than rasterizing the image on a CPU. Here the
-rows of a block stream through two buffers that stay in the cache, and only the gradient is written to memory:
+SSIM is `in_torch.ssim`'s. The rows of a block stream through two buffers that stay in the cache, and only the gradient
+is written to memory:
 
     prediction, target -> moments -> filtered down, then across -> SSIM and its derivatives with respect to the moments
     -> filtered down, then across -> gradient
@@ -24,18 +23,7 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
-from lapgs_plugin.jit.lanes import (
-    WIDTH,
-    Floats,
-    Lanes,
-    absolute,
-    fetch_add,
-    fma,
-    load,
-    select,
-    splat,
-    store,
-)
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, absolute, fetch_add, fma, load, select, splat, store
 from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
@@ -44,11 +32,11 @@ from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_RADIUS as RADIUS
 
 Integers = NDArray[np.int64]
 
-_MOMENTS = 4  # p, t, p^2 + t^2, p t: SSIM needs the squares in their sum only
+_MOMENTS = 4  # p, t, p^2 + t^2, p t: SSIM needs only the sum of the squares
 _DERIVATIVES = 3  # with respect to the means of p, p^2 and p t
-_GROUP = 4  # rows filtered down together: 14 rows are read for them, where one by one they would read 44
+_GROUP = 4  # rows filtered down together: they read 14 rows, where one by one they would read 44
 _BLOCK_COLUMNS = 400  # both buffers of a block fit a level-2 cache of 256 KiB in float32
-_STRIP_ROWS = 192  # each strip computes 20 rows of its neighbours again
+_STRIP_ROWS = 192  # a strip computes 20 rows of its neighbours again
 
 
 def _half_window() -> tuple[float, ...]:
@@ -65,7 +53,7 @@ def _window_sum(
     v0: Lanes, v1: Lanes, v2: Lanes, v3: Lanes, v4: Lanes, v5: Lanes,
     v6: Lanes, v7: Lanes, v8: Lanes, v9: Lanes, v10: Lanes,
 ) -> Lanes:  # fmt: skip
-    """The 11 values weighted by the window."""
+    """Return the sum of 11 values weighted by the window."""
     total = fma(_W1, v1 + v9, _W0 * (v0 + v10))
     total = fma(_W3, v3 + v7, fma(_W2, v2 + v8, total))
     return fma(_W5, v5, fma(_W4, v4 + v6, total))
@@ -73,15 +61,15 @@ def _window_sum(
 
 @inline
 def _filter_across(row: Floats, x: int) -> Lanes:
-    """The window over the 11 columns from x on, for 16 neighbouring x."""
+    """Filter the 11 columns from x on, for 16 neighbouring x."""
     return _window_sum(
         load(row, x), load(row, x + 1), load(row, x + 2), load(row, x + 3), load(row, x + 4), load(row, x + 5),
         load(row, x + 6), load(row, x + 7), load(row, x + 8), load(row, x + 9), load(row, x + 10),
     )  # fmt: skip
 
 
-# A buffer holds the last 16 rows as a ring of four groups of four. A row is its maps one after the other, each `pitch`
-# long. From a group, filtering makes the four rows whose windows end with the group's rows.
+# A buffer holds the last 16 rows as a ring of four groups of four. A row holds its maps one after the other, `pitch`
+# numbers each. Filtering a group makes the four rows whose windows end with the group's rows.
 
 
 @inline
@@ -117,10 +105,10 @@ def _store_moments(p_row: Floats, t_row: Floats, pitch: int, moments: Floats, st
 def _store_derivatives(
     filtered: Floats, row: int, inside: Floats, pitch: int, derivatives: Floats, start: int, ssim: Floats
 ) -> None:
-    """SSIM of a row and its derivatives with respect to the moments; zero where `inside` is.
+    """Store SSIM of a row and its derivatives by the moments; zero where `inside` is.
 
     With A1 = 2 mu_p mu_t + C1, A2 = 2 cov + C2, B1 = mu_p^2 + mu_t^2 + C1, B2 = var_p + var_t + C2 it is
-    S = A1 A2 / (B1 B2). What is stored lacks the factor 2 that all terms of the gradient share: its weight has it.
+    S = A1 A2 / (B1 B2). The factor 2 that all terms of the gradient share is left to the gradient's weight.
     """
     for x in range(0, pitch, WIDTH):
         mean_p, mean_t = _filter_across(filtered, row + x), _filter_across(filtered, row + pitch + x)
@@ -139,16 +127,10 @@ def _store_derivatives(
 
 @inline
 def _store_gradient(
-    filtered: Floats,
-    row: int,
-    moments: Floats,
-    start: int,
-    pitch: int,
-    weights: tuple[float, float],
-    l1_sum: Floats,
+    filtered: Floats, row: int, moments: Floats, start: int, pitch: int, weights: tuple[float, float], l1_sum: Floats,
     out: Floats,
-) -> None:
-    """One row of the gradient; adds |p - t| to `l1_sum`."""
+) -> None:  # fmt: skip
+    """Store one row of the gradient and add |p - t| to `l1_sum`."""
     l1_weight, ssim_weight = weights
     plus, minus = splat(out, l1_weight), splat(out, -l1_weight)
     for x in range(0, pitch - 2 * WIDTH + 1, WIDTH):
@@ -163,7 +145,7 @@ def _store_gradient(
 
 @inline
 def _copy_row(image: Floats, y: int, left: int, first: int, last: int, row: Floats) -> None:
-    """Columns first to last of row `y` with zeros around them; column `left` goes to the start of the row."""
+    """Copy columns first to last of row `y`, with zeros around them; the row starts at column `left`."""
     if 0 <= y < image.shape[0]:
         row[: first - left] = 0
         row[first - left : last - left] = image[y, first:last]
@@ -180,23 +162,17 @@ def _add_row(total: Floats, row: Floats, pitch: int) -> None:
 
 @inline
 def _mark_inside(left: int, width: int, inside: Floats) -> None:
-    """One where column left + x lies in the image, zero elsewhere."""
+    """Store 1 where column left + x lies in the image, 0 elsewhere."""
     for x in range(len(inside)):
         inside[x] = 0 <= left + x < width
 
 
 @jit
 def _photometric_kernel(
-    counter: Integers,
-    blocks: Integers,
-    pitch: int,
-    prediction: Floats,
-    target: Floats,
-    weights: tuple[float, float],
-    gradient: Floats,
-    sums: NDArray[np.float64],
-) -> None:
-    """Gradient (c, h, w), and for each block the sums of |p - t| and of SSIM, (blocks, 2)."""
+    counter: Integers, blocks: Integers, pitch: int, prediction: Floats, target: Floats, weights: tuple[float, float],
+    gradient: Floats, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Compute the gradient (c, h, w), and for each block the sums of |p - t| and of SSIM, (blocks, 2)."""
     _, height, width = prediction.shape
     dtype = prediction.dtype
     wide, narrow = _MOMENTS * pitch, _DERIVATIVES * pitch
@@ -212,7 +188,7 @@ def _photometric_kernel(
         channel, top, bottom, start, stop = blocks[task]
         left, first, last = start - 2 * RADIUS, max(start - 2 * RADIUS, 0), min(stop + 2 * RADIUS, width)
         _mark_inside(start - RADIUS, width, inside)
-        # Summed by column first: vectors, in a fixed order, and precise enough in float32.
+        # Sums by column are vectors, have a fixed order, and are precise enough in float32.
         l1_sum[:] = 0
         ssim_sum[:] = 0
         for group, y in enumerate(range(top - 2 * RADIUS, bottom + 2 * RADIUS, _GROUP)):
@@ -249,7 +225,7 @@ def _photometric_kernel(
 def _ssim_kernel(
     counter: Integers, blocks: Integers, pitch: int, prediction: Floats, target: Floats, ssim: Floats
 ) -> None:
-    """SSIM of each pixel, (c, h, w)."""
+    """Compute SSIM of each pixel, (c, h, w)."""
     width, dtype = prediction.shape[2], prediction.dtype
     wide = _MOMENTS * pitch
     moments, unused = np.zeros(4 * _GROUP * wide, dtype), np.zeros(_DERIVATIVES * pitch, dtype)
@@ -280,11 +256,11 @@ def _ssim_kernel(
 
 @lru_cache(maxsize=64)
 def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
-    """How an image is cut, (blocks, 5): channel, rows and columns; and the length of a buffered row.
+    """Cut an image into blocks, (blocks, 5): channel, first and last row, first and last column; and a row's pitch.
 
-    It depends on nothing but the size, so that sums over blocks have the same bits for any number of threads.
+    They depend on the size alone, so that sums over blocks have the same bits for any number of threads.
     """
-    # An even number, so that two threads get the same work.
+    # An even number, so that two threads share the work equally.
     strips, columns = 2 * -(-height // (2 * _STRIP_ROWS)), -(-width // _BLOCK_COLUMNS)
     blocks = [
         (channel, i * height // strips, (i + 1) * height // strips, j * width // columns, (j + 1) * width // columns)
@@ -321,7 +297,7 @@ class _PhotometricLoss(torch.autograd.Function):
         gradient = empty(count, images[0].dtype).reshape(prediction.shape)
         blocks, pitch = _blocks(*prediction.shape)
         sums = np.empty((len(blocks), 2))
-        # The mean of 1 - SSIM, and the factor 2 that the stored derivatives lack.
+        # The weight of SSIM has the factor 2 that the stored derivatives lack.
         weights = (1 - ssim_weight) / count, -2 * ssim_weight / count
         parallel(_photometric_kernel, blocks, pitch, *images, weights, gradient, sums)
         l1, ssim = sums.sum(axis=0) / count
@@ -332,12 +308,12 @@ class _PhotometricLoss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        # A pass over the image that multiplies by one costs a tenth of the loss.
+        # Multiplying by 1 would be another pass over the image.
         return (gradient if grad_loss.item() == 1 else gradient * grad_loss), None, None
 
 
 def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
-    """(1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once with respect to the prediction.
+    """Return (1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once by the prediction.
 
     Args:
         prediction: (c, h, w) image of any size and any value range, float32 or float64, on the CPU.
@@ -360,7 +336,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
 
 
 def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
-    """SSIM of each pixel and channel, (c, h, w); not differentiable.
+    """Return SSIM of each pixel and channel, (c, h, w); not differentiable.
 
     Raises:
         UserInputError: the images differ in shape or type, or are not float32 or float64 on the CPU.
@@ -373,5 +349,5 @@ def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim_cpu(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean of `ssim_map_cpu`, a scalar: the SSIM that papers on 3DGS report."""
+    """Return the mean of `ssim_map_cpu`, a scalar: the SSIM that papers on 3DGS report."""
     return ssim_map_cpu(prediction, target).mean()

@@ -1,4 +1,4 @@
-"""The L1 term of the photometric loss with its gradient in one kernel."""
+"""Compute the L1 term of the photometric loss with its gradient in one kernel."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def _kernel(
     difference = tl.load(prediction + places, here, 0.0) - tl.load(target + places, here, 0.0)
     sign = tl.where(difference > 0.0, weight, 0.0) - tl.where(difference < 0.0, weight, 0.0)
     tl.store(gradient + places, sign, here)
-    tl.atomic_add(total, tl.sum(difference * sign))  # NaN stays NaN, which ends a run that diverges
+    tl.atomic_add(total, tl.sum(difference * sign))  # NaN stays NaN, which stops a diverged run
 
 
 class _WeightedL1(torch.autograd.Function):
-    """(prediction, target, weight, constant) -> constant + weight * mean |prediction - target|."""
+    """Map (prediction, target, weight, constant) to constant + weight * mean |prediction - target|."""
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, weight: float, constant: float) -> Tensor:
@@ -47,7 +47,7 @@ class _WeightedL1(torch.autograd.Function):
 
 
 def weighted_l1(prediction: Tensor, target: Tensor, weight: float, constant: float) -> Tensor:
-    """constant + weight * mean |prediction - target|, differentiable with respect to the prediction.
+    """Return constant + weight * mean |prediction - target|, differentiable by the prediction.
 
     Args:
         prediction, target: of one shape, contiguous float32 on a CUDA device.

@@ -1,14 +1,20 @@
-"""Up(coarse), with or without + fine, on the CPU: rows are raised across into a buffer in the cache and summed there.
+"""Upsample on the CPU: first along rows, into a buffer that stays in the cache, then along columns.
 
-Across, the even and the odd fine samples 2 i and 2 i + 1 are sums over the same few coarse neighbours of i, which makes
-vectors of neighbouring i out of both.
+The fine samples 2 i and 2 i + 1 of a row are sums over the same few coarse neighbours of i. A vector holds one of these
+sums for neighbouring i.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from functools import lru_cache
+from typing import NamedTuple
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import (
@@ -30,15 +36,15 @@ from lapgs_plugin.jit.threads import parallel
 Integers = NDArray[np.int64]
 
 BEFORE, AFTER = 2, 3
-"""Coarse neighbours of i on its two sides."""
+"""Number of coarse neighbours of i before and after it."""
 NEIGHBOURS = BEFORE + 1 + AFTER
 
 _STRIP_ROWS = 32
-"""Fine rows of a piece of work: some 20 coarse ones are raised for them, 4 of which its neighbour raises again."""
+"""Fine rows of a task. Adjacent tasks upsample a few coarse rows twice."""
 
 
 def across_weights(first: Integers, weights: Floats) -> Floats:
-    """Weights of the neighbours, (2, NEIGHBOURS, pitch): of even and of odd samples, for each i from 0 on.
+    """Return the weights of the neighbours of each i, (2, NEIGHBOURS, pitch), for even and for odd fine samples.
 
     Args:
         first, weights: `Pyramid.up_taps` of the finer side.
@@ -58,7 +64,7 @@ def across_weights(first: Integers, weights: Floats) -> Floats:
 def _upsample_row(
     coarse: Floats, start: int, length: int, weights: Floats, pitch: int, row: Floats, out: Floats, place: int
 ) -> None:
-    """`length` coarse samples from `start` on at the fine width; `row` has room for them and their neighbours."""
+    """Upsample a row of `length` coarse samples; `row` is scratch space for them and their neighbours."""
     for x in range(length):
         put(row, BEFORE + x, at(coarse, start + x))
     for i in range(0, pitch, WIDTH):
@@ -74,7 +80,7 @@ def _upsample_row(
 def _kernel(
     counter: Integers,
     coarse: Floats,  # (n, h / 2, w / 2)
-    fine: Floats,  # (n, h, w), looked at if it is to be added
+    fine: Floats,  # (n, h, w), read if `adds`
     adds: bool,
     first_row: Integers,  # (h,)
     row_weights: Floats,  # (h, taps)
@@ -87,7 +93,7 @@ def _kernel(
     wide, whole, strips = 2 * pitch, width // WIDTH * WIDTH, -(-height // _STRIP_ROWS)
     memory = np.empty((_STRIP_ROWS + NEIGHBOURS) * wide, fine.dtype)
     padded = np.zeros(pitch + NEIGHBOURS + WIDTH, fine.dtype)
-    raised, row, below, above = borrowed(memory), borrowed(padded), borrowed(coarse), borrowed(fine)
+    upsampled, row, below, above = borrowed(memory), borrowed(padded), borrowed(coarse), borrowed(fine)
     across, down, result = borrowed(column_weights), borrowed(row_weights), borrowed(out)
     while True:
         task = fetch_add(counter, 1)
@@ -98,46 +104,60 @@ def _kernel(
         start, stop = first_row[top], first_row[bottom - 1] + taps
         for y in range(start, stop):
             place = (plane * coarse_height + y) * coarse_width
-            _upsample_row(below, place, coarse_width, across, pitch, row, raised, (y - start) * wide)
+            _upsample_row(below, place, coarse_width, across, pitch, row, upsampled, (y - start) * wide)
         for y in range(top, bottom):
             place, first = (plane * height + y) * width, (first_row[y] - start) * wide
             for x in range(0, whole, WIDTH):
                 total = load(above, place + x) if adds else splat(above, 0.0)
                 for tap in range(taps):
-                    total = fma(load(raised, first + tap * wide + x), at(down, y * taps + tap), total)
+                    total = fma(load(upsampled, first + tap * wide + x), at(down, y * taps + tap), total)
                 store(result, place + x, total)
             for x in range(whole, width):
                 rest = at(above, place + x) if adds else fine.dtype.type(0)
                 for tap in range(taps):
-                    rest += at(raised, first + tap * wide + x) * at(down, y * taps + tap)
+                    rest += at(upsampled, first + tap * wide + x) * at(down, y * taps + tap)
                 put(result, place + x, rest)
     keep_alive(memory)
     keep_alive(padded)
 
 
-def upsample_add_cpu(
-    coarse: Floats, fine: Floats, first_row: Integers, row_weights: Floats, column_weights: Floats
-) -> Floats:
-    """Up(coarse) + fine, the same bits for any number of threads.
-
-    Args:
-        coarse: (n, ceil(h / 2), ceil(w / 2)) contiguous.
-        fine: (n, h, w) contiguous, of the same type as all weights.
-        first_row, row_weights: `Pyramid.up_taps` of h.
-        column_weights: `across_weights` of w.
-
-    Returns:
-        (n, h, w).
-    """
-    out = empty(fine.size, fine.dtype).reshape(fine.shape)
-    parallel(_kernel, coarse, fine, True, first_row, row_weights, column_weights, out)
-    return out
+def upsample_add_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+    """Do `upsample_add` for float32 or float64; the same bits for any number of threads."""
+    added = _planes(fine)
+    out = empty(added.size, added.dtype).reshape(added.shape)
+    rows, columns = (_taps(pyramid.grid, side, fine.dtype) for side in fine.shape[-2:])
+    _launch(_planes(coarse), added, True, rows, columns, out)
+    return torch.from_numpy(out).view(fine.shape)
 
 
-def upsample_cpu(
-    coarse: Floats, size: tuple[int, int], first_row: Integers, row_weights: Floats, column_weights: Floats
-) -> Floats:
-    """Up(coarse) to (n, *size); the other arguments as `upsample_add_cpu` takes them."""
-    out = empty(len(coarse) * size[0] * size[1], coarse.dtype).reshape(len(coarse), *size)
-    parallel(_kernel, coarse, out, False, first_row, row_weights, column_weights, out)
-    return out
+def upsample_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    """Do `upsample` without its gradient; the same bits for any number of threads."""
+    source = _planes(coarse)
+    out = empty(len(source) * size[0] * size[1], source.dtype).reshape(len(source), *size)
+    rows, columns = (_taps(pyramid.grid, side, coarse.dtype) for side in size)
+    _launch(source, out, False, rows, columns, out)
+    return torch.from_numpy(out).view(*coarse.shape[:-2], *size)
+
+
+def _planes(image: Tensor) -> Floats:
+    """Return all channels as (n, h, w), contiguous."""
+    return image.detach().reshape(-1, *image.shape[-2:]).contiguous().numpy()
+
+
+class _Taps(NamedTuple):
+    """Hold `Pyramid.up_taps` of a side, and `across_weights` of them."""
+
+    first: Integers
+    weights: Floats
+    across: Floats
+
+
+@lru_cache(maxsize=64)
+def _taps(grid: str, size: int, dtype: torch.dtype) -> _Taps:
+    first, weights = Pyramid(grid).up_taps(size)
+    values = weights.to(dtype).numpy()
+    return _Taps(first.numpy(), values, across_weights(first.numpy(), values))
+
+
+def _launch(coarse: Floats, fine: Floats, adds: bool, rows: _Taps, columns: _Taps, out: Floats) -> None:
+    parallel(_kernel, coarse, fine, adds, rows.first, rows.weights, columns.across, out)

@@ -1,4 +1,4 @@
-"""Up on a GPU in one kernel, with or without a sum, and its gradient in two."""
+"""Upsample on a GPU in one kernel, with or without adding an image; the gradient takes two."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
 
 BLOCK_ROWS, BLOCK_COLUMNS = 8, 128
 MOST_TAPS, MOST_TRANSPOSED = 5, 12
-"""Of one sample: coarse ones that a fine one is made of, and fine ones that a coarse one goes into."""
+"""Upper bounds: coarse samples in the sum of a fine one, and fine samples whose sums a coarse one is in."""
 
-# Triton compiles a kernel anew, for a second, where an integer is 1 or a multiple of 16 and was not before: with
-# these, at many a new size of an image. Distances between columns are 1 or 3, and to know that they are 1 helps.
+# Triton compiles a kernel again for integers that are 1 or multiples of 16. Without this it would do so for many image
+# sizes. Column strides stay specialized: they are 1 or 3, and a known 1 makes faster code.
 OF_ANY_VALUE = (
     *("height", "width", "source_image", "source_plane", "source_row"),
     *("added_image", "added_plane", "added_row", "out_image", "out_plane", "out_row"),
@@ -36,14 +36,14 @@ def _kernel(
     adds: tl.constexpr, planes: tl.constexpr, taps_down: tl.constexpr, taps_across: tl.constexpr,
     block_rows: tl.constexpr, block_columns: tl.constexpr,
 ) -> None:  # fmt: skip
-    """A block of all planes of an image; *_image, *_plane, ... are distances between neighbours in memory."""
+    """Filter a block of all planes of an image; *_image, *_plane, *_row, *_column are strides."""
     rows = tl.program_id(1) * block_rows + tl.arange(0, block_rows)  # (r,)
     columns = tl.program_id(0) * block_columns + tl.arange(0, block_columns)  # (c,)
     in_rows, in_columns = rows < height, columns < width
     inside = in_rows[:, None] & in_columns[None, :]
     row, column = tl.load(first_row + rows, in_rows, 0), tl.load(first_column + columns, in_columns, 0)
     image = tl.program_id(2).to(tl.int64)
-    for plane in tl.static_range(planes):  # colours beside each other in memory are read by one block
+    for plane in tl.static_range(planes):  # one block reads all colours, which may be interleaved in memory
         total = tl.zeros((block_rows, block_columns), tl.float32)
         if adds:
             there = added + image * added_image + plane * added_plane
@@ -61,14 +61,14 @@ def _kernel(
 
 
 class _Taps(NamedTuple):
-    """Along one side, as `Pyramid.up_taps` says it, on a device: first (n,) int32, weights (n, k) float32."""
+    """Hold `Pyramid.up_taps` of a side on a device: first (n,) int32, weights (n, k) float32."""
 
     first: Tensor
     weights: Tensor
 
 
 def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    """See `raising.upsample_add`; float32 on a CUDA device, (c, h, w) or (b, c, h, w) in whatever order of memory."""
+    """Do `upsample_add` for float32 images on a CUDA device, with any strides."""
     rows, columns = (_up(pyramid.grid, side, fine.device) for side in fine.shape[-2:])
     out = torch.empty_like(fine)
     _filter(coarse, rows, columns, out, fine)
@@ -76,13 +76,13 @@ def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tenso
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """`Pyramid.up` with its gradient; `coarse` as `upsample_add_triton` takes it."""
-    raised: Tensor = _Upsampled.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
-    return raised
+    """Do `upsample` for a float32 image on a CUDA device, with any strides."""
+    out: Tensor = _Upsampled.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+    return out
 
 
 class _Upsampled(torch.autograd.Function):
-    """(coarse, grid, size) -> Up(coarse). Its gradient is Up's transpose, one side after the other."""
+    """Map (coarse, grid, size) to Up(coarse); the gradient applies the transpose of Up, one side after the other."""
 
     @staticmethod
     def forward(ctx: Any, coarse: Tensor, grid: str, size: tuple[int, int]) -> Tensor:
@@ -97,14 +97,14 @@ class _Upsampled(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (height, width), device = ctx.size, gradient.device
         lower = gradient.new_empty(*ctx.shape[:-1], width)  # half as many rows
-        _filter(gradient, _up_transposed(ctx.grid, height, device), _as_they_are(width, device), lower)
+        _filter(gradient, _up_transposed(ctx.grid, height, device), _identity(width, device), lower)
         out = gradient.new_empty(ctx.shape)
-        _filter(lower, _as_they_are(ctx.shape[-2], device), _up_transposed(ctx.grid, width, device), out)
+        _filter(lower, _identity(ctx.shape[-2], device), _up_transposed(ctx.grid, width, device), out)
         return out, None, None
 
 
 def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None) -> None:
-    """Write sums of `source`'s samples, plus `added` where there is any, into `out`."""
+    """Write weighted sums of `source`, plus `added` if given, to `out`."""
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
     height, width = out.shape[-2:]
@@ -112,7 +112,7 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
     launch: Any = _kernel[blocks]
     launch(
         *images, *rows, *columns, height, width,
-        *(distance for image in images for distance in image.stride()),
+        *(stride for image in images for stride in image.stride()),
         adds=added is not None, planes=images[2].shape[1],
         taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1],
         block_rows=BLOCK_ROWS, block_columns=BLOCK_COLUMNS,
@@ -120,29 +120,30 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # kept for others, who may need gradients
+@torch.inference_mode(False)  # the cache serves calls that need gradients
 def _up(grid: str, size: int, device: torch.device) -> _Taps:
-    return _sent(*Pyramid(grid).up_taps(size), (size + 1) // 2, MOST_TAPS, device)
+    return _to_device(*Pyramid(grid).up_taps(size), (size + 1) // 2, MOST_TAPS, device)
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # kept for others, who may need gradients
+@torch.inference_mode(False)  # the cache serves calls that need gradients
 def _up_transposed(grid: str, size: int, device: torch.device) -> _Taps:
-    return _sent(*transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2), size, MOST_TRANSPOSED, device)
+    return _to_device(*transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2), size, MOST_TRANSPOSED, device)
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # kept for others, who may need gradients
-def _as_they_are(size: int, device: torch.device) -> _Taps:
+@torch.inference_mode(False)  # the cache serves calls that need gradients
+def _identity(size: int, device: torch.device) -> _Taps:
     return _Taps(torch.arange(size, dtype=torch.int32, device=device), torch.ones(size, 1, device=device))
 
 
-def _sent(first: Tensor, weights: Tensor, samples: int, most: int, device: torch.device) -> _Taps:
-    """With as many taps for all sizes, since their number is compiled into the kernel.
+def _to_device(first: Tensor, weights: Tensor, samples: int, most: int, device: torch.device) -> _Taps:
+    """Pad taps to the same number for all sizes, which the kernel is compiled for, and copy them to the device.
 
     Args:
-        first, weights: as `Pyramid.up_taps` gives them.
-        samples: how many there are to be summed.
+        first, weights: as `Pyramid.up_taps` returns them.
+        samples: number of samples on the side that is summed over.
+        most: number of taps to pad to.
     """
     taps = min(most, samples)
     earlier = first.clamp_max(samples - taps)

@@ -22,7 +22,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
-from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 TILE = 16
 FAR_PLANE = 1e10

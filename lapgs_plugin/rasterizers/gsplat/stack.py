@@ -25,7 +25,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
 from lapgs_plugin.rasterizers.gsplat.direct import TILE
-from lapgs_plugin.reference_raster.oracle import NEAR_DEPTH, PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
 class GsplatStack:

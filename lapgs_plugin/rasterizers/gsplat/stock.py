@@ -16,7 +16,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
-from lapgs_plugin.reference_raster.oracle import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
+from lapgs_plugin.reference_raster.layout import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
 
 
 @dataclass(frozen=True)

@@ -1,26 +1,92 @@
-"""What the Python sides of the CUDA rasterizers have in common: the module, its argument checks, the sparse Adam."""
+"""Build the Python side of the CUDA rasterizers: settings, module, argument checks, the sparse Adam."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections import namedtuple
+from functools import lru_cache
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.standins.engine import Inputs, Settings, mark_visible
+from lapgs_plugin.reference_raster.standins.engine import Inputs, Settings, mark_visible, rasterize
+from lapgs_plugin.reference_raster.standins.variants import VARIANTS, Variant
 
 
-class RasterizerBase(nn.Module):
-    """A module that holds the settings of one view."""
+class _Rasterizer(nn.Module):
+    """Render Gaussians with the settings of one view; see `engine.Inputs` for shapes and `Variant.outputs`."""
+
+    variant: ClassVar[Variant]
 
     def __init__(self, raster_settings: Settings) -> None:
         super().__init__()
         self.raster_settings: Any = raster_settings
 
     def markVisible(self, positions: Tensor) -> Tensor:
-        """(n,) bool: points (n, 3) in front of the camera's near plane."""
+        """Return which points (n, 3) are in front of the camera's near plane, (n,) bool."""
         return mark_visible(self.raster_settings, positions)
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        settings = self.raster_settings
+        return self.variant.outputs(settings, rasterize(settings, inputs, self.variant.options(settings)))
+
+
+class _WholeSh(_Rasterizer):
+    """Take all SH coefficients in one argument."""
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        return self._render(
+            gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        )
+
+
+class _DcApart(_Rasterizer):
+    """Take the first SH coefficient apart from the others."""
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        dc: Tensor | None = None,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        return self._render(
+            gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        )
+
+
+@lru_cache
+def rasterizer_module(name: str) -> dict[str, Any]:
+    """Return the public names of the stand-in for a variant's module; always the same classes."""
+    variant = VARIANTS[name]
+    found: dict[str, Any] = {
+        "__doc__": variant.description,
+        "GaussianRasterizationSettings": namedtuple("GaussianRasterizationSettings", variant.settings),
+        "GaussianRasterizer": type(
+            "GaussianRasterizer",
+            (_DcApart if variant.dc_apart else _WholeSh,),
+            {"variant": variant, "__doc__": _Rasterizer.__doc__},
+        ),
+    }
+    if variant.sparse_adam:
+        found["SparseGaussianAdam"] = SparseGaussianAdam
+    return found
 
 
 def gather(
@@ -34,7 +100,7 @@ def gather(
     rotations: Tensor | None,
     cov3d_precomp: Tensor | None,
 ) -> Inputs:
-    """Inputs from a binding's arguments; SH come whole, or with the first coefficient apart in `dc` (n, 1, 3).
+    """Return a binding's arguments as `Inputs`, with the first SH coefficient from `dc` (n, 1, 3) if it is given.
 
     Raises:
         UserInputError: not exactly one of SH and colours, or of scales with rotations and covariances.
@@ -52,9 +118,10 @@ def gather(
 
 
 class SparseGaussianAdam(torch.optim.Adam):
-    """Adam that moves the Gaussians of the last view only, and does not correct the moments' bias.
+    """Move only the Gaussians of the last view by Adam, without correcting the moments' bias.
 
-    One tensor a parameter group, its first dimension the Gaussians. State as in torch.optim.Adam, but 'step' stays 0.
+    A parameter group has one tensor, whose first dimension is the Gaussians. The state is that of torch.optim.Adam, but
+    'step' stays 0.
     """
 
     def __init__(self, params: Any, lr: float, eps: float) -> None:

@@ -1,4 +1,4 @@
-"""How much each Gaussian adds to an image: the sums over pixels that Taming-3DGS and FastGS score Gaussians by."""
+"""Sum up, over pixels, how much each Gaussian contributes: Taming-3DGS and FastGS score Gaussians by this."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ from lapgs_plugin.reference_raster.layout import (
 )
 from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
 
-_FINAL = 2 * TILE_PIXELS  # `tile_kernels.FINAL`; kernels see constants of `layout` and their own module change only
+_FINAL = 2 * TILE_PIXELS  # `tile_kernels.FINAL`: the kernel cache notices changes of `layout` and of this file only
 
 
 @dataclass(frozen=True)
 class Contributions:
-    """Sums over the pixels in which a Gaussian is blended.
+    """Hold sums over the pixels in which each Gaussian is blended.
 
     Attributes:
         weights: (n,) float64 of the pixels' weights.
@@ -66,7 +66,7 @@ class Contributions:
 
 
 def contributions(n: int, view: View, kept: Kept, weights: Floats) -> Contributions:
-    """Walk through the pixels of an image that `pipeline.render` made of n Gaussians, asked to keep.
+    """Sum over the pixels of an image that `pipeline.render` made of n Gaussians with `keep`.
 
     Args:
         weights: (height * width,) float32 weight of each pixel.
@@ -96,7 +96,7 @@ def _accumulate(
     weights: Floats,  # (height * width,)
     slots: Floats,  # (pairs * SLOT,) filled: sums of weights, of 1, of shares, of distances
 ) -> None:
-    """Sums of each splat in each tile. Alpha is evaluated as `tile_kernels.blend` does, bit by bit."""
+    """Sum up each splat in each tile; alpha has the bits of `tile_kernels.blend`."""
     transmittance, weight = np.empty(TILE_PIXELS, splats.dtype), np.zeros(TILE_PIXELS, splats.dtype)
     none, one = splat(splats, 0.0), splat(splats, 1.0)
     while True:

@@ -1,5 +1,6 @@
-"""Covariances in PyTorch, for two options of the CUDA rasterizers that the CPU kernels do not have: covariances given
-by the caller, and antialiasing. Their gradients are those of the CUDA code: DEPARTURE marks what is not textbook.
+"""Compute covariances in PyTorch for two options that the CPU kernels lack: given covariances, and antialiasing.
+
+Gradients are those of the CUDA code; DEPARTURE marks where these are not the derivative of the image.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ from lapgs_plugin.reference_raster.layout import (
 from lapgs_plugin.reference_raster.pipeline import Kept, View
 
 MIN_SHARE = 2.5e-5
-"""Lower bound of the determinant without the 0.3 px^2 over that with it, in antialiasing."""
+"""Lower bound, in antialiasing, of the determinant without the 0.3 px^2 over that with it."""
 
 
 def matrices(covariances: Tensor) -> Tensor:
-    """(n, 3, 3) symmetric matrices from their entries (n, 6): xx, xy, xz, yy, yz, zz."""
+    """Return symmetric matrices (n, 3, 3) from their entries (n, 6): xx, xy, xz, yy, yz, zz."""
     return covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations (n, 3) and rotations (n, 4), wxyz, of Gaussians with these covariances (n, 6).
+    """Return standard deviations (n, 3) and rotations (n, 4), wxyz, of Gaussians with these covariances (n, 6).
 
     Not differentiable: the axes of a covariance with equal eigenvalues are not functions of it.
     """
@@ -58,7 +59,7 @@ def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
-    """(n, 6) covariances of Gaussians with standard deviations (n, 3) and quaternions (n, 4), used as they are."""
+    """Return covariances (n, 6) from standard deviations (n, 3) and quaternions (n, 4), used as they are."""
     w, x, y, z = quats.unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -70,7 +71,9 @@ def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """(n, 3) entries xx, xy, yy of the 2D covariances in px^2, without the 0.3 px^2; made up behind the camera.
+    """Return entries xx, xy, yy (n, 3) of the 2D covariances in px^2, without the 0.3 px^2.
+
+    Behind the camera they have no meaning.
 
     Args:
         means: (n, 3) in world coordinates.
@@ -80,7 +83,7 @@ def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor
     rotation = camera[ROTATION : ROTATION + 9].reshape(3, 3)
     x, y, depth = (means @ rotation.T + camera[TRANSLATION : TRANSLATION + 3]).unbind(1)
     depth = torch.where(depth > NEAR_DEPTH, depth, 1.0)
-    # DEPARTURE: where x / z or y / z is clamped, the clamped coordinate is a constant, although it still follows z.
+    # DEPARTURE: where x / z or y / z is clamped, the clamped coordinate counts as a constant, although it depends on z.
     x, y = (_clamped(t, depth, float(view.camera[limit])) for t, limit in ((x, LIMIT_X), (y, LIMIT_Y)))
     none = torch.zeros_like(depth)
     x_scale, y_scale = camera[FOCAL_X] / depth, camera[FOCAL_Y] / depth
@@ -95,7 +98,7 @@ def _clamped(value: Tensor, depth: Tensor, limit: float) -> Tensor:
 
 
 class _Antialiasing(torch.autograd.Function):
-    """(n, 3) 2D covariances without the 0.3 px^2 -> (n,) factors of the opacities."""
+    """Map 2D covariances (n, 3) without the 0.3 px^2 to factors (n,) on the opacities."""
 
     @staticmethod
     def forward(ctx: Any, covariances: Tensor) -> Tensor:
@@ -112,8 +115,8 @@ class _Antialiasing(torch.autograd.Function):
         wide, share, factors = ctx.saved_tensors
         x, z, y = wide.unbind(1)
         w = PIXEL_VARIANCE
-        # DEPARTURE: the derivative of the share is taken where the CUDA code takes it, at covariances that already have
-        # the 0.3 px^2, and not at those that the share is computed from.
+        # DEPARTURE: the CUDA code differentiates the share at covariances that already have the 0.3 px^2, and not at
+        # those that the share is computed from.
         d_share = torch.where(share <= MIN_SHARE, 0.0, grad_factors / (2 * factors))
         common = w * d_share / ((x + w) * (y + w) - z * z) ** 2
         return torch.stack([(w * y + y * y + z * z) * common, -2 * z * (w + x + y) * common,
@@ -121,9 +124,9 @@ class _Antialiasing(torch.autograd.Function):
 
 
 def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """(n, 1) what the antialiasing option multiplies opacities by: sqrt(|Sigma| / |Sigma + 0.3 px^2|).
+    """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + 0.3 px^2|).
 
-    In float64, because the determinant of a long Gaussian is a small difference of large products.
+    They are computed in float64, because the determinant of a long Gaussian is a small difference of large products.
     """
     on_screen = screen_covariances(means.double(), covariances.double(), view)
     factors: Tensor = _Antialiasing.apply(on_screen)  # type: ignore[no-untyped-call]  # torch's
@@ -131,9 +134,9 @@ def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tens
 
 
 def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, grad_image: Floats) -> Tensor:
-    """(n, 6) derivative of the loss by covariances given by the caller.
+    """Return the derivative of the loss by given covariances, (n, 6).
 
-    Runs the tiles' backward pass once more: this option is for experiments, and the kernels stay as they are.
+    It runs the tiles' backward pass once more, which is slower but leaves the kernels unchanged.
     """
     slots = np.empty(len(kept.members) * SLOT, np.float32)
     parallel(

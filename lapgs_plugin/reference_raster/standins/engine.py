@@ -1,7 +1,7 @@
-"""One differentiable call behind all rasterizer stand-ins: the arguments of the CUDA bindings, onto `pipeline`.
+"""Render with `pipeline` from the arguments of the CUDA bindings: the differentiable call of all stand-ins.
 
-As in the CUDA code: no Gaussians at all give a black image, whatever the background; the gradient by `means2D` is in
-units of half the image's sides; the gradient by the scales leaves out `scale_modifier`, which multiplied them.
+As in the CUDA code, a call without Gaussians gives a black image with any background, the gradient by `means2D` is in
+units of half the image's sides, and the gradient by the scales lacks the factor `scale_modifier`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from lapgs_plugin.reference_raster.standins.covariance import (
 from lapgs_plugin.reference_raster.standins.snug_tiles import snug_tiles
 
 FOCAL_TOLERANCE = 1e-3
-"""How far, relatively, the focal lengths in `projmatrix` may be from those that the fields of view say."""
+"""Relative tolerance between the focal lengths in `projmatrix` and those of the fields of view."""
 
 
 class Settings(Protocol):
-    """What all `GaussianRasterizationSettings` have, in the CUDA bindings' names."""
+    """Declare the fields that all `GaussianRasterizationSettings` share, named as in the CUDA bindings."""
 
     @property
     def image_height(self) -> int: ...
@@ -58,11 +58,11 @@ class Settings(Protocol):
 
 @dataclass(frozen=True)
 class Inputs:
-    """The tensors of a call; n Gaussians, float32. None stands for what is not given.
+    """Hold the tensors of a call; n Gaussians, float32, None for arguments that are not given.
 
     Attributes:
         means: (n, 3).
-        means2d: (n, 3), or (n, 4) for sums of absolute values in the last two columns; only its gradient matters.
+        means2d: (n, 3), or (n, 4) for sums of absolute values in the last two columns; only its gradient is used.
         opacities: (n, 1).
         sh: (n, k, 3), or None if there are colours.
         colors: (n, 3), or None.
@@ -87,7 +87,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Options:
-    """What one rasterizer offers and others do not.
+    """Hold the options that only some rasterizers have.
 
     Attributes:
         mult: FastGS's compact box, or None for three-sigma squares.
@@ -104,7 +104,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Output:
-    """What a call gives.
+    """Hold the results of a call.
 
     Attributes:
         image: (3, height, width).
@@ -124,10 +124,10 @@ class Output:
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
-    """Render, differentiably by all tensors of `inputs`.
+    """Render, differentiable by all tensors of `inputs`.
 
     Raises:
-        UserInputError: tensors that do not fit each other, or a projection that does not fit the field of view.
+        UserInputError: tensors do not fit each other, or the projection does not fit the field of view.
     """
     _check(settings, inputs)
     view = view_of(settings)
@@ -152,10 +152,10 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
 
 
 def view_of(settings: Settings) -> View:
-    """The camera, from transposed matrices as the CUDA code takes them.
+    """Return the camera from transposed matrices as the CUDA code takes them.
 
     Raises:
-        UserInputError: the projection is not one along the z axis with the focal lengths of the fields of view.
+        UserInputError: the projection is not along z, or its focal lengths are not those of the fields of view.
     """
     width, height = int(settings.image_width), int(settings.image_height)
     world_to_camera = settings.viewmatrix.detach().to("cpu", torch.float64).T.numpy()
@@ -175,12 +175,12 @@ def view_of(settings: Settings) -> View:
 
 
 def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
-    """(n,) bool: whether points (n, 3) are in front of the near plane; the CUDA code asks no more."""
+    """Return which points (n, 3) are in front of the near plane, (n,) bool; the CUDA code tests no more."""
     return _depths(positions.detach(), settings.viewmatrix) > NEAR_DEPTH
 
 
 class _Call:
-    """What a call hands to its autograd function beside tensors, and what it brings back beside differentiable ones."""
+    """Hold the arguments of a call that are no tensors, and its results that are not differentiable."""
 
     def __init__(self, settings: Settings, view: View, options: Options, keep: bool) -> None:
         self.settings, self.view, self.options, self.keep = settings, view, options, keep
@@ -190,7 +190,7 @@ class _Call:
         self.contributions: Contributions | None = None
 
     def gaussians(self, tensors: tuple[Tensor | None, ...]) -> Gaussians:
-        """The tensors as the kernels take them."""
+        """Return the tensors as the kernels take them."""
         means, _, opacities, sh, colors, scales, quats, covariances = (
             None if t is None else t.detach().contiguous() for t in tensors
         )
@@ -210,7 +210,7 @@ class _Call:
         )  # fmt: skip
 
     def render(self, gaussians: Gaussians, background: Any, keep: bool) -> Rendering:
-        """Render with the tiles that the options ask for."""
+        """Render with the tiles of the options."""
         assign = None
         if self.options.mult is not None:
             depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
@@ -218,7 +218,7 @@ class _Call:
         return pipeline.render(gaussians, self.view, background, keep=keep, assign=assign)
 
     def shaded_by_depth(self, gaussians: Gaussians) -> Gaussians:
-        """The same Gaussians with 1 / depth for their first colour."""
+        """Return the same Gaussians with 1 / depth as their first colour channel."""
         depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
         colors = np.zeros((len(depths), 3), np.float32)
         np.divide(1, depths, out=colors[:, 0], where=depths > 0)
@@ -226,7 +226,7 @@ class _Call:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(call, *tensors of Inputs) -> image, inverse depths (empty if not asked for), radii."""
+    """Map (call, *tensors of Inputs) to image, inverse depths (empty if not asked for), radii."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -266,7 +266,7 @@ class _Rasterize(torch.autograd.Function):
         if grad_image is not None:
             total = _add(total, _gradients(call, tensors, call.gaussians(tensors), ctx.rendering, grad_image))
         if grad_depth is not None and call.options.inverse_depth:
-            # The CUDA code blends 1 / depth beside the colours; as a colour of its own it has the same gradients.
+            # The CUDA code blends 1 / depth like a colour channel; here it is one.
             shaded = call.shaded_by_depth(call.gaussians(tensors))
             rendering = call.render(shaded, np.zeros(3, np.float32), True)
             grad = torch.cat([grad_depth, torch.zeros(2, *grad_depth.shape[1:])])
@@ -284,7 +284,7 @@ class _Rasterize(torch.autograd.Function):
 def _gradients(
     call: _Call, tensors: tuple[Tensor | None, ...], gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
 ) -> list[Tensor | None]:
-    """Gradients in the order of `Inputs.tensors`, but that by colours is there whenever Gaussians have colours."""
+    """Return gradients in the order of `Inputs.tensors`; that by colours whenever `gaussians` has colours."""
     above = grad_image.contiguous().numpy()
     found = pipeline.gradients(gaussians, call.view, rendering, above, None)
     means, means2d, opacities, _, _, _, _, covariances = tensors
@@ -308,7 +308,7 @@ def _gradients(
 
 
 def _screen_gradient(view: View, found: Gradients, means2d: Tensor) -> Tensor:
-    """Gradient by the centres in units of half the image: signed, then, in four columns, of absolute values."""
+    """Return the gradient by the centres in units of half the image; of four columns the last two are absolute sums."""
     half = np.array([view.width / 2, view.height / 2], np.float32)
     gradient = torch.zeros_like(means2d)
     gradient[:, :2] = torch.from_numpy(found.centres * half)
@@ -322,13 +322,13 @@ def _add(a: list[Tensor | None], b: list[Tensor | None]) -> list[Tensor | None]:
 
 
 def _depths(means: Tensor, viewmatrix: Tensor) -> Tensor:
-    """(n,) camera-space z."""
+    """Return camera-space z, (n,)."""
     matrix = viewmatrix.detach().to("cpu", torch.float32)
     return means @ matrix[:3, 2] + matrix[3, 2]
 
 
 def _check(settings: Settings, inputs: Inputs) -> None:
-    """Refuse what CUDA code would read out of bounds."""
+    """Refuse tensors that CUDA code would read out of bounds."""
     n = len(inputs.means)
     wanted = {
         "means3D": (inputs.means, (n, 3)),

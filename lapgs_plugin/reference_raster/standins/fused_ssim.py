@@ -1,27 +1,24 @@
-"""`fused_ssim`, and the two functions of the same kind in `diff_gaussian_rasterization._C`: SSIM with an 11x11 window.
+"""Stand in for `fused_ssim` and for the two SSIM functions of `diff_gaussian_rasterization._C`.
 
-Outside of the images are zeros. Only the first image gets a gradient. The window has sigma 1.5, the constants are
-0.01^2 and 0.03^2.
+Only the first image gets a gradient.
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_map
 
 __all__ = ["fused_ssim", "fused_ssim_", "fusedssim", "fusedssim_backward"]
 
-RADIUS = 5
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
-
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """Mean SSIM of two batches of images (b, c, h, w), a scalar; "valid" leaves out five pixels at each border."""
+    """Return mean SSIM of two batches (b, c, h, w), a scalar; "valid" leaves out five pixels at each border."""
     first, second = _prepared(img1, img2, padding, train)
     if padding == "valid":
         return _cropped(ssim_map(first, second), padding).mean()
@@ -29,46 +26,34 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
 
 
 def fused_ssim_(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """SSIM of one pair of images (1, c, h, w), the mean over channels: (h, w), or 10 less of each with "valid"."""
+    """Return SSIM of two images (1, c, h, w), the mean over channels: (h, w), or 10 less of each with "valid"."""
     first, second = _prepared(img1, img2, padding, train)
     return _cropped(ssim_map(first, second), padding).squeeze(0).mean(0)
 
 
 def fusedssim(c1: float, c2: float, img1: Tensor, img2: Tensor) -> Tensor:
-    """SSIM of each pixel and channel of two batches (b, c, h, w), in that shape; not differentiable by itself."""
-    return ssim_map(img1.detach(), img2.detach(), c1, c2)
+    """Return SSIM of each pixel and channel of two batches (b, c, h, w), in that shape, without gradient."""
+    _check_constants(c1, c2)
+    return ssim_map(img1.detach(), img2.detach())
 
 
 def fusedssim_backward(c1: float, c2: float, img1: Tensor, img2: Tensor, grad_map: Tensor) -> Tensor:
-    """Derivative of a loss by the first image (b, c, h, w), from that by what `fusedssim` returns."""
+    """Return the derivative of a loss by the first image (b, c, h, w), from that by the result of `fusedssim`."""
+    _check_constants(c1, c2)
     leaf = img1.detach().requires_grad_(True)
     with torch.enable_grad():
-        found = ssim_map(leaf, img2.detach(), c1, c2)
+        found = ssim_map(leaf, img2.detach())
     return torch.autograd.grad(found, leaf, grad_map)[0]
 
 
-def ssim_map(first: Tensor, second: Tensor, c1: float = C1, c2: float = C2) -> Tensor:
-    """SSIM of each pixel and channel (b, c, h, w), differentiable."""
-    moments = _blurred(torch.stack([first, second, first * first, second * second, first * second]))
-    mu1, mu2, square1, square2, product = moments
-    sigma1, sigma2, sigma12 = square1 - mu1 * mu1, square2 - mu2 * mu2, product - mu1 * mu2
-    above = (2 * mu1 * mu2 + c1) * (2 * sigma12 + c2)
-    found: Tensor = above / ((mu1 * mu1 + mu2 * mu2 + c1) * (sigma1 + sigma2 + c2))
-    return found
-
-
-def _blurred(images: Tensor) -> Tensor:
-    """(..., h, w) filtered with the window, zeros outside."""
-    places = torch.arange(-RADIUS, RADIUS + 1, dtype=images.dtype)
-    window = torch.exp(-(places**2) / (2 * SIGMA**2))
-    window = window / window.sum()
-    flat = images.reshape(-1, 1, *images.shape[-2:])
-    down = conv2d(flat, window[None, None, :, None], padding=(RADIUS, 0))
-    return conv2d(down, window[None, None, None, :], padding=(0, RADIUS)).reshape(images.shape)
+def _check_constants(c1: float, c2: float) -> None:
+    if not (math.isclose(c1, SSIM_C1) and math.isclose(c2, SSIM_C2)):
+        raise UserInputError(f"SSIM with the constants {c1:g} and {c2:g}: expected 0.01^2 and 0.03^2")
 
 
 def _cropped(values: Tensor, padding: str) -> Tensor:
-    return values[..., RADIUS:-RADIUS, RADIUS:-RADIUS] if padding == "valid" else values
+    inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
+    return values[..., inside, inside] if padding == "valid" else values
 
 
 def _prepared(img1: Tensor, img2: Tensor, padding: str, train: bool) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
-"""`gsplat.rasterization` and `gsplat.spherical_harmonics` on the CPU, for loops that are written against gsplat.
+"""Stand in for `gsplat.rasterization` and `gsplat.spherical_harmonics` on the CPU, in loops written against gsplat.
 
-Plain colours or SH, no depths, and gradients of one camera a call. What is rendered is what `CpuRasterizer` renders:
+It renders plain colours or SH, no depths, and differentiates one camera a call. Images are those of `CpuRasterizer`:
 alpha is capped at 0.99 instead of 0.999, and footprints end at three sigma.
 """
 
@@ -17,12 +17,12 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.inheritance import SH_C0
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
+from lapgs_plugin.reference_raster.layout import TILE
 
 __all__ = ["rasterization", "spherical_harmonics"]
 
-TILE = 16
 HIGHEST_OPACITY = 1 - 1e-6
-"""Opacities are handed on as logits; that of 1 is infinite."""
+"""Opacities are passed on as logits; that of 1 would be infinite."""
 CONVENTIONS = {
     "near_plane": (0.01, 0.2),
     "far_plane": (1e10,),
@@ -34,11 +34,11 @@ CONVENTIONS = {
     "sparse_grad": (False,),
     "packed": (False,),
 }
-"""Arguments of which only these values are honoured. Everything nearer than 0.2 is culled."""
+"""The only values accepted of these arguments. Everything nearer than 0.2 is culled."""
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
-    """Raw SH values, (n, 3): nothing added, nothing clamped, zero where `masks` (n,) is False.
+    """Return raw SH values, (n, 3), without offset or clamping, zero where `masks` (n,) is False.
 
     Args:
         degrees_to_use: highest degree, 0 to 3.
@@ -73,21 +73,22 @@ def rasterization(
         quats: (n, 4), wxyz.
         scales: (n, 3), not logarithms.
         opacities: (n,) in [0, 1], not logits.
-        colors: (n, 3), or (b, n, 3) of each camera, shown as they are; or, with `sh_degree`, SH coefficients (n, k, 3)
+        colors: (n, 3), or (b, n, 3) of each camera, used as they are; or, with `sh_degree`, SH coefficients (n, k, 3)
             for max(SH + 0.5, 0).
         viewmats: (b, 4, 4) world to camera.
         Ks: (b, 3, 3) intrinsics.
         sh_degree: highest degree to evaluate.
         backgrounds: (b, 3), zero when None.
-        absgrad: leave absolute gradients of the centres in `info["means2d"].absgrad`.
-        conventions: the other arguments of gsplat, as far as they ask for what is done anyway.
+        absgrad: store absolute gradients of the centres in `info["means2d"].absgrad`.
+        conventions: the other arguments of gsplat, with the values in `CONVENTIONS`.
 
     Returns:
-        (b, h, w, 3) colours, (b, h, w, 1) opacities, and of one camera what densification looks at: "means2d" (1, n, 2)
-        whose gradient is there after `backward()`, "radii" (1, n, 2), "gaussian_ids", "width", "height", "n_cameras".
+        (b, h, w, 3) colours, (b, h, w, 1) opacities, and for one camera the inputs of densification: "means2d"
+        (1, n, 2), which has a gradient after `backward()`, "radii" (1, n, 2), "gaussian_ids", "width", "height",
+        "n_cameras".
 
     Raises:
-        UserInputError: an argument asks for what this does not do.
+        UserInputError: an argument has a value that is not supported.
     """
     if len(viewmats) > 1:
         options = {"sh_degree": sh_degree, "absgrad": absgrad, "tile_size": tile_size, **conventions}
@@ -129,7 +130,7 @@ def rasterization(
 
 
 def _with_gradient(means2d: Tensor, absgrad2d: Tensor | None) -> Tensor:
-    """Centres (1, n, 2) that get the gradient which the backward pass leaves for `means2d` (n, 2)."""
+    """Return centres (1, n, 2) that get the gradient by `means2d` (n, 2) in the backward pass."""
     centres: Any = means2d.detach()[None].requires_grad_(means2d.requires_grad)
     if means2d.requires_grad:
 

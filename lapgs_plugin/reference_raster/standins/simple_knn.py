@@ -1,4 +1,4 @@
-"""`simple_knn._C`: distances between neighbouring points, from which 3DGS takes the Gaussians' first sizes."""
+"""Stand in for `simple_knn._C`: distances between neighbouring points, from which 3DGS initialises scales."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ __all__ = ["distCUDA2"]
 
 
 def distCUDA2(points: Tensor) -> Tensor:
-    """(n,) mean of the squared distances from each point (n, 3) to its three nearest neighbours.
+    """Return the mean squared distance (n,) of each point (n, 3) to its three nearest neighbours.
 
-    With fewer than four points it is over those there are, where the CUDA code returns infinity.
+    With fewer than four points the mean is over those that exist, where the CUDA code returns infinity.
     """
     return mean_squared_distance(points)

@@ -1,9 +1,9 @@
-"""Tiles as FastGS assigns them: those that an ellipse of constant alpha meets, instead of a three-sigma square.
+"""Assign tiles as FastGS does: those that an ellipse of constant alpha meets, instead of a three-sigma square.
 
 A Gaussian of opacity o reaches alpha = 1/255 where its squared Mahalanobis distance is 2 ln(255 o). FastGS multiplies
-that by `mult` ("compact box", 0.5 in its options) and blends the Gaussian in the tiles that this ellipse meets, in all
-of their pixels: with mult < 1 this is part of the image. Source: the FastGS paper, and Speedy-Splat, whose exact
-ellipse-tile test it takes over.
+this distance by `mult` ("compact box", 0.5 by default) and blends the Gaussian in all pixels of the tiles that this
+ellipse meets: with mult < 1 the image depends on it. Source: the FastGS paper, and Speedy-Splat, whose exact
+ellipse-tile test FastGS uses.
 """
 
 from __future__ import annotations
@@ -26,28 +26,30 @@ from lapgs_plugin.reference_raster.layout import (
     FACTOR_YY,
     LOG2_MIN_ALPHA,
     LOG2_OPACITY,
+    MIN_ROOT,
     NEAR_DEPTH,
+    RADIUS_SIGMAS,
     SPLAT,
     TILE,
 )
 from lapgs_plugin.reference_raster.pipeline import TileLists
-from lapgs_plugin.reference_raster.projection_kernels import HUGE, MIN_ROOT, RADIUS_SIGMAS
+from lapgs_plugin.reference_raster.projection_kernels import HUGE
 
 Assign = Callable[[Floats, NDArray[np.int32]], TileLists]
 
 
 def snug_tiles(depths: Floats, mult: float, tiles_x: int, tiles_y: int) -> Assign:
-    """What `pipeline.render` takes to assign tiles as FastGS does.
+    """Make the argument `assign` of `pipeline.render` for FastGS's tiles.
 
     Args:
         depths: (n,) float32 camera-space z.
-        mult: share of the squared distance at which alpha reaches 1/255.
+        mult: factor on the squared distance at which alpha reaches 1/255.
     """
 
     def assign(splats: Floats, radii: NDArray[np.int32]) -> TileLists:
         n = len(radii)
-        # A Gaussian that its three-sigma square puts outside of the image may still reach it, if it is nearly opaque;
-        # those at the near plane itself are left to the projection, which decided with other rounding.
+        # The ellipse of a nearly opaque Gaussian may reach the image although its three-sigma square does not. At the
+        # near plane itself the decision is left to the projection, which rounds differently.
         candidates = (radii > 0) | (depths > NEAR_DEPTH * (1 + 1e-5))
         first_pair = np.empty(n + 1, np.int64)
         starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
@@ -57,7 +59,7 @@ def snug_tiles(depths: Floats, mult: float, tiles_x: int, tiles_y: int) -> Assig
         sorted_keys, spare_keys = np.empty(shown, np.uint32), np.empty(shown, np.uint32)
         ordering_kernels.sort_by_depth(first_pair, keys, order, spare, sorted_keys, spare_keys)
         members, places = np.empty(first_pair[n], np.int32), np.empty(first_pair[n], np.int32)
-        _deal(order, splats, float(mult), tiles_x, tiles_y, first_pair, starts.copy(), members, places)
+        _list_by_tile(order, splats, float(mult), tiles_x, tiles_y, first_pair, starts.copy(), members, places)
         return first_pair, places, starts, members
 
     return assign
@@ -70,8 +72,8 @@ def _clip(value: float, last: int) -> int:
 
 @inline
 def _rows(splats: Floats, s: int, mult: float, tiles_y: int) -> tuple[float, float, int, int]:
-    """Squared size of the ellipse in the splat's units, half its height in pixels, its first tile row and the one past
-    its last."""
+    """Return the ellipse's squared size in the splat's units, half its height in pixels, its first tile row and the
+    row past its last."""
     reach = mult * (splats[s + LOG2_OPACITY] - LOG2_MIN_ALPHA)
     if not (reach > 0.0 and splats[s + FACTOR_XX] > 0.0 and splats[s + FACTOR_YY] > 0.0):
         return 0.0, 0.0, 0, 0
@@ -83,10 +85,10 @@ def _rows(splats: Floats, s: int, mult: float, tiles_y: int) -> tuple[float, flo
 
 @inline
 def _span(splats: Floats, s: int, reach: float, half: float, row: int, tiles_x: int) -> tuple[int, int]:
-    """First tile that the ellipse meets in a row of tiles, and one past the last.
+    """Return the first tile that the ellipse meets in a row of tiles, and one past the last.
 
-    The ellipse is u^2 + v^2 <= reach with u = xx dx + xy dy, v = yy dy. Its border on either side is monotone in dy but
-    for the leftmost and the rightmost point, which mirror each other.
+    The ellipse is u^2 + v^2 <= reach with u = xx dx + xy dy, v = yy dy. Its border on either side is monotone in dy
+    except at the leftmost and the rightmost point, which mirror each other.
     """
     xx, xy, yy = float(splats[s + FACTOR_XX]), float(splats[s + FACTOR_XY]), float(splats[s + FACTOR_YY])
     top = min(max(row * TILE - splats[s + CENTRE_Y], -half), half)
@@ -104,7 +106,7 @@ def _span(splats: Floats, s: int, reach: float, half: float, row: int, tiles_x: 
 
 @inline
 def _radius(splats: Floats, s: int) -> int:
-    """The three-sigma radius in pixels, from the inverse covariance."""
+    """Return the three-sigma radius in pixels, from the inverse covariance."""
     xx, xy = float(splats[s + FACTOR_XX]) / FACTOR_SCALE, float(splats[s + FACTOR_XY]) / FACTOR_SCALE
     yy = float(splats[s + FACTOR_YY]) / FACTOR_SCALE
     scale = 1.0 / (xx * yy) ** 2
@@ -123,9 +125,9 @@ def _count(
     tiles_y: int,
     radii: NDArray[np.int32],  # (n,) set to 0 where no tile is met
     first_pair: NDArray[np.int64],  # (n + 1,) filled: see `ordering_kernels.count_pairs`
-    starts: NDArray[np.int64],  # (tiles + 1,) zero, filled with where the tiles' lists begin
+    starts: NDArray[np.int64],  # (tiles + 1,) zero, filled with the starts of the tiles' lists
 ) -> int:
-    """Count pairs of a Gaussian and a tile; returns the Gaussians that have any."""
+    """Count the pairs of a Gaussian and a tile; return the number of Gaussians with any."""
     total, shown = 0, 0
     for i in range(n):
         first_pair[i] = total
@@ -150,18 +152,18 @@ def _count(
 
 
 @jit
-def _deal(
+def _list_by_tile(
     order: NDArray[np.int32],  # (shown,) nearest first
     splats: Floats,
     mult: float,
     tiles_x: int,
     tiles_y: int,
     first_pair: NDArray[np.int64],
-    starts: NDArray[np.int64],  # (tiles + 1,) used up
-    members: NDArray[np.int32],  # (pairs,) filled: see `ordering_kernels.deal_to_tiles`
+    starts: NDArray[np.int64],  # (tiles + 1,) overwritten
+    members: NDArray[np.int32],  # (pairs,) filled: see `ordering_kernels.list_by_tile`
     places: NDArray[np.int32],  # (pairs,) filled: as above
 ) -> None:
-    """Put each pair into its tile's list."""
+    """Write each pair to its tile's list."""
     for i in order:
         pair = first_pair[i]
         reach, half, first, end = _rows(splats, i * SPLAT, mult, tiles_y)

@@ -1,0 +1,184 @@
+"""Time every operation in the versions that this machine has, each against plain PyTorch in one run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from statistics import median
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops import adam, densification_statistics, photometric_loss, upsample
+from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
+from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+
+NUMBA = "Numba"
+TORCH = "PyTorch"
+"""The version that the others are compared with; its SSIM is kornia's."""
+
+
+class Version(NamedTuple):
+    """Do an operation once with `run`, which returns the result or updates the tensor `result`."""
+
+    run: Callable[[], object]
+    result: Tensor | None = None
+
+
+Versions = dict[str, Version]
+
+
+@dataclass(frozen=True)
+class OpTime:
+    """Hold the time of one version of an operation.
+
+    Attributes:
+        milliseconds: median over all turns.
+        ratio: time of the PyTorch version over this one's.
+        difference: largest difference from the PyTorch version's result after one call.
+    """
+
+    op: str
+    version: str
+    milliseconds: float
+    ratio: float
+    difference: float
+
+
+def benchmark(device: torch.device, width: int, height: int, gaussians: int, repeats: int) -> list[OpTime]:
+    """Time all operations; the versions of one take turns, so that a change in the machine's load meets all of them.
+
+    Args:
+        width, height: of the images, in pixels.
+        gaussians: in the field.
+        repeats: turns.
+    """
+    ours = "Triton" if device.type == "cuda" else NUMBA
+    generator = torch.Generator().manual_seed(0)
+    images = [torch.rand(3, height, width, generator=generator).to(device) for _ in range(2)]
+    coarse = torch.rand(3, (height + 1) // 2, (width + 1) // 2, generator=generator).to(device)
+    operations = {
+        "upsample": _upsample_versions(ours, coarse, images[0]),
+        "photometric loss": _loss_versions(ours, images[0], images[1]),
+        "Adam": _adam_versions(ours, gaussians, device),
+        "densification statistics": _statistics_versions(ours, gaussians, device),
+    }
+    return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
+
+
+def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> list[OpTime]:
+    results = {}
+    for name, version in versions.items():
+        found = version.run()  # the first call compiles
+        result = found if version.result is None else version.result
+        assert isinstance(result, Tensor)
+        results[name] = result.detach().clone()
+    seconds: dict[str, list[float]] = {name: [] for name in versions}
+    wait: Callable[[], object] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    for _ in range(repeats):
+        for name, version in versions.items():
+            with one_pool() if name == NUMBA else nullcontext():  # as in training
+                wait()
+                start = time.perf_counter()
+                version.run()
+                wait()
+                seconds[name].append(time.perf_counter() - start)
+    medians = {name: median(each) for name, each in seconds.items()}
+    reference = results[TORCH]
+    return [
+        OpTime(
+            op, name, 1e3 * each, medians[TORCH] / each,
+            float((results[name] - reference).abs().max()),
+        )
+        for name, each in medians.items()
+    ]  # fmt: skip
+
+
+def _upsample_versions(ours: str, coarse: Tensor, fine: Tensor) -> Versions:
+    pyramid, size = Pyramid(), (fine.shape[-2], fine.shape[-1])
+    versions = {TORCH: Version(lambda: pyramid.up(coarse, size) + fine)}
+    if ours == NUMBA or upsample.triton_works():
+        versions[ours] = Version(lambda: upsample.upsample_add(pyramid, coarse, fine))
+    if size[0] % 2 == size[1] % 2 == 0:  # kornia doubles sides exactly
+        from kornia.geometry.transform import pyrup
+
+        versions["kornia.pyrup"] = Version(lambda: pyrup(coarse[None])[0] + fine)
+    return versions
+
+
+def _loss_versions(ours: str, prediction: Tensor, target: Tensor) -> Versions:
+    leaf = prediction.clone().requires_grad_()
+
+    def gradient_of(loss: Callable[[Tensor, Tensor], Tensor]) -> Version:
+        # Times the number of pixels and channels, so that values are about 1.
+        return Version(lambda: torch.autograd.grad(loss(leaf, target), leaf)[0] * leaf.numel())
+
+    versions = {TORCH: gradient_of(photometric_loss_torch)}
+    fused = photometric_loss.fused_ssim() if ours != NUMBA else None
+    if ours == NUMBA or (fused is not None and photometric_loss.triton_works()):
+        versions[ours if fused is None else f"{ours} and fused_ssim"] = gradient_of(photometric_loss.photometric_loss)
+    return versions
+
+
+def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
+    generator = torch.Generator().manual_seed(0)
+    shapes: list[tuple[int, ...]] = [(3,), (4,), (3,), (), (16, 3)]
+    starts, gradients = (
+        [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
+    )
+
+    def version(make: Callable[[list[torch.nn.Parameter]], Callable[[], object]]) -> Version:
+        """Give an optimizer its own copy of the parameters."""
+        parameters = [torch.nn.Parameter(start.clone()) for start in starts]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        return Version(make(parameters), parameters[-1])
+
+    def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
+        count = torch.zeros(())
+        slots = [
+            AdamSlot(one, gradient, torch.zeros_like(one), torch.zeros_like(one), count, 1e-3, 1e-3)
+            for one, gradient in zip(parameters, gradients, strict=True)
+        ]
+
+        def step() -> None:
+            count.add_(1)
+            step_torch(slots)
+
+        return step
+
+    def triton(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
+        optimizers = [adam.GpuFieldAdam(parameter, 1e-3) for parameter in parameters]
+        return lambda: adam.step_together(optimizers)
+
+    versions = {
+        TORCH: version(plain),
+        "torch.optim.Adam": version(lambda made: torch.optim.Adam(made, 1e-3, eps=adam.ADAM_EPS, fused=True).step),
+    }
+    if ours == NUMBA:
+        versions[ours] = version(lambda made: FieldAdam(made, 1e-3).step)
+    elif adam.triton_works():
+        versions[ours] = version(triton)
+    return versions
+
+
+def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
+    generator = torch.Generator().manual_seed(0)
+    gradient = torch.randn(gaussians, 2, generator=generator).to(device)
+    radii = torch.randint(0, 3, (gaussians,), generator=generator, dtype=torch.int32).to(device)
+
+    def version(add: Callable[[Tensor, Tensor, tuple[int, int], Tensor, Tensor], None]) -> Version:
+        norms, counts = (torch.zeros(gaussians, device=device) for _ in range(2))
+        return Version(lambda: add(gradient, radii, (2, 2), norms, counts), norms)
+
+    versions = {TORCH: version(add_statistics_torch)}
+    if ours != NUMBA and densification_statistics.triton_works():
+        versions[ours] = version(densification_statistics.add_statistics)
+    return versions

@@ -1,0 +1,95 @@
+"""Hold the objects that the stages of a run over a checkout share, and the results that they hand on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.checkouts.level_views import SceneImages
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.hook_calls import HookCaller
+from lapgs_plugin.runner.iteration_parts import IterationParts
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.runs.watcher import Watcher
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
+
+    adapter: BackboneAdapter
+    options: RunSettings
+    device: torch.device
+    images: SceneImages
+    wrapper: RasterizerWrapper
+    hooks: HookCaller
+    parts: IterationParts
+    watcher: Watcher
+    test_every: int | None
+
+    def render(
+        self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor
+    ) -> Tensor:
+        """Return the image (3, h, w) that the checkout's render makes of a view, before exposure or clamping.
+
+        Args:
+            rendering: replaces the running stage's meanwhile; it captures.
+            call: call of the script's `training` for the stage of these Gaussians.
+            view: the checkout's camera at that stage's level.
+            gaussians: the checkout's model.
+            background: (3,) behind the Gaussians.
+        """
+        outer, self.wrapper.stage = self.wrapper.stage, rendering
+        try:
+            self.adapter.render(call, view, gaussians, background)
+        finally:
+            self.wrapper.stage = outer
+        image, rendering.captured = rendering.captured, None
+        assert image is not None, "a rendering that captures"
+        return image
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """Hold the objects of a run that exist once the script has called `training`."""
+
+    call: TrainingCall  # for the whole run
+    scene: CheckoutScene
+    archive: RunArchive  # open for writing
+    color_path: ColorPath
+
+
+@dataclass(frozen=True)
+class FinishedStage:
+    """Name a stage whose field is in the archive."""
+
+    stage: Stage
+    call: TrainingCall  # for this stage
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """Hand a finished stage on to the next one.
+
+    Attributes:
+        field: its Gaussians, on the CPU.
+        predictions: Up(I_hat^l) of every view by key; None after the finest level, and where levels are nested.
+        carried: attributes for the next model.
+        moments: optimizer state by parameter group, for full inheritance.
+    """
+
+    field: GaussianField
+    predictions: UpsampledImages | None
+    carried: Mapping[str, Any]
+    moments: Mapping[str, dict[str, Tensor]]

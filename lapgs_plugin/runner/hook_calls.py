@@ -1,0 +1,122 @@
+"""Call users' hooks from a checkout's training loop, which does not know them.
+
+    before_render, compose, loss    after the rasterizer has rendered a training view with gradients
+    after_backward                  after the backward pass through that image
+    on_densify                      after density control
+
+A hook's loss leaves the loop's own unchanged: the image passes through a function whose backward pass gives the hook's
+term a gradient of one, as if the loop had added it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.checkouts.level_views import view_name
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
+
+if TYPE_CHECKING:
+    from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+
+
+class HookCaller:
+    """Call users' hooks; false without hooks, so that a run without them has no overhead.
+
+    Args:
+        hooks: hooks besides those registered by entry point.
+
+    Raises:
+        UserInputError: a hook is not usable.
+    """
+
+    def __init__(self, hooks: Sequence[StageHook] = ()) -> None:
+        found = (*entry_point_hooks(), *hooks)
+        self._hooks = HookDispatcher(found) if found else None
+        self._stage: Stage | None = None
+        self._rendering: StageRendering | None = None
+        self._iteration = 0
+        self._context: StageContext | None = None
+
+    def __bool__(self) -> bool:
+        return self._hooks is not None
+
+    def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
+        """Call `on_stage_start`."""
+        self._stage, self._rendering = stage, rendering
+        if self._hooks is not None:
+            self._hooks.on_stage_start(stage)
+
+    def stage_ends(self, stage: Stage) -> None:
+        """Call `on_stage_end`."""
+        if self._hooks is not None:
+            self._hooks.on_stage_end(stage)
+
+    def iteration_begins(self, iteration: int) -> None:
+        """Note the number of the iteration."""
+        self._iteration = iteration
+
+    def on_image(self, key: str, image: Tensor, below: Tensor | None) -> Tensor:
+        """Call `before_render`, `compose` and `loss`, and return the image (3, h, w) for the loop.
+
+        Args:
+            key: key of the view.
+            image: (3, h, w) image for the loop without hooks.
+            below: (3, h, w) upsampled prediction in the image; None if the image is not composed.
+        """
+        assert self._hooks is not None
+        context = self._context = self._make_context(key, below)
+        # Hooks get composed images, even where the loop's loss is about the residual alone.
+        added = context.accumulated if below is None else None
+        if added is not None:
+            image = image + added
+        self._hooks.before_render(context)
+        image = self._hooks.compose(context, image)
+        term = self._hooks.extra_loss(context, image)
+        result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
+        return result if added is None else result - added
+
+    def _make_context(self, key: str, below: Tensor | None) -> StageContext:
+        assert self._stage is not None
+        assert self._rendering is not None
+        targets, accumulated, coarse = self._rendering.targets, self._rendering.accumulated, self._rendering.coarse
+        assert targets is not None, "a stage that is trained has targets"
+        if below is None and accumulated is not None:
+            below = accumulated.get(key)
+        return StageContext(
+            stage=self._stage,
+            iteration=self._iteration,
+            view=view_name(key),
+            target=targets.get(key),
+            accumulated=below,
+            coarse_target=None if coarse is None else coarse.get(key),
+        )
+
+    def densified(self) -> None:
+        """Call `on_densify`."""
+        if self._hooks is not None and self._context is not None:
+            self._hooks.on_densify(self._context)
+
+    def _after_backward(self) -> None:
+        assert self._hooks is not None
+        assert self._context is not None
+        self._hooks.after_backward(self._context)
+
+
+class _WithTerm(torch.autograd.Function):
+    """Return the image unchanged; the backward pass gives the term a gradient of one."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, term: Tensor | None, done: Any) -> Tensor:
+        ctx.term, ctx.done = term is not None, done
+        return image.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        # The engine calls it at the end of this backward pass; data-parallel training relies on the same.
+        torch.autograd.Variable._execution_engine.queue_callback(ctx.done)
+        return gradient, gradient.new_ones(()) if ctx.term else None, None

@@ -1,0 +1,84 @@
+"""Write and compare the manifests of runs over checkouts."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
+from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+
+
+def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan) -> Manifest:
+    """Return the manifest of a run before its first stage; `call` is the script's, for the whole run."""
+    dataset = call.dataset
+    return Manifest(
+        scene=SceneReference(
+            path=str(Path(dataset.source_path).absolute()),
+            resolution=f"3dgs:{dataset.resolution}",
+            eval=bool(dataset.eval),
+            background=(1.0, 1.0, 1.0) if dataset.white_background else (0.0, 0.0, 0.0),
+            kind="colmap" if (Path(dataset.source_path) / "sparse").exists() else "transforms",
+            images=dataset.images or "images",
+        ),
+        levels=plan.levels,
+        grid=settings.grid,
+        supervision=settings.supervision,
+        inherit=settings.resolved()["inherit"],
+        sh_degree=dataset.sh_degree,
+        rasterizer=adapter.info.rasterizer,
+        seed=settings.seed,
+        settings={
+            "backbone": {
+                "name": adapter.info.name,
+                "checkout": str(adapter.script.checkout),
+                "arguments": sys.argv[1:],
+            },
+            RASTER_SETTINGS: adapter.raster_settings(call),
+            "iterations": plan.iterations,
+            **settings.for_manifest(),
+        },
+    )
+
+
+def require_same_run(found: Manifest, wanted: Manifest) -> None:
+    """Refuse to continue a run with other settings: its levels would not belong together.
+
+    Raises:
+        RunFolderError: a setting differs.
+    """
+    before, now = _identity(found), _identity(wanted)
+    for name in {**before, **now}:
+        if before.get(name) != now.get(name):
+            # The default hierarchy may have been another when the run was started.
+            same = f"--hierarchy {before[name]}" if name == "hierarchy" else "the same options"
+            raise RunFolderError(
+                f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
+                f"resume with {same}, or start again with --overwrite"
+            )
+
+
+def _identity(manifest: Manifest) -> dict[str, Any]:
+    """Return the values that must stay while a run is continued; the place of images may change, to save memory."""
+    values = asdict(manifest)
+    for name in ("records", "created", "created_by"):
+        values.pop(name)
+    settings = values.pop("settings")
+    backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
+    settings.pop("images_on", None)
+    # Manifests of earlier versions lack these.
+    residuals = Hierarchy.LAPLACIAN.value
+    before = {
+        "hierarchy": residuals,
+        "protocol": "default",
+        "prune": 0.0,
+        "residual_threshold": 1.0,
+        "residual_resets": settings.get("hierarchy", residuals) == residuals,
+    }
+    return {**before, **values, **settings, **backbone}

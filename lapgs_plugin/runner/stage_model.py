@@ -1,0 +1,111 @@
+"""Initialise the checkout's model of a stage, and collect what the next stage's model inherits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.hierarchy.inheritance import inherit
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.context import RunContext, StageResult
+from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
+
+
+class StageModel:
+    """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
+
+    def __init__(self, context: RunContext, scene: CheckoutScene, stage: Stage, before: StageResult | None) -> None:
+        self._options, self._adapter, self._device = context.options, context.adapter, context.device
+        self._scene, self._stage, self._before = scene, stage, before
+        self._kept: Tensor  # (n,) Gaussians of the level before that are inherited
+
+    def initialise(self, gaussians: Any) -> None:
+        """Create the model's Gaussians: from points for the base, inherited for a finer level."""
+        points, others = self._scene.points, self._scene.others
+        if self._before is None:
+            gaussians.create_from_pcd(points, *others)
+            return
+        generator = torch.Generator().manual_seed(self._options.seed)
+        mode = self._options.inherit_mode
+        field, self._kept = inherit(self._before.field, mode, self._options.inherit_ratio, generator)
+        positions = field.means.numpy().astype(np.float64)
+        grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
+        gaussians.create_from_pcd(
+            type(points)(points=positions, colors=grey, normals=np.zeros_like(positions)), *others
+        )
+        if mode != "xyz":
+            names = ["_rotation", "_scaling", "_opacity"]
+            if mode == "full":
+                names += ["_features_dc", "_features_rest"]
+            self._adapter.import_field(gaussians, field.to(self._device), names)
+        for name, value in self._before.carried.items():
+            setattr(gaussians, name, value)
+
+    def prepare_optimizers(self, gaussians: Any) -> None:
+        """Give the checkout's new optimizers inherited state, and fuse their steps on a GPU."""
+        for optimizer in self._adapter.optimizers(gaussians):
+            if self._before is not None:
+                self._inherit_moments(optimizer, self._before.moments)
+            if self._options.fused_adam and self._device.type == "cuda":
+                _fuse_steps(optimizer)
+
+    def carried(self, gaussians: Any) -> dict[str, Any]:
+        """Return attributes for the next model besides its Gaussians. SH of a residual start again at degree 0."""
+        degree = {"active_sh_degree": gaussians.active_sh_degree} if self._options.nested else {}
+        return {**self._adapter.carried_over(gaussians), **degree}
+
+    def moments(self, gaussians: Any) -> dict[str, dict[str, Tensor]]:
+        """Return optimizer state by parameter group on the CPU; empty unless the next stage inherits it."""
+        if self._options.inherit_mode != "full" or self._stage.level == 0:
+            return {}
+        state = {}
+        for optimizer in self._adapter.optimizers(gaussians):
+            for group in optimizer.param_groups:
+                values = optimizer.state.get(group["params"][0], {})
+                state[group["name"]] = {n: torch.as_tensor(v).detach().cpu().clone() for n, v in values.items()}
+        return state
+
+    def load_inherited(self, archive: RunArchive) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+        """Return `carried` and `moments` of this stage from the archive.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        path = archive.path(f"level_{self._stage.level}", OPTIMIZER)
+        if not path.exists():
+            return {}, {}
+        stored = archive.optimizer_state(self._stage.level)
+        if not all(isinstance(stored.get(part), dict) for part in ("carried", "moments")):
+            raise RunFolderError(
+                f"{path} holds {', '.join(map(str, stored))}, expected carried and moments; start again with "
+                "--overwrite"
+            )
+        carried = {
+            name: torch.nn.Parameter(value.detach().to(self._device)) if isinstance(value, Tensor) else value
+            for name, value in stored["carried"].items()
+        }
+        return carried, stored["moments"]
+
+    def _inherit_moments(self, optimizer: torch.optim.Optimizer, moments: Mapping[str, dict[str, Tensor]]) -> None:
+        for group in optimizer.param_groups:
+            if state := moments.get(group["name"]):
+                optimizer.state[group["params"][0]] = {
+                    name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
+                }
+
+
+def _fuse_steps(optimizer: torch.optim.Optimizer) -> None:
+    """Let a plain Adam step each tensor in one kernel instead of a dozen; results differ by rounding."""
+    if type(optimizer) is not torch.optim.Adam:
+        return
+    for group in optimizer.param_groups:
+        group["fused"], group["foreach"] = True, False
+        for parameter in group["params"]:
+            if "step" in (state := optimizer.state.get(parameter, {})):
+                state["step"] = state["step"].to(parameter.device)

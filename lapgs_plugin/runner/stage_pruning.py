@@ -1,0 +1,42 @@
+"""Prune the least visible Gaussians of a checkout's model when a stage's densification ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import TrainingCall
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+from lapgs_plugin.runner.stage_views import StageViews
+
+
+def pruning_iteration(call: TrainingCall) -> int | None:
+    """Return the first iteration of a stage after densification; None if densification does not end in the stage."""
+    opt = call.opt
+    return opt.densify_until_iter if opt.densify_from_iter < opt.densify_until_iter < opt.iterations else None
+
+
+def prune_least_visible(views: StageViews, gaussians: Any, share: float, path: ColorPath) -> None:
+    """Prune the least visible Gaussians, together `share` of total visibility, by the checkout's own method."""
+    pixels = _visibility(views, gaussians, path)
+    gaussians.tmp_radii = gaussians.max_radii2D  # some checkouts prune it, too, and set it only while they densify
+    with torch.no_grad():
+        gaussians.prune_points(least_blended(pixels, share))
+    gaussians.tmp_radii = None
+
+
+def _visibility(views: StageViews, gaussians: Any, path: ColorPath) -> Tensor:
+    """Return `pruning.blended_pixels` (n,) of the model over the training views."""
+    alone = StageRendering(signed=False, path=path, views={}, capture=True)
+    colors, degree = gaussians._features_dc, gaussians.active_sh_degree
+    grey = torch.nn.Parameter(torch.zeros_like(colors))
+    images = (views.render_train_view(alone, gaussians, camera) for camera in views.images.train)
+    try:
+        gaussians._features_dc, gaussians.active_sh_degree = grey, 0
+        return blended_pixels(images, grey)
+    finally:
+        gaussians._features_dc, gaussians.active_sh_degree = colors, degree

@@ -1,0 +1,155 @@
+"""Store the images that a stage trains on, and return them on the training device by the name of their view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.runs.image_store import PRECISIONS, ImageStore, place
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
+
+
+@dataclass(frozen=True)
+class ImageStores:
+    """Make stores for one image a view.
+
+    Attributes:
+        sizes: (width, height) of all views at full size.
+        device: of the images that the stores return.
+        eight_bit: whether all full-size images are 8-bit ones.
+        where: a place of `ImageStore`; AUTO chooses one by the size of the images. "gpu" is memory for a CPU.
+        folder: for images on the disk.
+    """
+
+    sizes: Sequence[tuple[int, int]]
+    device: torch.device
+    eight_bit: bool = False
+    where: str = AUTO
+    folder: Path | None = None
+
+    def target_precision(self, level: int) -> str:
+        """Return the precision of targets: 8-bit photos are exact in uint8 at full size, their averages are not."""
+        return "uint8" if level == 0 and self.eight_bit else "float16"
+
+    def num_bytes(self, level: int, precision: str) -> int:
+        """Return the bytes of the images of all views at a level."""
+        pixels = sum(math.prod(level_size(size, level)) for size in self.sizes)
+        return 3 * pixels * PRECISIONS[precision].itemsize
+
+    def make(self, level: int, precision: str, name: str, beside: int = 0) -> ImageStore:
+        """Return an empty store for images of a level; `beside` are bytes of others that are needed with them."""
+        where = self.where
+        if where == AUTO:
+            where = place(self.num_bytes(level, precision) + beside, self.device)
+        elif where == "gpu" and self.device.type == "cpu":
+            where = "memory"
+        folder = None if self.folder is None else self.folder / name
+        return ImageStore(where, precision, device=self.device, folder=folder)
+
+    def make_upsampled(self, level: int, precision: str, name: str, pyramid: Pyramid) -> UpsampledImages:
+        """Return an empty store for images of a level that the next finer one uses upsampled, beside its targets."""
+        targets = self.num_bytes(level - 1, self.target_precision(level - 1))
+        return UpsampledImages(self.make(level, precision, name, beside=targets), pyramid)
+
+
+class HeldImages:
+    """Keep images as the tensors they are. It has those methods of an `ImageStore` that training calls."""
+
+    bytes_on_device = bytes_in_memory = bytes_on_disk = 0  # nothing has to be copied
+
+    def __init__(self) -> None:
+        self._images: dict[str, Tensor] = {}
+
+    def put(self, name: str, image: Tensor) -> None:
+        self._images[name] = image.contiguous()
+
+    def prefetch(self, name: str) -> None:
+        """Do nothing: images are on the device."""
+
+    def get(self, name: str) -> Tensor:
+        return self._images[name]
+
+    def get_batch(self, names: Sequence[str]) -> Tensor:
+        return torch.stack([self._images[name] for name in names])
+
+    def close(self) -> None:
+        self._images.clear()
+
+
+class LevelImages:
+    """Store the images of one level: I^l, and Up(I^(l+1)) for supervisions that need it.
+
+    Args:
+        stores: makes the stores.
+        level: l.
+        pyramid: makes the images, on the stores' device.
+        with_coarse: also store I^(l+1).
+        exact: keep the images as float32 tensors, for training on a CPU.
+
+    Attributes:
+        targets: I^l.
+        coarse: Up(I^(l+1)); None unless asked for.
+    """
+
+    def __init__(
+        self, stores: ImageStores, level: int, pyramid: Pyramid, *, with_coarse: bool = False, exact: bool = False
+    ) -> None:
+        self._level, self._pyramid, self._device = level, pyramid, stores.device
+        self.targets: ImageStore | HeldImages = (
+            HeldImages() if exact else stores.make(level, stores.target_precision(level), f"targets_{level}")
+        )
+        self.coarse: UpsampledImages | None = None
+        if with_coarse:
+            precision = "float32" if exact else "float16"
+            self.coarse = stores.make_upsampled(level + 1, precision, f"coarse_{level}", pyramid)
+
+    def put(self, name: str, image: Tensor, *, with_coarse: bool = True) -> None:
+        """Make and store the images of a view.
+
+        Args:
+            name: of the view.
+            image: (3, h, w) at full size.
+            with_coarse: False for a view whose Up(I^(l+1)) is not needed.
+        """
+        coarse = self.coarse if with_coarse else None
+        images = self._pyramid.gaussian(image.to(self._device), self._level + 1 + (coarse is not None))
+        target = images[self._level]
+        self.targets.put(name, target)
+        if coarse is not None:
+            coarse.put(name, images[self._level + 1], (target.shape[1], target.shape[2]))
+
+    def prefetch(self, name: str) -> None:
+        """Start copying a view's images to the device."""
+        for store in self.stores:
+            store.prefetch(name)
+
+    def get(self, name: str) -> tuple[Tensor, Tensor | None]:
+        """Return I^l (3, h, w) of a view, and Up(I^(l+1)) or None."""
+        return self.targets.get(name), None if self.coarse is None else self.coarse.get(name)
+
+    def get_batch(self, names: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+        """Return both (b, 3, h, w) for several views of one size."""
+        return self.targets.get_batch(names), None if self.coarse is None else self.coarse.get_batch(names)
+
+    @property
+    def stores(self) -> Iterable[ImageStore | HeldImages]:
+        """The stores of the images."""
+        return (self.targets,) if self.coarse is None else (self.targets, self.coarse.store)
+
+    @property
+    def bytes_on_device(self) -> int:
+        """Bytes of the images on a GPU."""
+        return sum(store.bytes_on_device for store in self.stores)
+
+    def close(self) -> None:
+        """Drop all images."""
+        for store in self.stores:
+            store.close()

@@ -1,0 +1,91 @@
+"""Write and read checkpoints: dictionaries of tensors, numbers, strings and containers of them."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.files import atomic_write, one_line_errors
+
+
+def write_tensors(path: Path, state: dict[str, Any]) -> None:
+    """Replace a file by a dictionary that `read_tensors` reads.
+
+    Raises:
+        RunFolderError: the disk is full or the folder is not writable; the file stays as it was.
+    """
+    with one_line_errors(path, training=True), atomic_write(path) as stream:
+        try:
+            torch.save(state, stream)
+        except RuntimeError as error:  # torch hides the OSError of a full disk in one
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from error
+            raise
+
+
+def read_tensors(path: Path, advice: str) -> dict[str, Any]:
+    """Read what `write_tensors` wrote, with tensors on the CPU.
+
+    Args:
+        path: of the file.
+        advice: what a user can do if it is damaged; ends the message.
+
+    Raises:
+        RunFolderError: it cannot be read, or its tensors would take more memory than the file has bytes.
+    """
+    try:
+        _require_stored(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # RuntimeError, UnpicklingError, EOFError, OSError, ...: it depends on the damage
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
+    if not isinstance(state, dict):
+        raise RunFolderError(f"{path} holds a {type(state).__name__}, expected a dictionary; {advice}")
+    _require_held(state, path, advice)
+    return state
+
+
+def _require_stored(path: Path) -> None:
+    """Check that the contents of a zip file are stored without compression, as `torch.save` writes them.
+
+    Raises:
+        ValueError: they are compressed or overlap, and would unpack to more bytes than the file has.
+        zipfile.BadZipFile, OSError: it is no zip file, or cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    size, held = path.stat().st_size, sum(entry.file_size for entry in entries)
+    if held > size or any(entry.file_size != entry.compress_size for entry in entries):
+        raise ValueError(f"it unpacks to {held:,} bytes, expected no more than its own {size:,}")
+
+
+def _require_held(state: dict[str, Any], path: Path, advice: str) -> None:
+    """Check that tensors are dense ones on the CPU and together no larger than their file.
+
+    An expanded view can have more elements than fit into memory; copying it would allocate them.
+
+    Raises:
+        RunFolderError: they are not.
+    """
+    waiting: list[Any] = [state]
+    seen: set[int] = set()
+    held, size = 0, path.stat().st_size
+    while waiting:
+        each = waiting.pop()
+        if id(each) in seen:
+            continue
+        seen.add(id(each))
+        if isinstance(each, torch.Tensor):
+            if each.layout != torch.strided or each.device.type != "cpu" or each.is_quantized:
+                raise RunFolderError(f"{path} holds a {each.layout} tensor, expected dense ones; {advice}")
+            held += each.nelement() * each.element_size()
+        elif isinstance(each, dict):
+            waiting.extend(each.values())
+        elif isinstance(each, (list, tuple)):
+            waiting.extend(each)
+    if held > size:
+        raise RunFolderError(f"{path} names tensors of {held:,} bytes, expected at most its own {size:,}; {advice}")

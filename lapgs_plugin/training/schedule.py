@@ -1,0 +1,168 @@
+"""Decide what happens in which iteration of a stage. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage, nested_densify_until
+from lapgs_plugin.training.settings import MOST_VIEWS, TrainSettings
+
+LATE_SHARE = 0.25
+"""Share of a stage, its last, in which the gradients of several views make one step, once densification has ended.
+Positions hardly move any more, and the differences between single views are noise; earlier, more steps are better."""
+LEAST_STEPS = 40
+"""Fewest such steps; a stage that is too short for them steps after every view."""
+PIXELS_OF_A_STEP = 1 << 22
+"""Most pixels of all views of one step where the number of views is left to the program."""
+STEPS_OF_A_STAGE = 900
+"""Fewest steps of a stage where it is: a short stage steps for fewer views."""
+PIXELS_OF_A_LAUNCH = 1 << 22
+"""Pixels of views that are rendered together. More of them would take memory and save no time."""
+
+
+def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, batches: bool) -> int:
+    """Return the number of views of one optimizer step in a stage.
+
+    Args:
+        settings: of the run.
+        stage: its image size and length decide where the settings say "auto".
+        training_views: number of training views, the upper limit for "auto".
+        batches: whether the rasterizer renders several views together; "auto" is 1 where it does not.
+    """
+    asked = settings.asked_views
+    if asked is None:
+        pixels = stage.image_size[0] * stage.image_size[1]
+        limits = round(PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
+        asked = max(1, min(MOST_VIEWS, training_views, *limits)) if batches else 1
+    return asked
+
+
+@dataclass(frozen=True)
+class StageSchedule:
+    """Answer what is due in an iteration of one stage. It has no state.
+
+    Iterations count from 1 in each stage. In a stage of n of N iterations, densification ends at `until` scaled by n/N,
+    and the learning rate of positions decays to its last value at n; the other constants are the settings' own.
+
+    A field that was trained before, in `before` iterations of coarser nested levels, keeps its SH degree and stops
+    densifying earlier (`plan.nested_densify_until`). Its opacities are reset only if the user says when: resets remove
+    floaters near the cameras, which the coarser level did, and recovering from one takes iterations. The same holds for
+    residuals, which start from the base's geometry or positions.
+
+    Attributes:
+        gather_from, gather: from this iteration on, the gradients of so many views make one step.
+        views: the same for earlier steps. A step ends early where something is due.
+    """
+
+    iterations: int
+    densify_start: int
+    densify_until: int
+    densify_every: int
+    reset_every: int
+    sh_every: int
+    sh_degree: int
+    means_first: float
+    means_last: float
+    sh_rest_factor: float
+    gather_from: int
+    gather: int
+    before: int
+    views: int = 1
+
+    @classmethod
+    def create(
+        cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1, training_views: int = 1
+    ) -> StageSchedule:
+        shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
+        given = settings.densification
+
+        def constant(chosen: int | None, reference: int, smallest: int) -> int:
+            return chosen if chosen is not None else max(smallest, round(reference * shrink))
+
+        resets = constant(given.reset_every, 3000, 300)
+        keeps_opacities = before or (stage.signed and not settings.residual_resets)
+        if given.reset_every == 0 or (keeps_opacities and given.reset_every is None):
+            resets = stage.iterations + 1  # never
+        until = constant(given.until, given.options.densify_until, 1)
+        of_stage = round(until * stage.iterations / settings.iterations)
+        if (share := settings.densify_share_of(stage)) is not None:
+            of_stage = round(share * stage.iterations)
+        densify_until = nested_densify_until(of_stage) if before else of_stage
+        # A refinement replaces parameters, and with them gradients that wait for those of other views.
+        late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
+        rates = settings.learning_rates
+        return cls(
+            iterations=stage.iterations,
+            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
+            densify_until=densify_until,
+            densify_every=given.every,
+            reset_every=resets,
+            sh_every=constant(settings.sh_every, 1000, 1),
+            sh_degree=settings.sh_degree_of(stage),
+            means_first=rates.means_first,
+            means_last=rates.means_last,
+            sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),
+            gather_from=stage.iterations - late + 1,
+            gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
+            before=before,
+            views=views,
+        )
+
+    def refines(self, iteration: int) -> bool:
+        """Return whether Gaussians are added and removed after this iteration, while densification lasts."""
+        return iteration > self.densify_start and iteration % self.densify_every == 0
+
+    def gathers(self, iteration: int) -> bool:
+        """Return whether the step of this iteration is a late one, which keeps the step sizes of one view."""
+        return self.gather > 1 and iteration >= self.gather_from
+
+    def views_of_step(self, done: int) -> int:
+        """Return the number of views, at least 1, of the step after `done` iterations."""
+        if self.gathers(done + 1):
+            within = (done + 1 - self.gather_from) % self.gather
+            return min(self.gather - within, self.iterations - done)
+        return 1 if self.views == 1 else min(self.views, self._next_due(done) - done)
+
+    def _next_due(self, done: int) -> int:
+        """Return the first iteration after `done` that ends a step, because statistics or the field change with it."""
+        due = [self.iterations]
+        if done < self.densify_until:
+            # Statistics are collected before iteration `densify_until`, and pruning follows it.
+            due += [(done // every + 1) * every for every in (self.densify_every, self.reset_every)]
+            due += [self.densify_until - 1, self.densify_until]
+        if self.gather > 1:
+            due.append(self.gather_from - 1)
+        return min(each for each in (*due, *self.late_prunes) if each > done)
+
+    @property
+    def prunes_after(self) -> int | None:
+        """The iteration that ends densification; None where there is none, or nothing comes after it."""
+        return self.densify_until if self.densify_start < self.densify_until < self.iterations else None
+
+    @cached_property
+    def late_prunes(self) -> frozenset[int]:
+        """The iterations after densification in which a strategy may prune once more: every tenth of the stage in its
+        second half, moved to the end of a step where gradients of several views are gathered."""
+        found = set()
+        for tenth in range(6, 10):
+            due = max(round(self.iterations * tenth / 10), self.densify_until + 1)
+            if self.gathers(due):
+                due += (self.gather_from - 1 - due) % self.gather
+            found.add(due)
+        return frozenset(due for due in found if due < self.iterations)
+
+    def means_learning_rate(self, iteration: int) -> float:
+        """Return the step size of positions in units of the scene's extent; its logarithm decays linearly."""
+        progress = min(max(iteration / self.iterations, 0.0), 1.0)
+        return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
+
+    def sh_rest_factor_at(self, iteration: int) -> float:
+        """Return the factor on the rate of SH above degree 0, which falls exponentially to 1 at the stage's end."""
+        left: float = 1.0 - min(iteration / self.iterations, 1.0)
+        factor: float = self.sh_rest_factor**left
+        return factor
+
+    def active_sh_degree(self, iteration: int) -> int:
+        return min(self.sh_degree, (self.before + iteration) // self.sh_every)

@@ -1,0 +1,199 @@
+"""Choose how a stage adds and removes Gaussians: strategies by name, with their own options. Imports no torch.
+
+Each strategy here says what differs between strategies in the rest of training; the work is done by the
+`densification.DensityControl` that it makes for a stage.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import check_bounds, option
+from lapgs_plugin.registry import Registry
+from lapgs_plugin.untrusted import STRICT
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from lapgs_plugin.fields.gaussian_field import GaussianField
+    from lapgs_plugin.training.densification import DensityControl
+    from lapgs_plugin.training.schedule import StageSchedule
+
+PANEL = "Density control"
+GROW_THRESHOLD = 2e-4
+"""Threshold of densification on screen-space gradients, in normalised device coordinates: 3DGS's."""
+ABSGRAD_THRESHOLD = 8e-4
+"""Default threshold on absolute gradients, which do not cancel and are larger: gsplat's recommendation."""
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """Describe one strategy of density control. Subclasses are frozen dataclasses whose fields are its options.
+
+    Fields that are declared with `options.option` become options of `lapgs train`. Two strategies have the same option
+    only where one inherits it from the other.
+
+    Attributes:
+        densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
+        needs_gsplat: whether only gsplat on a GPU can train with it.
+        unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    densify_until: ClassVar[int] = 15_000
+    needs_gsplat: ClassVar[bool] = False
+    unused: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def needs_absgrad(self) -> bool:
+        """Whether the rasterizer has to compute `RenderResult.absgrad2d`."""
+        return False
+
+    def check(self) -> None:
+        """Raise a UserInputError about an option that is out of range."""
+        check_bounds(self)
+
+    def of_stage(self, threshold_factor: float, base: bool) -> Self:
+        """Return the options of one stage.
+
+        Args:
+            threshold_factor: on densification thresholds in this stage.
+            base: whether it is the coarsest of several levels.
+        """
+        return self
+
+    def start(self, field: GaussianField) -> GaussianField:
+        """Return the field to train, given one that was made from points."""
+        return field
+
+    def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
+        """Return the density control of one stage. Called on what `of_stage` returned.
+
+        Args:
+            schedule: of the stage.
+            extent: of the scene, in world units.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Default(Strategy):
+    """Clone and split by screen-space gradients, prune by opacity and size: 3DGS's heuristics, by gsplat."""
+
+    grow_grad2d: float | None = option(
+        None,
+        "Screen-space gradient above which a Gaussian is cloned or split, in normalised device coordinates. Default: "
+        f"{GROW_THRESHOLD:g}, and {ABSGRAD_THRESHOLD:g} with --absgrad.",
+        panel=PANEL,
+        names=("--densify-threshold",),
+    )
+    absgrad: bool = option(False, "Densify by absolute gradients (AbsGS).", panel=PANEL)
+
+    @property
+    def needs_absgrad(self) -> bool:
+        return self.absgrad
+
+    def check(self) -> None:
+        super().check()
+        if self.grow_grad2d is not None:
+            require_positive("--densify-threshold", self.grow_grad2d, "gradient")
+
+    def of_stage(self, threshold_factor: float, base: bool) -> Self:
+        whole = self.grow_grad2d or (ABSGRAD_THRESHOLD if self.absgrad else GROW_THRESHOLD)
+        return replace(self, grow_grad2d=whole * threshold_factor)
+
+    def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
+        from lapgs_plugin.training.densification import Densifier
+
+        return Densifier(schedule, self, extent)
+
+
+@dataclass(frozen=True)
+class Multiview(Default):
+    """Clone and split only where several views have large errors: the idea of FastGS (Ren et al. 2025)."""
+
+    split_absgrad2d: float = option(
+        ABSGRAD_THRESHOLD,
+        "Absolute gradient above which --strategy multiview splits a large Gaussian.",
+        panel=PANEL,
+        names=("--split-threshold",),
+    )
+    error_threshold: float = option(
+        0.1, "Share of a view's largest error above which a pixel counts, for --strategy multiview.", panel=PANEL
+    )
+    error_pixels: float = option(
+        0.1,
+        "Counted pixels of a view that a Gaussian must make up to be cloned or split, for --strategy multiview.",
+        panel=PANEL,
+    )
+
+    @property
+    def needs_absgrad(self) -> bool:
+        return True
+
+    def check(self) -> None:
+        super().check()
+        require_positive("--split-threshold", self.split_absgrad2d, "gradient")
+        require_positive("--error-pixels", self.error_pixels, "number")
+        if not 0.0 <= self.error_threshold < 1.0:
+            raise UserInputError(
+                f"--error-threshold {self.error_threshold}: expected a share of a view's largest error from 0 to "
+                "below 1, such as 0.1"
+            )
+        if self.absgrad:
+            raise UserInputError("--absgrad with --strategy multiview: it splits by absolute gradients anyway")
+
+    def of_stage(self, threshold_factor: float, base: bool) -> Self:
+        split = self.split_absgrad2d * threshold_factor
+        return replace(super().of_stage(threshold_factor, base), split_absgrad2d=split)
+
+    def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
+        from lapgs_plugin.training.multiview import MultiviewDensifier
+
+        return MultiviewDensifier(schedule, self, extent)
+
+
+@dataclass(frozen=True)
+class Mcmc(Strategy):
+    """Move transparent Gaussians to opaque ones and add some up to a limit (Kheradmand et al. 2024), by gsplat."""
+
+    densify_until: ClassVar[int] = 25_000
+    needs_gsplat: ClassVar[bool] = True
+    unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
+
+    cap_max: int = option(1_000_000, "Most Gaussians of a level, for --strategy mcmc.", panel=PANEL, least=1)
+    base_cap_max: int | None = option(
+        None, "Most Gaussians of the coarsest level, for --strategy mcmc. Default: --cap-max.", panel=PANEL, least=1
+    )
+
+    def of_stage(self, threshold_factor: float, base: bool) -> Self:
+        return replace(self, cap_max=self.base_cap_max) if base and self.base_cap_max is not None else self
+
+    def start(self, field: GaussianField) -> GaussianField:
+        from lapgs_plugin.training.densification import mcmc_start
+
+        return mcmc_start(field)
+
+    def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
+        from lapgs_plugin.training.densification import McmcDensifier
+
+        return McmcDensifier(schedule, self)
+
+
+def require_positive(name: str, value: float, kind: str) -> None:
+    """Raise a UserInputError about a number that is not positive and finite."""
+    if not (value > 0.0 and math.isfinite(value)):
+        raise UserInputError(f"{name} {value}: expected a positive {kind}")
+
+
+DEFAULT = "default"
+STRATEGIES: Registry[Strategy] = Registry(
+    "--strategy",
+    "lapgs_plugin.strategies",
+    Strategy,
+    {DEFAULT: Default(), "mcmc": Mcmc(), "multiview": Multiview()},
+)
+"""Strategies by name. Other packages add instances of `Strategy` as entry points of this group."""

@@ -1,0 +1,122 @@
+"""What documents say holds: links lead somewhere, commands parse, options exist, figures stand where they belong."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from lapgs_plugin import limits
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.rehearsal import Rehearsal
+from lapgs_plugin.untrusted import JSON_MIB, JSON_MIB_VARIABLE
+from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, prose
+
+WITH_COMMANDS = [path for path in PAGES if commands(path)]
+OF_OTHERS = {
+    # of scripts of the backbones
+    "--benchmark_dir", "--cams", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
+    "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
+    "--highfeature_lr", "--ho_iteration", "--mult", "--opacity_reset_interval", "--optimizer_type",
+    "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
+    "--test_iterations",
+    # of the extension in docs/extending.md
+    "--duplicates",
+    # of gsplat's trainer, pip and mkdocs
+    "--data_dir", "--data_factor", "--disable_video", "--max_steps", "--index-url", "--no-build-isolation",
+}  # fmt: skip
+"""Options in documents that are not of `lapgs`."""
+
+
+def parsed(words: list[str]) -> tuple[Any, Any]:
+    """Parse a command line as the program does, and return the command and its context."""
+    command, name = typer.main.get_command(app), "lapgs"
+    parent: Any = None
+    while True:
+        context = command.make_context(name, list(words), parent=parent, obj=Rehearsal())
+        if not hasattr(command, "commands"):
+            return command, context
+        rest = [*getattr(context, "_protected_args", ()), *context.args]
+        name, command, words = command.resolve_command(context, rest)
+        parent = context
+
+
+@pytest.mark.parametrize("document", WITH_COMMANDS, ids=name_of)
+def test_every_command_parses(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The rehearsal of `lapgs run` recognises a checkout; its script is never started.
+    shutil.copytree(ROOT / "tests/contract/checkouts/graphdeco", tmp_path / "checkout")
+    monkeypatch.chdir(tmp_path / "checkout")
+    for words in commands(document):
+        command, context = parsed(words)
+        given = context.params
+        if words[0] in ("train", "run") and not (given.get("view") or given.get("resume") or given.get("off")):
+            with context:
+                command.invoke(context)  # makes the settings, which checks their values, and ends
+
+
+def test_a_renamed_option_would_be_found() -> None:
+    with pytest.raises(Exception, match="No such option: --levls"):
+        parsed(["train", "scene", "-o", "run", "--levls", "2"])
+    with pytest.raises(Exception, match="No such command 'evaluate'"):
+        parsed(["evaluate", "run"])
+
+
+def every_option() -> set[str]:
+    found, waiting = {"--help"}, [typer.main.get_command(app)]
+    while waiting:
+        command: Any = waiting.pop()
+        waiting += getattr(command, "commands", {}).values()
+        found |= {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+    return found
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_options_in_the_text_exist(document: Path) -> None:
+    named = set(re.findall(r"(?<![\w-])--[A-Za-z][\w-]*[A-Za-z]", prose(document)))
+    assert named - every_option() - OF_OTHERS == set()
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+def test_links_lead_to_files(document: Path) -> None:
+    for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", prose(document)):
+        assert (document.parent / target).exists(), target
+
+
+def test_documents_that_the_code_names_exist() -> None:
+    for path in (ROOT / "lapgs_plugin").rglob("*.py"):
+        for named in re.findall(r"(?<![\w/])(?:docs|patches)/[\w./-]+\.md", path.read_text(encoding="utf-8")):
+            assert (ROOT / named).is_file(), (path, named)
+
+
+def test_limits_are_those_of_the_code() -> None:
+    in_code = {
+        limit.variable: f"{limit.default:,}" for limit in vars(limits).values() if isinstance(limit, limits.Limit)
+    }
+    in_code[JSON_MIB_VARIABLE] = str(JSON_MIB)
+    rows = re.findall(
+        r"^\| `(LAPGS_\w+)` \| ([\d,]+) \|", (ROOT / "docs/scenes.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert dict(rows) == in_code
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert [variable for variable in in_code if variable not in changes] == []
+
+
+def test_the_readme_is_a_screen_and_a_half() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_figures_of_the_readme_are_rows_of_the_results() -> None:
+    rows = [line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    results = (ROOT / "docs/results.md").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 1 + 4  # its head and four rows
+    assert [row for row in rows if row not in results] == []
+
+
+@pytest.mark.parametrize("document", [path for path in PAGES if path.name != "results.md"], ids=name_of)
+def test_measured_figures_stand_in_the_results(document: Path) -> None:
+    text = "\n".join(line for line in prose(document).splitlines() if document.name != "README.md" or line[:1] != "|")
+    assert re.findall(r"\d[\d.]* dB|\d[\d.]*x as fast|\d+\.\d+ m?s\b", text) == []

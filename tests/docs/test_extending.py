@@ -1,0 +1,215 @@
+"""The code blocks of docs/extending.md do what the page says."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import lapgs_plugin
+from lapgs_plugin import ops
+from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.settings import HierarchySettings
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
+from lapgs_plugin.hooks import HookDispatcher, StageContext, entry_point_hooks
+from lapgs_plugin.patching.engine import find_targets, plan_apply
+from lapgs_plugin.patching.recipe import load_recipes
+from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.training.strategies import STRATEGIES
+from tests.cli.run_folder import write_run, write_scene
+from tests.docs.documents import ROOT, blocks
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # before Python 3.11
+    import tomli as tomllib
+
+PAGE = ROOT / "docs/extending.md"
+FILES = {block.title: block.text for block in blocks(PAGE) if block.title}
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Install the package that the page describes, as pip would."""
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    (tmp_path / "my_extension/__init__.py").touch()
+    project = tomllib.loads(FILES["pyproject.toml"])["project"]
+    info = tmp_path / f"my_extension-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    lines: list[str] = []
+    for group, entries in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in entries.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for registry in REGISTRIES:
+        vars(registry).pop("_found", None)
+    yield tmp_path
+    for registry in REGISTRIES:
+        vars(registry).pop("_found", None)
+    for name in [name for name in sys.modules if name.split(".")[0] == "my_extension"]:
+        del sys.modules[name]
+
+
+REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES)
+
+
+def context(signed: bool) -> StageContext:
+    stage = Stage(0 if signed else 1, (8, 6), 10, signed=signed)
+    image = torch.rand(3, 6, 8)
+    return StageContext(stage, 1, "view", image, accumulated=image / 2 if signed else None)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_is_under_forty_lines(name: str) -> None:
+    assert len(FILES[name].splitlines()) < 40
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_hook_adds_to_the_loss_of_residual_stages() -> None:
+    (hook,) = entry_point_hooks()
+    assert type(hook).__name__ == "Smooth"
+    image = torch.zeros(3, 6, 8)
+    image[:, 3:] = 1.0  # one edge, across 8 of 5 * 8 vertical steps
+    term = HookDispatcher([hook]).extra_loss(context(signed=True), image)
+    assert isinstance(term, Tensor)
+    assert term.item() == pytest.approx(1e-3 / 5)
+    assert HookDispatcher([hook]).extra_loss(context(signed=False), image) is None
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_supervision_is_chosen_by_its_name() -> None:
+    settings = HierarchySettings(hierarchy="laplacian", supervision="clamped")
+    prediction, target = SUPERVISIONS[settings.supervision].pair(
+        torch.tensor([[[-0.5, 0.5, 1.5]]]), torch.ones(1, 1, 3), torch.zeros(1, 1, 3), None
+    )
+    assert prediction.tolist() == [[[0.0, 0.5, 1.0]]]
+    assert target.tolist() == [[[1.0, 1.0, 1.0]]]
+    assert settings.joint_from(Stage(0, (8, 6), 100, signed=True)) == 76  # it composes
+
+
+def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path) -> None:
+    checkout = tmp_path / "checkout"
+    shutil.copytree(ROOT / "tests/contract/checkouts/graphdeco", checkout)
+    assert adapter_class(checkout).info.name == "graphdeco"
+    (checkout / "utils/my_scores.py").touch()
+    adapter = adapter_class(checkout)
+    assert (adapter.info.name, adapter) == ("my_fork", adapter_class(checkout, "my_fork"))
+    assert "my_threshold" in adapter.info.densify_thresholds
+    original = SimpleNamespace(image_width=80, blur=4.0, alpha_mask=None, invdepthmap=None)
+    view = copy.copy(original)
+    script: Any = SimpleNamespace(module=SimpleNamespace(SPARSE_ADAM_AVAILABLE=False))
+    adapter(script).level_view(view, original, (40, 30), signed=False)
+    assert (view.blur, original.blur) == (2.0, 4.0)
+
+
+def test_the_strategy_trains_with_its_option(installed: Path, tmp_path: Path) -> None:
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    make_sample_scene(scene, width=64, height=48, views=6, points=300, progress=False)
+    words = (
+        "--iterations",
+        "40",
+        "--levels",
+        "1",
+        "--densify-every",
+        "10",
+        "--strategy",
+        "opaque",
+        "--duplicates",
+        "7",
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, *words],
+        env={**os.environ, "PYTHONPATH": str(installed)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    added = lapgs_plugin.RunArchive.open(run).manifest.record(0).num_gaussians - 300
+    assert added > 0
+    assert added % 7 == 0
+
+
+@pytest.fixture
+def tone(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The page's operation, as if its folder were in the package."""
+    monkeypatch.setattr(ops, "__path__", [*ops.__path__, str(installed / "lapgs_plugin/ops")])
+    yield importlib.import_module("lapgs_plugin.ops.tone")
+    for name in [name for name in sys.modules if name.startswith("lapgs_plugin.ops.tone")]:
+        del sys.modules[name]
+
+
+def test_the_operation_is_pytorchs_on_a_cpu(tone: Any) -> None:
+    assert tone.tone(torch.tensor([0.0, 1.0]), 2.0, 0.5).tolist() == [0.5, 2.5]
+    assert not tone.triton_works(torch.zeros(1))
+    assert not tone.triton_works.passes_on(torch.device("cpu"))  # no Triton, or none for CPUs
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_operation_is_one_kernel_on_a_gpu(tone: Any) -> None:
+    image = torch.rand(3, 50, 70, device="cuda")
+    assert tone.triton_works(image)
+    torch.testing.assert_close(tone.tone(image, 2.0, 0.5), image * 2 + 0.5, rtol=0, atol=1e-6)
+
+
+def test_no_file_on_the_page_is_without_a_test() -> None:
+    package = {
+        "pyproject.toml",
+        *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy")),
+    }
+    operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
+    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml", "render_a_run.py"}
+
+
+def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:
+    source = installed / "my_rasterizer.cu"
+    source.write_text(
+        '#include "my_rasterizer.h"\n__device__ float blend(float colour, int degree) {\n'
+        "\treturn max(colour + 0.5f, 0.0f);\n}\n"
+    )
+    (target,) = find_targets(installed, load_recipes(installed / "patches"))
+    (change,) = plan_apply(target, {"signed-color", "build-cuda13"})
+    text = change.after.decode()
+    assert "#include <cfloat>" in text
+    assert "degree < 0 ? colour : max(colour + 0.5f, 0.0f)" in text
+
+
+def test_a_run_is_rendered_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_scene(tmp_path / "data/mine")
+    write_run(tmp_path / "runs/mine", scene)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(FILES["render_a_run.py"], "render_a_run.py", "exec"), names)
+    camera, images = names["view"].camera, names["images"]
+    assert images.composed[0].shape == (3, camera.height, camera.width)
+    up = lapgs_plugin.Pyramid().up(images.base, (camera.height, camera.width))
+    torch.testing.assert_close(images.composed[0], up + images.residuals[0], rtol=0, atol=1e-5)
+
+
+def test_the_pieces_of_a_loop_are_names_of_the_package() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    table = text[text.index("| piece | for |") : text.index("[gsplat_after.py]")]
+    named = {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)", row)}
+    assert len(named) > 8
+    assert named <= set(lapgs_plugin.__all__)
+    for piece, method in re.findall(r"`([A-Z]\w+)\.(\w+)", table):
+        assert hasattr(getattr(lapgs_plugin, piece), method)
+    for method in ("put", "prefetch", "get"):
+        assert hasattr(lapgs_plugin.ImageStore, method)
