@@ -16,10 +16,10 @@ def sample(
     seed: Annotated[int, typer.Option(help="Seed of patterns and cameras. The same seed gives the same files.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene in OUT.")] = False,
 ) -> None:
-    """Make a procedural scene: a still life of test patterns in a round library.
+    """Make a procedural scene to try everything on: a still life of test patterns in a round hall.
 
-    Hard edges, fine print, wires and a chain-link fence, with exact camera poses and noisy sparse points, in COLMAP's
-    layout. The finest detail is as small as a pixel at 480x320: every level of a hierarchy has something to show.
+    The scene is a COLMAP folder with exact camera poses and noisy sparse points. Its patterns repeat at doubling
+    frequencies with sharp edges, down to the size of a pixel at 480x320.
     """
     from lapgs_plugin.scenes.sample import make_sample_scene, parse_size
 

@@ -1,4 +1,4 @@
-"""`lapgs prepare` on photos whose cameras are known exactly: renderings of the sample scene."""
+"""`lapgs prepare` on photos whose cameras are known exactly: renderings by the sample scene's ray caster."""
 
 from __future__ import annotations
 
@@ -31,12 +31,31 @@ from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.prepare import PrepareResult, prepare_scene
 from lapgs_plugin.scenes.sample.raycast import render
-from lapgs_plugin.scenes.sample.world import build_world
+from lapgs_plugin.scenes.sample.solids import ball, box, rod
+from lapgs_plugin.scenes.sample.world import PALETTE
 
 SIZE = (384, 256)
 FOCAL = 390.0
 COUNT = 8
 DISTORTION = np.array([-0.16, 0.03, 0.001, -0.001])  # k1, k2, p1, p2 as OpenCV and COLMAP define them
+
+
+COLORS = np.random.default_rng(0).integers(PALETTE.shape[1], size=1 << 16).astype(np.uint8)
+
+
+def _speckled(points: NDArray[np.float32], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Cubes of 12 cm in random colours: unlike the patterns of the sample scene, no place looks like another."""
+    x, y, z = np.floor(points / 0.12 + 0.5).astype(np.int64)
+    return COLORS[(x * 73856093 ^ y * 19349663 ^ z * 83492791) % len(COLORS)]
+
+
+WORLD = (
+    rod((0, 0, 0), (0, 0, 5.2), 6.5, _speckled, room=True),
+    box((0.9, 0.8, 0.5), (0.9, 0.9, 1.0), _speckled, 0.4),
+    box((-1.2, -0.4, 0.3), (0.7, 0.7, 0.6), _speckled, 1.1),
+    rod((0, 0, 0), (0, 0, 0.9), 0.35, _speckled),
+    ball((0, 0, 1.4), 0.5, _speckled),
+)
 
 
 def _arc(size: tuple[int, int], focal: float) -> list[Camera]:
@@ -62,9 +81,8 @@ def _save(path: Path, image: NDArray[np.float32]) -> None:
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
-    world = build_world(0)
     for index, camera in enumerate(_arc(SIZE, FOCAL)):
-        _save(folder / f"{index:02d}.png", render(world, camera))
+        _save(folder / f"{index:02d}.png", render(WORLD, camera))
     return folder
 
 
@@ -87,7 +105,6 @@ def prepared(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 def distorted_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same views through a lens that bends straight lines, as JPEG."""
     folder = tmp_path_factory.mktemp("distorted")
-    world = build_world(0)
     wide = (448, 304)  # holds all that the lens sees
     matrix = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
     columns, rows = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
@@ -95,7 +112,7 @@ def distorted_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     straight = cv2.undistortPoints(pixels[:, None], matrix, DISTORTION)[:, 0].reshape(SIZE[1], SIZE[0], 2)
     source = (straight * FOCAL + np.array(wide) / 2 - 0.5).astype(np.float32)
     for index, camera in enumerate(_arc(wide, FOCAL)):
-        image = cv2.remap(render(world, camera), source[..., 0], source[..., 1], cv2.INTER_CUBIC)
+        image = cv2.remap(render(WORLD, camera), source[..., 0], source[..., 1], cv2.INTER_CUBIC)
         _save(folder / f"{index:02d}.jpg", image.clip(0, 1))
     return folder
 
@@ -151,7 +168,7 @@ def test_a_bent_lens_is_straightened(distorted_photos: Path, tmp_path: Path) -> 
     assert camera.model.name == "PINHOLE"
     assert _centre_errors(model).max() < 0.01  # seen 3.6e-3
     # Straight images taken from one place differ by a homography, whatever their focal length and direction.
-    exact = render(build_world(0), _arc((448, 304), FOCAL)[4])
+    exact = render(WORLD, _arc((448, 304), FOCAL)[4])
     straightened = cv2.imread(str(tmp_path / "scene" / "images" / "04.jpg"))[:, :, ::-1] / 255
     bent = cv2.imread(str(distorted_photos / "04.jpg"))[:, :, ::-1] / 255
     # Seen: 0.007 against 0.039.

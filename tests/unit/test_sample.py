@@ -21,7 +21,9 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample import scene as scene_module
 from lapgs_plugin.scenes.sample.cameras import orbit_camera
 from lapgs_plugin.scenes.sample.points import NOISE
-from lapgs_plugin.scenes.sample.shapes import Ball, Box, Cone, Dome, Floor, Panel, Pose, Rod, Shape, Wall
+from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
+from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
+from lapgs_plugin.scenes.sample.world import build_world
 
 SMALL = {"width": 96, "height": 64, "views": 3, "points": 40, "progress": False}
 VIEWS, POINTS = 10, 500
@@ -128,12 +130,12 @@ def test_views_show_a_surface_point_in_its_colour(
 def test_no_solid_stands_between_a_view_and_the_points_it_sees(
     model: pycolmap.Reconstruction, surface_points: dict[int, NDArray[np.float64]]
 ) -> None:
-    globe, column = np.array([0.0, 0.0, 1.52]), 0.2
+    globe, column = np.array([0.0, 0.0, 1.42]), 0.16
     for key, point in model.points3D.items():
         end = surface_points[key]
         for image, _ in _observations(model, point):
             path = np.linspace(image.projection_center(), end, 400)
-            assert np.linalg.norm(path - globe, axis=1).min() > 0.37 - 5e-3
+            assert np.linalg.norm(path - globe, axis=1).min() > 0.42 - 5e-3
             in_column = (np.hypot(path[:, 0], path[:, 1]) < column - 5e-3) & (path[:, 2] > 0.22) & (path[:, 2] < 1.0)
             in_plinth = (np.hypot(path[:, 0], path[:, 1]) < 1.05 - 5e-3) & (path[:, 2] < 0.22 - 5e-3)
             assert not (in_column | in_plinth | (path[:, 2] < -5e-3)).any()
@@ -152,8 +154,8 @@ def test_the_red_ring_of_the_plinth_is_where_colmap_projects_it(
             red.append((r > 1.7 * g) & (r > 1.7 * b))
         return float(np.mean(red))
 
-    # Seen: 0.79 on the ring, which things in front hide in part; 0.01 and 0.004 beside it.
-    assert share_of_red(1.01) > 0.7
+    # Seen: 0.66 on the ring, which things in front hide in part; at most 0.02 beside it.
+    assert share_of_red(0.965) > 0.55
     assert share_of_red(1.12) < 0.05
     assert share_of_red(0.90) < 0.05
 
@@ -179,7 +181,7 @@ def test_images_have_energy_at_high_frequencies(pictures: dict[str, NDArray[np.f
         energy = np.abs(np.fft.fft2((grey - grey.mean()) * window)) ** 2
         frequency = np.hypot(np.fft.fftfreq(grey.shape[0])[:, None], np.fft.fftfreq(grey.shape[1])[None])
         shares.append(energy[frequency > 0.25].sum() / energy.sum())  # half of Nyquist is 0.25 cycles a pixel
-    assert min(shares) > 0.1  # seen: 0.17 to 0.30
+    assert min(shares) > 0.07  # seen: 0.10 to 0.18
 
 
 def _hashes(folder: Path) -> dict[str, str]:
@@ -216,105 +218,107 @@ def test_cameras_stand_all_around_and_so_do_those_held_out(step: int, seed: int)
     assert np.ptp(centres[:, 2]) > 1.0
 
 
-def _inside(shape: Shape) -> Callable[[NDArray[np.float64]], NDArray[np.bool_]]:
-    """Which local points (3, n) lie in the solid (or behind the sheet), straight from its definition."""
-    if isinstance(shape, Ball | Dome):
-        return lambda p: (np.linalg.norm(p, axis=0) < shape.radius) == isinstance(shape, Ball)
-    if isinstance(shape, Floor):
-        return lambda p: p[2] < 0
-    if isinstance(shape, Wall):
-        return lambda p: np.hypot(p[0], p[1]) > shape.radius
-    if isinstance(shape, Box):
-        return lambda p: (np.abs(p) < np.array(shape.size)[:, None] / 2).all(axis=0)
-    if isinstance(shape, Rod):
-        return lambda p: (np.hypot(p[0], p[1]) < shape.radius) & (p[2] > 0) & (p[2] < shape.length)
-    assert isinstance(shape, Cone)
-    return lambda p: (p[2] > 0) & (np.hypot(p[0], p[1]) < shape.radius * (1 - p[2] / shape.height))
+Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
 
 def _no_paint(points: NDArray[np.float32], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.zeros(points.shape[1], np.uint8)
 
 
-LEANING = Pose.between((0.1, -0.2, 0.3), (0.5, 0.4, 1.0))
-SHAPES = [
-    Floor(Pose.standing(0, 0, 0), _no_paint),
-    Wall(Pose.standing(0, 0, 0), _no_paint, 3.0),
-    Dome(Pose.standing(0, 0, 0), _no_paint, 4.0),
-    Ball(Pose.standing(0.2, 0.1, 0.8), _no_paint, 0.6),
-    Box(Pose.standing(-0.1, 0.2, 0.5, 0.7), _no_paint, (0.9, 0.6, 1.1)),
-    Rod(LEANING, _no_paint, 0.3, 1.2),
-    Rod(LEANING, _no_paint, 0.006, 2.0),
-    Cone(Pose.standing(0.1, 0.1, 0.0), _no_paint, 0.7, 1.3),
-]
+def _in_ball(p: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.linalg.norm(p - np.array([[0.2], [0.1], [0.8]]), axis=0) < 0.6
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
-def test_rays_hit_shapes_where_marching_along_them_does(shape: Shape) -> None:
-    random = np.random.default_rng(0)
+def _in_box(p: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A box of 0.9 x 0.6 x 1.1 around (-0.1, 0.2, 0.5), turned by 0.7."""
+    x, y, z = p - np.array([[-0.1], [0.2], [0.5]])
+    c, s = np.cos(0.7), np.sin(0.7)
+    return (np.abs(c * x + s * y) < 0.45) & (np.abs(c * y - s * x) < 0.3) & (np.abs(z) < 0.55)
+
+
+START, END = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.4, 1.0])
+
+
+def _in_rod(radius: float) -> Inside:
+    def inside(p: NDArray[np.float64]) -> NDArray[np.bool_]:
+        length = np.linalg.norm(END - START)
+        along = (END - START) / length @ (p - START[:, None])
+        off = np.linalg.norm(p - START[:, None] - (END - START)[:, None] / length * along, axis=0)
+        return (off < radius) & (along > 0) & (along < length)
+
+    return inside
+
+
+def _outside_hall(p: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return (np.hypot(p[0], p[1]) > 3.0) | (p[2] < 0) | (p[2] > 2.5)
+
+
+SOLIDS: dict[str, tuple[Solid, Inside]] = {
+    "ball": (ball((0.2, 0.1, 0.8), 0.6, _no_paint), _in_ball),
+    "box": (box((-0.1, 0.2, 0.5), (0.9, 0.6, 1.1), _no_paint, 0.7), _in_box),
+    "rod": (rod((0.1, -0.2, 0.3), (0.5, 0.4, 1.0), 0.3, _no_paint), _in_rod(0.3)),
+    "wire": (rod((0.1, -0.2, 0.3), (0.5, 0.4, 1.0), 0.006, _no_paint), _in_rod(0.006)),
+    "hall": (rod((0, 0, 0), (0, 0, 2.5), 3.0, _no_paint, room=True), _outside_hall),
+}
+
+
+def _rays(count: int, spread: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A point and directions (3, count) from it towards the solids."""
     origin = np.array([1.3, -1.9, 1.1])
-    spread = 0.03 if isinstance(shape, Rod) and shape.radius < 0.1 else 1.0
-    aims = np.array([[0.3], [0.1], [0.65]]) + spread * random.normal(scale=0.5, size=(3, 300))
-    directions = (aims - origin[:, None]) / np.linalg.norm(aims - origin[:, None], axis=0)
-    step = shape.radius / 20 if isinstance(shape, Rod | Ball) else 2e-3
-    ways = np.arange(0, 12, step) if shape.bounds() is None or step > 1e-3 else np.arange(1.0, 4.0, step)
-    which, distance = shape.hit(origin.astype(np.float32), directions.astype(np.float32))
-    hits = {ray: far for ray, far in zip(which.tolist(), distance.tolist(), strict=True) if far < ways[-1]}
-    to_local = shape.pose.rotation.astype(np.float64).T
-    disagreements = 0
+    aims = np.array([[0.3], [0.1], [0.65]]) + spread * np.random.default_rng(0).normal(size=(3, count))
+    return origin, (aims - origin[:, None]) / np.linalg.norm(aims - origin[:, None], axis=0)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_rays_hit_solids_where_marching_along_them_does(name: str) -> None:
+    solid, inside = SOLIDS[name]
+    origin, directions = _rays(300, 0.015 if name == "wire" else 0.5)
+    step = 3e-4 if name == "wire" else 2e-3
+    ways = np.arange(0, 8, step) if name == "hall" else np.arange(0.5, 4.0, step)
+    distance = solid.hit(origin.astype(np.float32), directions.astype(np.float32))
+    hits = disagreements = 0
     for ray in range(300):
-        path = to_local @ (origin[:, None] + ways * directions[:, ray : ray + 1] - shape.pose.origin[:, None])
-        inside = np.flatnonzero(_inside(shape)(path))
-        if (inside.size > 0) != (ray in hits):
+        entered = np.flatnonzero(inside(origin[:, None] + ways * directions[:, ray : ray + 1]))
+        if (entered.size > 0) != np.isfinite(distance[ray]):
             disagreements += 1  # a chord shorter than a step
-        elif inside.size:
-            assert hits[ray] == pytest.approx(ways[inside[0]] - step / 2, abs=step / 2 + 1e-4)
+        elif entered.size:
+            hits += 1
+            assert distance[ray] == pytest.approx(ways[entered[0]] - step / 2, abs=step / 2 + 1e-4)
+    assert hits >= 50
     assert disagreements <= 3  # none seen
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
-def test_normals_stand_on_the_surface(shape: Shape) -> None:
-    random = np.random.default_rng(1)
-    origin = np.array([1.3, -1.9, 1.1], np.float32)
-    aims = np.array([[0.3], [0.1], [0.65]], np.float32) + random.normal(scale=0.3, size=(3, 2000)).astype(np.float32)
-    directions = (aims - origin[:, None]) / np.linalg.norm(aims - origin[:, None], axis=0)
-    which, distance = shape.hit(origin, directions)
-    points = origin[:, None] + distance * directions[:, which]
-    _, normals = shape.surface(points)
+@pytest.mark.parametrize("name", SOLIDS)
+def test_normals_stand_on_the_surface(name: str) -> None:
+    solid, inside = SOLIDS[name]
+    origin, directions = _rays(2000, 0.015 if name == "wire" else 0.3)
+    distance = solid.hit(origin.astype(np.float32), directions.astype(np.float32))
+    hit = np.isfinite(distance)
+    points = (origin[:, None] + distance[hit] * directions[:, hit]).astype(np.float32)
+    _, normals = solid.surface(points)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1.0, atol=1e-5)
-    # A short step along the normal leaves the solid and one against it enters it, or the other way round.
-    to_local = shape.pose.rotation.T
-    ahead, behind = (
-        _inside(shape)((to_local @ (points + s * 5e-4 * normals - shape.pose.origin[:, None])).astype(np.float64))
-        for s in (1, -1)
-    )
-    assert np.mean(ahead != behind) > 0.98  # seen: all; next to an edge both may lie outside
+    # A short step along the normal leaves the solid, and one against it enters it; in a hall the other way round.
+    ahead, behind = (inside((points + s * 5e-4 * normals).astype(np.float64)) for s in (1, -1))
+    assert np.mean((ahead, behind)[name != "hall"]) > 0.98  # seen: all; next to an edge both may lie outside
+    assert np.mean((ahead, behind)[name == "hall"]) < 0.02
 
 
-def test_a_sheet_is_hit_only_where_it_is_solid() -> None:
-    panel = Panel(Pose.standing(0, 0, 0), _no_paint, 2.0, 1.0, lambda x, z: x > 0.25)
-    targets = np.array([[-0.5, 0.2, 0.3, 0.9, 1.1, 0.5], [0] * 6, [0.5, 0.5, 0.5, 0.5, 0.5, 1.2]], np.float32)
-    origin = np.array([0.1, -2.0, 0.4], np.float32)
-    lengths = np.linalg.norm(targets - origin[:, None], axis=0)
-    which, distance = panel.hit(origin, (targets - origin[:, None]) / lengths)
-    assert which.tolist() == [2, 3]
-    np.testing.assert_allclose(distance, lengths[[2, 3]], rtol=1e-5)
-
-
-def test_a_ball_with_holes_shows_its_far_side_through_them() -> None:
-    half = Ball(Pose.standing(0, 0, 0), _no_paint, 1.0, lambda longitude, latitude: np.abs(longitude) < np.pi / 2)
-    rays = np.array([[1.0, -1.0], [0, 0], [0, 0]], np.float32)
-    from_left = half.hit(np.array([-3, 0, 0], np.float32), rays)
-    assert (from_left[0].tolist(), from_left[1].tolist()) == ([0], [4.0])
-    from_right = half.hit(np.array([3, 0, 0], np.float32), rays)
-    assert (from_right[0].tolist(), from_right[1].tolist()) == ([1], [2.0])
+def test_blocks_of_an_image_miss_no_solid() -> None:
+    """Solids are left out of blocks of rays that cannot hit them: all together are hit as each by itself."""
+    world = build_world(0)
+    camera = orbit_camera(3, (480, 320), 0)
+    for left in range(0, 480, 96):
+        columns, rows = np.meshgrid(np.arange(left, left + 96, 3) + 0.5, np.arange(0, 320, 40) + 0.5)
+        origin, directions = camera_rays(camera, np.stack([columns.ravel(), rows.ravel()]))
+        nearest = np.min([solid.hit(origin, directions) for solid in world], axis=0)
+        np.testing.assert_array_equal(first_hits(world, origin, directions)[0], nearest)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"views": 1}, "--views 1: expected 2 to 9999"),
-        ({"points": 0}, "--points 0: expected 1 to 10000000"),
+        ({"points": 0}, "--points 0: expected at least 1"),
         ({"width": 8}, "--size 8x64: expected at least 16x16"),
         ({"seed": -1}, "--seed -1: expected 0 or more"),
     ],

@@ -1,4 +1,4 @@
-"""Where the photos of the sample scene are taken from."""
+"""Place the cameras of the sample scene."""
 
 from __future__ import annotations
 
@@ -15,20 +15,14 @@ SWAY = 0.15  # metres that the target moves either way
 FOCAL_RATIO = 1.025  # focal length over the longer side of the image: 52 degrees
 
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0])
-"""How far azimuth, elevation, distance and target move from one view to the next, in parts of their range, modulo 1.
+"""Steps of azimuth, elevation, distance and target from view to view, in parts of their range, modulo 1.
 
-Multiples of such irrational numbers fill the ranges evenly, whether one takes the first n views or every eighth. (The
-golden ratio does not: eight of its steps are nearly a whole turn, and all held-out views would stand side by side.)"""
+Multiples of these irrational numbers fill the ranges evenly, both for the first n views and for every eighth view. The
+golden ratio does not: eight of its steps are nearly a whole turn, so held-out views would stand side by side."""
 
 
 def orbit_camera(index: int, size: tuple[int, int], seed: int) -> Camera:
-    """Camera number `index`, the same in scenes with fewer or more views.
-
-    Args:
-        index: from 0.
-        size: (width, height) in pixels.
-        seed: shifts all cameras alike.
-    """
+    """Return camera number `index`, from 0. `size` is (width, height) in pixels; `seed` shifts all cameras alike."""
     start = np.random.default_rng([seed, 2]).random(len(STEPS))
     azimuth, elevation, distance, *sway = (start + index * STEPS) % 1.0
     angle = np.radians(np.interp(elevation, (0, 1), ELEVATIONS))
@@ -40,7 +34,7 @@ def orbit_camera(index: int, size: tuple[int, int], seed: int) -> Camera:
 
 
 def _looking_at(centre: NDArray[np.float64], target: NDArray[np.float64], size: tuple[int, int]) -> Camera:
-    """A level camera."""
+    """Return a camera without roll."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)

@@ -1,79 +1,66 @@
-"""Sparse points as structure from motion would give them: on visible surfaces, a little off, seen by several views."""
+"""Sample sparse points as structure from motion would give them: on visible surfaces, a little off, with tracks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits, pixel_colors, surfaces
-from lapgs_plugin.scenes.sample.shapes import Floats, dot
-from lapgs_plugin.scenes.sample.world import World
+from lapgs_plugin.scenes.sample.raycast import World, camera_rays, first_hits, pixel_colors, surfaces
+from lapgs_plugin.scenes.sample.solids import Floats, dot
 
 NOISE = 0.006
-"""Standard deviation of a point's coordinates in metres: an eighth of a percent of the cameras' distance."""
-
+"""Standard deviation of a point's coordinates in metres."""
 MIN_FACING = 0.15
-"""Cosine between a surface's normal and the ray to a camera below which the camera cannot match the point."""
-
+"""Smallest cosine between the normal and the ray at which a camera can match a point."""
 OCCLUSION_GAP = 5e-3
-"""A point counts as seen when the first hit on the way to it is nearer by no more than this, in metres."""
-
+"""Metres by which another surface must be nearer to the camera to hide a point."""
 ROUNDS = 50
 
 
-@dataclass(frozen=True)
-class SparsePoints:
-    """Points and where the views see them.
+class SparsePoints(NamedTuple):
+    """Points and the views that see them.
 
     Attributes:
-        positions: (n, 3) float64 in the world, noisy.
-        colors: (n, 3) uint8, what the pixel around the point shows in one of its views.
-        observations: for each point the indices of its views (at least two) and the exact image positions of the
-            surface point in them, (k,) and (k, 2).
+        positions: (n, 3) in the world, noisy.
+        colors: (n, 3) RGB in [0, 1] of the pixel around the point in one of its views.
+        seen: (n, views) whether a view sees the point; at least two do.
+        pixels: (n, views, 2) exact image positions of the surface point.
     """
 
     positions: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    observations: list[tuple[NDArray[np.intp], NDArray[np.float64]]]
+    colors: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    pixels: NDArray[np.float64]
 
 
 def sample_points(world: World, cameras: Sequence[Camera], count: int, seed: int) -> SparsePoints:
-    """Points on what the cameras see, evenly over their images, that at least two cameras see.
+    """Sample points evenly over the images, each seen by at least two cameras.
 
     Raises:
         UserInputError: the cameras share too little for so many points.
     """
     random = np.random.default_rng([seed, 3])
-    batch = max(256, count + count // 8)
     parts: list[SparsePoints] = []
-    found = 0
-    for _ in range(ROUNDS):
-        parts.append(_sample_batch(world, cameras, batch, random))
-        found += len(parts[-1].positions)
-        if found >= count:
-            break
-    else:
-        raise UserInputError(
-            f"--points {count}: found only {found} that two of {len(cameras)} views see, expected fewer points or more "
-            "--views"
-        )
-    return SparsePoints(
-        np.concatenate([part.positions for part in parts])[:count],
-        np.concatenate([part.colors for part in parts])[:count],
-        [observation for part in parts for observation in part.observations][:count],
-    )
+    while (found := sum(len(part.positions) for part in parts)) < count:
+        if len(parts) == ROUNDS:
+            raise UserInputError(
+                f"--points {count}: found only {found} that two of {len(cameras)} views see, expected fewer points or "
+                "more --views"
+            )
+        parts.append(_sample_batch(world, cameras, max(256, count + count // 8), random))
+    return SparsePoints(*(np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True)))
 
 
 def _sample_batch(world: World, cameras: Sequence[Camera], count: int, random: np.random.Generator) -> SparsePoints:
     owners = random.integers(len(cameras), size=count)
     places = random.random((2, count))  # in the image, 0 to 1
     noise = random.normal(scale=NOISE, size=(count, 3))
-    surface, normals, colors = np.empty((3, count), np.float32), np.empty((3, count), np.float32), np.empty((count, 3))
+    surface, normals, colors = np.empty((3, 3, count), np.float32)
     for view in np.unique(owners):
         here = np.flatnonzero(owners == view)
         camera = cameras[view]
@@ -82,36 +69,28 @@ def _sample_batch(world: World, cameras: Sequence[Camera], count: int, random: n
         distance, index = first_hits(world, origin, directions)
         surface[:, here] = origin[:, None] + distance * directions
         normals[:, here] = surfaces(world, index, surface[:, here])[1]
-        colors[here] = pixel_colors(world, camera, pixels).T
-    seen, pixels = _visibility(world, cameras, surface, normals)
-    kept = np.flatnonzero(seen.sum(axis=0) >= 2)
-    views = [np.flatnonzero(seen[:, point]) for point in kept]
-    return SparsePoints(
-        surface.T[kept].astype(np.float64) + noise[kept],
-        np.round(colors[kept] * 255).astype(np.uint8),
-        [(which, pixels[which, :, point]) for which, point in zip(views, kept, strict=True)],
-    )
+        colors[:, here] = pixel_colors(world, camera, pixels)
+    visible = [_visibility(world, camera, surface, normals) for camera in cameras]
+    seen, positions = (np.stack(arrays, axis=1) for arrays in zip(*visible, strict=True))
+    kept = seen.sum(axis=1) >= 2
+    return SparsePoints(surface.T[kept] + noise[kept], colors.T[kept].astype(np.float64), seen[kept], positions[kept])
 
 
 def _visibility(
-    world: World, cameras: Sequence[Camera], points: Floats, normals: Floats
+    world: World, camera: Camera, points: Floats, normals: Floats
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Which views see surface points (3, n), (views, n), and where they project, (views, 2, n)."""
-    seen = np.zeros((len(cameras), points.shape[1]), np.bool_)
-    pixels = np.empty((len(cameras), 2, points.shape[1]))
-    for view, camera in enumerate(cameras):
-        pose = camera.world_to_camera.numpy()
-        local = pose[:3, :3] @ points + pose[:3, 3:]  # (3, n)
-        pixels[view] = local[:2] / local[2] * [[camera.fx], [camera.fy]] + [[camera.cx], [camera.cy]]
-        inside = (pixels[view] > 0).all(axis=0) & (pixels[view] < [[camera.width], [camera.height]]).all(axis=0)
-        asked = np.flatnonzero(inside & (local[2] > 0))
-        if asked.size == 0:
-            continue
+    """Return which surface points (3, n) a camera sees, (n,), and where they project, (n, 2)."""
+    pose = camera.world_to_camera.numpy()
+    local = pose[:3, :3] @ points + pose[:3, 3:]  # (3, n)
+    pixels = (local[:2] / local[2]).T * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    seen = (local[2] > 0) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    asked = np.flatnonzero(seen)
+    if asked.size:
         origin = camera.position.numpy().astype(np.float32)
         rays = points.take(asked, axis=1) - origin[:, None]
         length = np.sqrt(dot(rays, rays))
         rays /= length
         nearest, _ = first_hits(world, origin, rays)
         facing = np.abs(dot(rays, normals.take(asked, axis=1))) > MIN_FACING
-        seen[view, asked] = facing & (nearest > length - np.float32(OCCLUSION_GAP))
+        seen[asked] = facing & (nearest > length - np.float32(OCCLUSION_GAP))
     return seen, pixels

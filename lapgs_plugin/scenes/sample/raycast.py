@@ -1,34 +1,33 @@
-"""Pictures of a world: the first hit of each ray, light and shadow, and the average over a pixel."""
+"""Render solids: the first hit of each ray, a lamp with shadows, and the average over a pixel."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.scenes.sample.shapes import Floats, Mask, dot, rotate
-from lapgs_plugin.scenes.sample.textures import linear_rgb
-from lapgs_plugin.scenes.sample.world import PALETTE, World
+from lapgs_plugin.scenes.sample.solids import Floats, Solid, dot, rotate
+from lapgs_plugin.scenes.sample.world import PALETTE
 
-SAMPLES, SKEW = 10, 3
-"""Rays a pixel: a lattice of 10 points, each in a row and a column of its own, the same in every pixel. There is no
-noise, and the error is that of about 13 points of Hammersley's set."""
-
+SAMPLES, SKEW = 8, 3
+"""Rays a pixel, in a lattice with one point in each row and each column, the same in every pixel."""
 BLOCK = 64
-"""Side in pixels of the blocks traced at once: the arrays of one step then stay in a core's cache."""
+"""Side in pixels of the blocks traced at once, whose arrays fit into the cache of a core."""
 
-LAMP: Floats = np.array([2.3, -2.6, 4.6], np.float32)
-LIGHT = linear_rgb("#fff0d8")
-SKY = linear_rgb("#93a3b5")  # ambient light from above
-GROUND = linear_rgb("#6b5f54")  # and from below
-SHININESS = 48
-
+LAMP: Floats = np.array([2.3, -2.6, 4.7], np.float32)
+LIGHT: Floats = np.array([0.92, 0.80, 0.62], np.float32)
+SKY: Floats = np.array([0.34, 0.38, 0.44], np.float32)  # ambient light from above
+GROUND: Floats = np.array([0.20, 0.16, 0.12], np.float32)  # and from below
 SHADOW_GAP = 2e-3
-"""A surface throws no shadow on what is nearer than this, in metres: itself."""
+"""Metres within which a surface casts no shadow: on itself."""
+
+World = Sequence[Solid]
 
 
 def render(world: World, camera: Camera) -> Floats:
-    """The picture a camera takes, (height, width, 3) in [0, 1], sRGB-encoded."""
+    """Return the image of a camera, (height, width, 3) in [0, 1], sRGB-encoded."""
     image = np.empty((camera.height, camera.width, 3), np.float32)
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
@@ -40,56 +39,64 @@ def render(world: World, camera: Camera) -> Floats:
 
 
 def pixel_colors(world: World, camera: Camera, pixels: NDArray[np.float64]) -> Floats:
-    """Average colour (3, n), sRGB-encoded, over the squares of one pixel around image positions (2, n)."""
-    positions = pixels[:, None, :] + _sample_offsets()[:, :, None]  # (2, SAMPLES, n)
+    """Return sRGB colours (3, n), averaged over squares of one pixel around image positions (2, n)."""
+    order = np.arange(SAMPLES)
+    offsets = (np.stack([order, order * SKEW % SAMPLES]) + 0.5) / SAMPLES - 0.5  # (2, SAMPLES), their mean is zero
+    positions = pixels[:, None, :] + offsets[:, :, None]  # (2, SAMPLES, n)
     origin, directions = camera_rays(camera, positions.reshape(2, -1))
-    colors = _radiance(world, origin, directions).reshape(3, SAMPLES, -1).mean(axis=1)
-    return _encode(colors)
+    linear = np.clip(_radiance(world, origin, directions).reshape(3, SAMPLES, -1).mean(axis=1), 0, 1)
+    encoded: Floats = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
+    return encoded
 
 
 def camera_rays(camera: Camera, positions: NDArray[np.float64]) -> tuple[Floats, Floats]:
-    """Centre (3,) of a camera and unit directions (3, n) through image positions (2, n) in pixels, in the world."""
+    """Return a camera's centre (3,) and unit directions (3, n) through image positions (2, n), in the world."""
     pose = camera.world_to_camera.double().numpy()
     plane = np.ones((3, positions.shape[1]), np.float32)
-    plane[0] = (positions[0] - camera.cx) * (1 / camera.fx)
-    plane[1] = (positions[1] - camera.cy) * (1 / camera.fy)
+    plane[0] = (positions[0] - camera.cx) / camera.fx
+    plane[1] = (positions[1] - camera.cy) / camera.fy
     directions = rotate(pose[:3, :3].T.astype(np.float32), plane)
-    directions *= 1 / np.sqrt(dot(plane, plane))
+    directions /= np.sqrt(dot(plane, plane))
     return (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32), directions
 
 
-def first_hits(
-    world: World, origin: Floats, directions: Floats, *, hall: bool = True
-) -> tuple[Floats, NDArray[np.uint8]]:
-    """Distance (n,) and index of the shape (n,) that rays from `origin` (3,) along `directions` (3, n) hit first.
-
-    Without the hall rays can miss everything; their distance is then inf.
-    """
+def first_hits(world: World, origin: Floats, directions: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the distance (n,) and the index (n,) of the solid that each ray hits first; inf and 0 if it hits none."""
     distance = np.full(directions.shape[1], np.inf, np.float32)
-    index = np.zeros(directions.shape[1], np.uint8)
-    for number in (*(world.unbounded if hall else ()), *_near_rays(world, origin, directions)):
-        which, candidate = world.shapes[number].hit(origin, directions)
-        if which.size:
-            closer = np.flatnonzero(candidate < distance.take(which))
-            which = which.take(closer)
-            distance[which] = candidate.take(closer)
-            index[which] = number
+    index = np.zeros(directions.shape[1], np.intp)
+    axis = directions.mean(axis=1)
+    axis /= np.linalg.norm(axis)
+    spread = np.arccos(np.clip(dot(axis, directions).min(), -1, 1))
+    for number, solid in enumerate(world):
+        if solid.room or _meets_cone(solid, origin, axis, spread):
+            candidate = solid.hit(origin, directions)
+            closer = candidate < distance
+            distance[closer], index[closer] = candidate[closer], number
     return distance, index
 
 
-def surfaces(world: World, index: NDArray[np.uint8], points: Floats) -> tuple[Floats, Floats]:
-    """Albedo and normals of either side, (3, n) each, at points (3, n) on the shapes that `index` (n,) names."""
-    codes, normals = np.empty_like(index), np.empty_like(points)
-    for number in np.flatnonzero(np.bincount(index)):
+def _meets_cone(solid: Solid, origin: Floats, axis: Floats, spread: float) -> bool:
+    """Return False for solids that no ray of the cone can hit. Nearly all blocks of an image miss most solids."""
+    points = solid.origin[:, None] + solid.rotation[:, 2:] * np.linspace(-1, 1, 9, dtype=np.float32) * solid.half[2]
+    radius = np.linalg.norm([*solid.half[:2], solid.half[2] / 8])  # balls around nine points cover the solid
+    offsets = points - origin[:, None]
+    away = np.linalg.norm(offsets, axis=0)
+    angle = np.arccos(np.clip(dot(axis, offsets) / np.maximum(away, 1e-9), -1, 1))
+    reach = np.arcsin(np.clip(radius / np.maximum(away, radius), 0, 1)) + 2e-3  # with a margin for rounding
+    return bool(((away <= radius) | (angle <= spread + reach)).any())
+
+
+def surfaces(world: World, index: NDArray[np.intp], points: Floats) -> tuple[Floats, Floats]:
+    """Return albedo and normals, (3, n) each, at points (3, n) on the solids that `index` (n,) names."""
+    codes, normals = np.empty(len(index), np.uint8), np.empty_like(points)
+    for number in np.flatnonzero(np.bincount(index)).tolist():
         here = np.flatnonzero(index == number)
-        codes[here], part = world.shapes[number].surface(points.take(here, axis=1))
-        for axis in range(3):  # row by row: several times faster than [:, here]
-            normals[axis][here] = part[axis]
+        codes[here], normals[:, here] = world[number].surface(points.take(here, axis=1))
     return PALETTE.take(codes, axis=1), normals
 
 
 def _radiance(world: World, origin: Floats, directions: Floats) -> Floats:
-    """Linear RGB (3, n) that arrives along rays."""
+    """Return linear RGB (3, n) that arrives along rays."""
     distance, index = first_hits(world, origin, directions)
     points = origin[:, None] + distance * directions
     albedo, normals = surfaces(world, index, points)
@@ -98,50 +105,11 @@ def _radiance(world: World, origin: Floats, directions: Floats) -> Floats:
     lamp_distance = np.sqrt(dot(to_lamp, to_lamp))
     to_lamp /= lamp_distance
     facing = np.maximum(dot(normals, to_lamp), 0)
-    glows = np.array([shape.glows for shape in world.shapes], np.float32).take(index)
-    facing *= (1 - glows) * _lit(world, to_lamp, lamp_distance, facing > 0)
+    asked = np.flatnonzero(facing)
+    if asked.size:
+        objects = [solid for solid in world if not solid.room]
+        nearest, _ = first_hits(objects, LAMP, -to_lamp.take(asked, axis=1))
+        facing[asked] *= nearest >= lamp_distance.take(asked) - np.float32(SHADOW_GAP)
     upness = (normals[2] + 1) / 2
-    ambient = SKY[:, None] * upness + GROUND[:, None] * (1 - upness)
-    ambient += (1 - ambient) * glows
-    light: Floats = albedo * (ambient + LIGHT[:, None] * facing)
-    gloss = np.array([shape.gloss for shape in world.shapes], np.float32).take(index) * (facing > 0)
-    shiny = np.flatnonzero(gloss)
-    half = to_lamp.take(shiny, axis=1) - directions.take(shiny, axis=1)
-    cosine = np.maximum(dot(normals.take(shiny, axis=1), half) / np.sqrt(dot(half, half)), 0)
-    light[:, shiny] += LIGHT[:, None] * (gloss.take(shiny) * cosine**SHININESS)
-    return light
-
-
-def _lit(world: World, to_lamp: Floats, lamp_distance: Floats, asked: Mask) -> Floats:
-    """1 where the lamp sees the point, else 0, (n,); points that are not asked about count as lit."""
-    lit = np.ones_like(lamp_distance)
-    which = np.flatnonzero(asked)
-    if which.size:
-        nearest, _ = first_hits(world, LAMP, -to_lamp.take(which, axis=1), hall=False)
-        lit[which] = nearest >= lamp_distance.take(which) - np.float32(SHADOW_GAP)
-    return lit
-
-
-def _near_rays(world: World, origin: Floats, directions: Floats) -> NDArray[np.intp]:
-    """Indices of the bounded shapes that a ball of meets the cone around all rays."""
-    axis = directions.mean(axis=1)
-    axis /= np.linalg.norm(axis)
-    spread = np.arccos(np.clip(dot(axis, directions).min(), -1, 1))
-    centres, radii, owners = world.balls
-    offsets = centres - origin[:, None]
-    away = np.maximum(np.sqrt(dot(offsets, offsets)), 1e-9)
-    angle = np.arccos(np.clip(dot(axis, offsets) / away, -1, 1))
-    reach = np.arcsin(np.minimum(radii / away, 1)) + 2e-3  # a margin against rounding
-    return np.unique(owners[(radii >= away) | (angle <= spread + reach)])
-
-
-def _sample_offsets() -> NDArray[np.float64]:
-    """Positions of the rays relative to the pixel's centre, (2, SAMPLES); their mean is zero."""
-    order = np.arange(SAMPLES)
-    return (np.stack([order, order * SKEW % SAMPLES]) + 0.5) / SAMPLES - 0.5
-
-
-def _encode(linear: Floats) -> Floats:
-    """sRGB in [0, 1] from linear light."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))
+    light: Floats = GROUND[:, None] * (1 - upness) + SKY[:, None] * upness + LIGHT[:, None] * facing
+    return albedo * light

@@ -1,34 +1,30 @@
-"""Writing the sample scene as a COLMAP folder: images, exact poses, noisy sparse points with their tracks."""
+"""Write the sample scene as a COLMAP folder: images, exact poses, noisy sparse points with tracks."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import torch
-from numpy.typing import NDArray
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.output import fresh_scene, write_model
+from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.sample.cameras import orbit_camera
 from lapgs_plugin.scenes.sample.points import SparsePoints, sample_points
-from lapgs_plugin.scenes.sample.raycast import render
-from lapgs_plugin.scenes.sample.world import World, build_world
+from lapgs_plugin.scenes.sample.raycast import World, render
+from lapgs_plugin.scenes.sample.world import build_world
 
 MIN_SIDE = 16
 MAX_SIDE = 8192
-MAX_VIEWS = 9999  # names have four digits, so that their order is that of the views
+MAX_VIEWS = 9999  # names of four digits sort as numbers
 MAX_POINTS = 1_000_000
-"""Rendering and sampling hold arrays of all pixels of an image and of all points."""
 
 
 def make_sample_scene(
@@ -42,19 +38,19 @@ def make_sample_scene(
     overwrite: bool = False,
     progress: bool = True,
 ) -> None:
-    """Write a still life of test patterns in a round library as a COLMAP scene.
+    """Write a still life of test patterns in a round hall as a COLMAP scene.
 
-    images/0000.png ... and sparse/0/ with one PINHOLE camera, exact poses, and sparse points. Lengths are metres, z is
-    up. The same arguments give the same bytes on the same machine. View i is the same picture whatever `views` is.
+    The folder holds images/0000.png ... and sparse/0/ with one PINHOLE camera. Lengths are metres, z is up. The same
+    arguments give the same bytes on the same machine. Image i does not depend on `views`.
 
     Args:
-        out: the scene folder; new, empty, or with `overwrite` one that holds a scene. It appears when it is complete.
+        out: the scene folder; new, empty, or with `overwrite` a scene. It appears when it is complete.
         width, height: image size in pixels, 16 to 8192.
         views: number of images, 2 to 9999.
-        points: number of sparse points, 1 to 1,000,000. Each lies on a surface that at least two views see, off by
-            noise of 6 mm a coordinate; their tracks hold the exact image positions.
-        seed: chooses colours, patterns and cameras.
-        overwrite: replace the scene that `out` holds.
+        points: number of sparse points, 1 to 1,000,000. At least two views see each. Coordinates have noise of
+            `points.NOISE`; tracks hold the exact image positions.
+        seed: chooses patterns and cameras.
+        overwrite: replace the scene in `out`.
         progress: show a bar on stderr.
 
     Raises:
@@ -70,10 +66,10 @@ def make_sample_scene(
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height from "480x320".
+    """Return width and height from text such as "480x320".
 
     Raises:
-        UserInputError: the text is of another form.
+        UserInputError: the text has another form.
     """
     match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", text.strip())
     if match is None:
@@ -82,26 +78,22 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def check_sample_scene(width: int, height: int, views: int, points: int, seed: int = 0) -> None:
-    """Refuse what `make_sample_scene` cannot make.
+    """Check the arguments of `make_sample_scene`.
 
     Raises:
         UserInputError: an argument is out of range.
     """
-    _check("--size", f"{width}x{height}", min(width, height) >= MIN_SIDE, f"at least {MIN_SIDE}x{MIN_SIDE}")
-    _check("--size", f"{width}x{height}", max(width, height) <= MAX_SIDE, f"at most {MAX_SIDE}x{MAX_SIDE}")
-    _check("--views", views, 2 <= views <= MAX_VIEWS, f"2 to {MAX_VIEWS}")
-    _check("--points", points, points >= 1, "at least 1")
-    _check("--points", points, points <= MAX_POINTS, f"at most {MAX_POINTS}")
-    _check("--seed", seed, seed >= 0, "0 or more")
-
-
-def _check(option: str, value: object, valid: bool, expected: str) -> None:
-    if not valid:
-        raise UserInputError(f"{option} {value}: expected {expected}")
-
-
-def _name(view: int) -> str:
-    return f"{view:04d}.png"
+    sizes = min(width, height) >= MIN_SIDE, max(width, height) <= MAX_SIDE
+    for option, value, valid, expected in (
+        ("--size", f"{width}x{height}", sizes[0], f"at least {MIN_SIDE}x{MIN_SIDE}"),
+        ("--size", f"{width}x{height}", sizes[1], f"at most {MAX_SIDE}x{MAX_SIDE}"),
+        ("--views", views, 2 <= views <= MAX_VIEWS, f"2 to {MAX_VIEWS}"),
+        ("--points", points, points >= 1, "at least 1"),
+        ("--points", points, points <= MAX_POINTS, f"at most {MAX_POINTS}"),
+        ("--seed", seed, seed >= 0, "0 or more"),
+    ):
+        if not valid:
+            raise UserInputError(f"{option} {value}: expected {expected}")
 
 
 def _write_images(folder: Path, world: World, cameras: Sequence[Camera], progress: bool) -> None:
@@ -109,46 +101,28 @@ def _write_images(folder: Path, world: World, cameras: Sequence[Camera], progres
 
     def write(view: int) -> None:
         image = torch.from_numpy(render(world, cameras[view]))  # (h, w, 3)
-        write_image(folder / _name(view), image.permute(2, 0, 1))
+        write_image(folder / f"{view:04d}.png", image.permute(2, 0, 1))
 
-    bar = item_progress("images") if progress else None
-    task = bar.add_task("Rendering images", total=len(cameras)) if bar else None
-    # One thread an image: each worker's own pool inside torch would only compete with the others.
-    pool = ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
-        try:
-            for future in as_completed([pool.submit(write, view) for view in range(len(cameras))]):
-                future.result()
-                if bar and task is not None:
-                    bar.advance(task)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = os.cpu_count() or 1
+    in_threads("Rendering images", "images", write, range(len(cameras)), threads=threads, progress=progress)
 
 
 def _write_model(folder: Path, cameras: Sequence[Camera], points: SparsePoints) -> None:
     model = pycolmap.Reconstruction()
     first = cameras[0]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=1,
-            model="PINHOLE",
-            width=first.width,
-            height=first.height,
-            params=[first.fx, first.fy, first.cx, first.cy],
-        )
-    )
-    tracks = [pycolmap.Track() for _ in points.observations]
-    positions: list[list[NDArray[np.float64]]] = [[] for _ in cameras]
-    for track, (views, pixels) in zip(tracks, points.observations, strict=True):
-        for view, pixel in zip(views, pixels, strict=True):
-            track.add_element(int(view) + 1, len(positions[view]))
-            positions[view].append(pixel)
+    size, params = (first.width, first.height), [first.fx, first.fy, first.cx, first.cy]
+    lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=size[0], height=size[1], params=params)
+    model.add_camera_with_trivial_rig(lens)
+    tracks = [pycolmap.Track() for _ in points.positions]
     for view, camera in enumerate(cameras):
-        pose = pycolmap.Rigid3d(camera.world_to_camera[:3].numpy())
-        observed = [pycolmap.Point2D(pixel) for pixel in positions[view]]
-        image = pycolmap.Image(name=_name(view), points2D=observed, camera_id=1, image_id=view + 1)
-        model.add_image_with_trivial_frame(image, pose)
-    for position, color, track in zip(points.positions, points.colors, tracks, strict=True):
+        observed = np.flatnonzero(points.seen[:, view])
+        for index, point in enumerate(observed):
+            tracks[point].add_element(view + 1, index)
+        pixels = [pycolmap.Point2D(pixel) for pixel in points.pixels[observed, view]]
+        image = pycolmap.Image(name=f"{view:04d}.png", points2D=pixels, camera_id=1, image_id=view + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3].numpy()))
+    colors = np.round(points.colors * 255).astype(np.uint8)
+    for position, color, track in zip(points.positions, colors, tracks, strict=True):
         model.add_point3D(position, track, color)
     model.update_point_3d_errors()
     write_model(model, folder)
