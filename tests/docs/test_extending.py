@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 import lapgs_plugin
+from lapgs_plugin.adapters.base import FAMILY_FILES
+from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
@@ -56,7 +58,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
         del sys.modules[name]
 
 
-REGISTRIES = (SUPERVISIONS,)
+REGISTRIES = (SUPERVISIONS, BACKBONES)
 
 
 def context(signed: bool) -> StageContext:
@@ -91,6 +93,15 @@ def test_the_supervision_is_chosen_by_its_name() -> None:
     assert prediction.tolist() == [[[0.0, 0.5, 1.0]]]
     assert target.tolist() == [[[1.0, 1.0, 1.0]]]
     assert settings.joint_from(Stage(0, (8, 6), 100, signed=True)) == 76  # it composes
+
+
+def test_the_backbone_recognises_its_checkout(installed: Path) -> None:
+    for name in (*FAMILY_FILES, "utils/tiny_utils.py"):
+        (installed / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
+        (installed / "checkout" / name).touch()
+    adapter = adapter_class(installed / "checkout")
+    assert adapter is adapter_class(installed, "tiny")
+    assert adapter.info.title == "TinyGS"
 
 
 def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:
