@@ -24,6 +24,8 @@ OF_OTHERS = {
     "--highfeature_lr", "--ho_iteration", "--mult", "--opacity_reset_interval", "--optimizer_type",
     "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
     "--test_iterations",
+    # of the extension in docs/extending.md
+    "--duplicates",
     # of gsplat's trainer, pip and mkdocs
     "--data_dir", "--data_factor", "--disable_video", "--max_steps", "--index-url", "--no-build-isolation",
 }  # fmt: skip

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+import importlib
+import os
 import re
+import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +19,7 @@ import torch
 from torch import Tensor
 
 import lapgs_plugin
-from lapgs_plugin.adapters.base import FAMILY_FILES
+from lapgs_plugin import ops
 from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
@@ -21,6 +27,8 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import HookDispatcher, StageContext, entry_point_hooks
 from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
+from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.training.strategies import STRATEGIES
 from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
 
@@ -58,7 +66,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
         del sys.modules[name]
 
 
-REGISTRIES = (SUPERVISIONS, BACKBONES)
+REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES)
 
 
 def context(signed: bool) -> StageContext:
@@ -95,13 +103,79 @@ def test_the_supervision_is_chosen_by_its_name() -> None:
     assert settings.joint_from(Stage(0, (8, 6), 100, signed=True)) == 76  # it composes
 
 
-def test_the_backbone_recognises_its_checkout(installed: Path) -> None:
-    for name in (*FAMILY_FILES, "utils/tiny_utils.py"):
-        (installed / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
-        (installed / "checkout" / name).touch()
-    adapter = adapter_class(installed / "checkout")
-    assert adapter is adapter_class(installed, "tiny")
-    assert adapter.info.title == "TinyGS"
+def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path) -> None:
+    checkout = tmp_path / "checkout"
+    shutil.copytree(ROOT / "tests/contract/checkouts/graphdeco", checkout)
+    assert adapter_class(checkout).info.name == "graphdeco"
+    (checkout / "utils/my_scores.py").touch()
+    adapter = adapter_class(checkout)
+    assert (adapter.info.name, adapter) == ("my_fork", adapter_class(checkout, "my_fork"))
+    assert "my_threshold" in adapter.info.densify_thresholds
+    original = SimpleNamespace(image_width=80, blur=4.0, alpha_mask=None, invdepthmap=None)
+    view = copy.copy(original)
+    script: Any = SimpleNamespace(module=SimpleNamespace(SPARSE_ADAM_AVAILABLE=False))
+    adapter(script).level_view(view, original, (40, 30), signed=False)
+    assert (view.blur, original.blur) == (2.0, 4.0)
+
+
+def test_the_strategy_trains_with_its_option(installed: Path, tmp_path: Path) -> None:
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    make_sample_scene(scene, width=64, height=48, views=6, points=300, progress=False)
+    words = (
+        "--iterations",
+        "40",
+        "--levels",
+        "1",
+        "--densify-every",
+        "10",
+        "--strategy",
+        "opaque",
+        "--duplicates",
+        "7",
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, *words],
+        env={**os.environ, "PYTHONPATH": str(installed)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    added = lapgs_plugin.RunArchive.open(run).manifest.record(0).num_gaussians - 300
+    assert added > 0
+    assert added % 7 == 0
+
+
+@pytest.fixture
+def tone(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The page's operation, as if its folder were in the package."""
+    monkeypatch.setattr(ops, "__path__", [*ops.__path__, str(installed / "lapgs_plugin/ops")])
+    yield importlib.import_module("lapgs_plugin.ops.tone")
+    for name in [name for name in sys.modules if name.startswith("lapgs_plugin.ops.tone")]:
+        del sys.modules[name]
+
+
+def test_the_operation_is_pytorchs_on_a_cpu(tone: Any) -> None:
+    assert tone.tone(torch.tensor([0.0, 1.0]), 2.0, 0.5).tolist() == [0.5, 2.5]
+    assert not tone.triton_works(torch.zeros(1))
+    assert not tone.triton_works.passes_on(torch.device("cpu"))  # no Triton, or none for CPUs
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_operation_is_one_kernel_on_a_gpu(tone: Any) -> None:
+    image = torch.rand(3, 50, 70, device="cuda")
+    assert tone.triton_works(image)
+    torch.testing.assert_close(tone.tone(image, 2.0, 0.5), image * 2 + 0.5, rtol=0, atol=1e-6)
+
+
+def test_no_file_on_the_page_is_without_a_test() -> None:
+    package = {
+        "pyproject.toml",
+        *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy")),
+    }
+    operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
+    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml", "render_a_run.py"}
 
 
 def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:

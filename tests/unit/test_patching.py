@@ -877,11 +877,6 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = "#include <f>"',
-            "edit[0].unless is '#include <f>', expected a valid array",
-        ),
-        (
-            'name = "new"\ntitle = "New"\npresent = []\n'
-            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = ["<f>"]',
             "expected a list of directives that start with #",
         ),
         (
