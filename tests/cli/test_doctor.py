@@ -86,7 +86,7 @@ def test_what_training_will_use(
 
 def test_the_current_folder_is_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
     for folder, message in (
-        ("fastgs", "a checkout of FastGS; `lapgs run train.py ...` trains it on the"),
+        ("fastgs", "a checkout of FastGS or a fork of it; `lapgs run train.py ...` trains it on the"),
         ("", "not a"),
     ):
         monkeypatch.chdir(CHECKOUTS / folder)

@@ -99,8 +99,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("runs") / "run", scene)
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a scene of its own: its records are of that scene's size."""
+    folder = tmp_path_factory.mktemp("runs")
+    return write_run(folder / "run", write_scene(folder / "scene"))
 
 
 def commands(scene: Path, run: Path, out: Path) -> dict[str, list[object]]:
@@ -109,7 +111,7 @@ def commands(scene: Path, run: Path, out: Path) -> dict[str, list[object]]:
         "sample": ["sample", out / "sample", "--views", 200],
         "train": ["train", scene, "-o", out / "run", "--iterations", 4000],
         "eval": ["eval", run],
-        "render": ["render", run, "--out", out / "pictures", "--trajectory", "orbit", "--frames", 3000],
+        "render": ["render", run, "--out", out / "pictures", "--trajectory", "orbit", "--frames", 50_000],
         "view": ["view", run],
         "export": ["export", run, "--out", out / "export"],
         "report": ["report", run],

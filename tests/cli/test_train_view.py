@@ -69,7 +69,7 @@ def test_a_foreign_page_is_refused(command: str, scene: Path, tmp_path: Path, mo
 def test_mistakes_come_before_the_run_folder(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserInputError, match="--view-port 8123 needs --view"):
         lapgs("train", scene, "-o", tmp_path / "run", "--view-port", 8123)
-    with pytest.raises(UserInputError, match="--view with --off"):
+    with pytest.raises(UserInputError, match="--view has no effect with --off"):
         lapgs("run", "--off", "--view", "--device", "cpu", STUBS["graphdeco"].script)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"--view needs viser.*lapgs_plugin\[viewer\]"):

@@ -435,7 +435,7 @@ def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) ->
 def test_cuda_that_is_not_there(lapgs_run: Any, scene: Path) -> None:
     code, lines = lapgs_run("--device", "cuda", STUBS["taming"].script, "-s", scene)
     assert code == 2
-    assert lines[-1].startswith("lapgs: --device cuda: PyTorch sees no CUDA device")
+    assert lines[-1].startswith("lapgs: --device cuda: PyTorch finds no CUDA device")
 
 
 def test_nothing_is_left_of_a_refused_run(scene: Path, tmp_path: Path) -> None:

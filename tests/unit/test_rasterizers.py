@@ -119,10 +119,10 @@ def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: d
     ("device", "rasterizer", "message"),
     [
         ("gpu", "auto", "--device gpu: expected auto, cuda, cpu"),
-        ("cuda", "auto", "--device cuda: PyTorch sees no CUDA device"),
+        ("cuda", "auto", "--device cuda: PyTorch finds no CUDA device"),
         ("auto", "my_own", "--rasterizer my_own: expected auto, cpu, oracle, gsplat, diff_gaussian"),
         ("cpu", "gsplat", "--rasterizer gsplat --device cpu: it runs on CUDA only"),
-        ("auto", "gsplat", "--rasterizer gsplat: PyTorch sees no CUDA device"),
+        ("auto", "gsplat", "--rasterizer gsplat: PyTorch finds no CUDA device"),
     ],
 )
 def test_what_cannot_be_had_is_refused_in_one_line(device: str, rasterizer: str, message: str) -> None:

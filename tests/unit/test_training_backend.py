@@ -78,7 +78,7 @@ def test_gsplat_trains_if_there_is_a_gpu_and_nothing_falls_back_silently(monkeyp
             choose_rasterizer("auto")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
     assert choose_rasterizer("auto") == "cpu", "the GPU was hidden on purpose"
-    with pytest.raises(MissingExtraError, match="PyTorch sees no CUDA device"):
+    with pytest.raises(MissingExtraError, match="PyTorch finds no CUDA device"):
         training_rasterizer("gsplat", SETTINGS)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "there is no nvcc")

@@ -48,7 +48,7 @@ SEMANTICS = Semantics(
 def missing() -> str:
     """Return why gsplat cannot render on this machine, as a clause; empty if it can. Imports and compiles nothing."""
     if not torch.cuda.is_available():
-        return "PyTorch sees no CUDA device"
+        return "PyTorch finds no CUDA device"
     built = gsplat_built()
     if built is None:
         return "gsplat is not installed"
