@@ -59,7 +59,9 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
     if device not in DEVICES:
         raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
     if device == "cuda" and not torch.cuda.is_available():
-        raise UserInputError("--device cuda: PyTorch finds no CUDA device; `lapgs doctor` says why, or use --device cpu")
+        raise UserInputError(
+            "--device cuda: PyTorch finds no CUDA device; `lapgs doctor` says why, or use --device cpu"
+        )
     settings = _raster_settings(manifest)
     if rasterizer == "auto":
         placed, why = _most_similar(manifest.rasterizer, device, settings)

@@ -192,5 +192,6 @@ def test_a_dry_run_prints_commands_and_writes_nothing(experiment: Path) -> None:
 
 
 def test_subcommands_are_still_found() -> None:
-    assert "Measure training iterations of the CPU rasterizer" in CliRunner().invoke(bench_app, ["raster", "--help"]).output
+    help_of_raster = CliRunner().invoke(bench_app, ["raster", "--help"]).output
+    assert "Measure training iterations of the CPU rasterizer" in help_of_raster
     assert "EXPERIMENT" in CliRunner().invoke(bench_app, ["--help"]).output
