@@ -54,7 +54,7 @@ def train(
 
         lapgs train data/garden -o runs/plain --levels 1       (baseline: one field)
 
-        lapgs train data/garden -o runs/bands --hierarchy laplacian       (the paper's method: base and residual)
+        lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
 
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
     """

@@ -95,7 +95,7 @@ def inherit(
         if degree != field.sh_degree:
             raise UserInputError(
                 f"full inheritance of a field of SH degree {field.sh_degree} cannot give degree {degree}; "
-                "keep the degree or inherit xyz"
+                "keep the degree, or inherit geometry or xyz"
             )
         return Inherited(GaussianField(**rows, signed=True), kept)
     sh = torch.zeros(len(kept), (degree + 1) ** 2, 3, dtype=field.means.dtype, device=field.means.device)

@@ -71,7 +71,7 @@ class Stage:
     Attributes:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
         image_size: (width, height) in pixels of this level for an image of the plan's size.
-        iterations: optimizer steps of this stage, at least 1.
+        iterations: iterations of this stage, the views that it trains on; at least 1.
         signed: True for a residual (raw SH value, zero background), False for the base and for nested levels.
     """
 

@@ -162,7 +162,7 @@ class Densifier(DensityControl):
 
 
 class McmcDensifier(DensityControl):
-    """Let gsplat's `MCMCStrategy` (Kheradmand et al. 2024) edit the field, which runs on a GPU only.
+    """Edit the field with gsplat's `MCMCStrategy` (Kheradmand et al. 2024), which runs on a GPU only.
 
     Gaussians that have become transparent are moved to opaque ones, 5 % are added at a time up to `cap_max`, and
     positions get noise in every iteration. Opacities are never reset.

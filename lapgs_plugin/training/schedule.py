@@ -17,7 +17,7 @@ LEAST_STEPS = 40
 PIXELS_OF_A_STEP = 1 << 22
 """Most pixels of all views of one step where the number of views is left to the program."""
 STEPS_OF_A_STAGE = 900
-"""Fewest steps of a stage where it is: a short stage steps for fewer views."""
+"""Fewest steps of a stage where the program chooses the number of views; a short stage takes fewer views a step."""
 PIXELS_OF_A_LAUNCH = 1 << 22
 """Pixels of views that are rendered together. More of them would take memory and save no time."""
 

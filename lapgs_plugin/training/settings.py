@@ -24,8 +24,8 @@ else:  # pydantic cannot read the older TypedDict of `typing`
 if TYPE_CHECKING:
     from lapgs_plugin.runs.manifest import Manifest
 
-VIEWS_OF_RATE, MOST_RATE = 32, 8.0
-"""The rate of SH above degree 0 is multiplied by the number of training views over the first, from 1 to the second: few
+SH_RATE_VIEWS, MOST_SH_RATE = 32, 8.0
+"""The rate of SH above degree 0 is multiplied by (training views / SH_RATE_VIEWS), clamped to 1 ... MOST_SH_RATE: few
 views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
@@ -164,7 +164,7 @@ class TrainSettings(HierarchySettings):
         None,
         "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
         "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
-        f"to {VIEWS_OF_RATE} to {MOST_RATE:g}.",
+        f"to {SH_RATE_VIEWS} to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
@@ -257,7 +257,7 @@ class TrainSettings(HierarchySettings):
             return 1.0  # `residual_color_rate` is a factor on these, too
         if self.sh_rate_factor is not None:
             return self.sh_rate_factor
-        return min(MOST_RATE, max(1.0, training_views / VIEWS_OF_RATE))
+        return min(MOST_SH_RATE, max(1.0, training_views / SH_RATE_VIEWS))
 
     @property
     def paper_settings(self) -> Mapping[str, object]:

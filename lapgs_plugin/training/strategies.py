@@ -122,7 +122,7 @@ class Multiview(Default):
         names=("--split-threshold",),
     )
     error_threshold: float = option(
-        0.1, "Share of a view's largest error above which a pixel counts, for --strategy multiview.", panel=PANEL
+        0.1, "Share of the range of a view's errors above which a pixel counts, for --strategy multiview.", panel=PANEL
     )
     error_pixels: float = option(
         0.1,
@@ -140,8 +140,8 @@ class Multiview(Default):
         require_positive("--error-pixels", self.error_pixels, "number")
         if not 0.0 <= self.error_threshold < 1.0:
             raise UserInputError(
-                f"--error-threshold {self.error_threshold}: expected a share of a view's largest error from 0 to "
-                "below 1, such as 0.1"
+                f"--error-threshold {self.error_threshold}: expected a share of the range of a view's errors "
+                "from 0 to below 1, such as 0.1"
             )
         if self.absgrad:
             raise UserInputError("--absgrad with --strategy multiview: it splits by absolute gradients anyway")

@@ -152,4 +152,4 @@ VARIANTS = {
         sparse_adam=True,
     ),
 }
-"""By the names that patches go by."""
+"""By name, as `BackboneInfo.stand_in` gives it; most are also names of recipes in patches/."""
