@@ -32,9 +32,9 @@ from torch import Tensor
 
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
 from lapgs_plugin.files import one_line_errors
-from lapgs_plugin.hierarchy.settings import AUTO, PLACES
+from lapgs_plugin.hierarchy.settings import AUTO, PLACES, PRECISIONS
 
-PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "uint8": torch.uint8}
+DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISIONS}
 
 GPU_LIMIT = 1 << 30
 """Most bytes of a stage's images that `place` keeps on a GPU of any size."""
@@ -130,7 +130,7 @@ class ImageStore:
         self.check(where, precision, device)
         assert where != "disk" or folder is not None, "a store on disk needs a folder"
         self._where = where
-        self._dtype = PRECISIONS[precision]
+        self._dtype = DTYPES[precision]
         self._device = torch.device(device)
         self._folder = folder if where == "disk" else None
         self._images: dict[str, _Image] = {}

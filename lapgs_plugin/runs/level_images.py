@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.runs.image_store import PRECISIONS, ImageStore, place
+from lapgs_plugin.runs.image_store import DTYPES, ImageStore, place
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 
@@ -42,7 +42,7 @@ class ImageStores:
     def num_bytes(self, level: int, precision: str) -> int:
         """Return the bytes of the images of all views at a level."""
         pixels = sum(math.prod(level_size(size, level)) for size in self.sizes)
-        return 3 * pixels * PRECISIONS[precision].itemsize
+        return 3 * pixels * DTYPES[precision].itemsize
 
     def make(self, level: int, precision: str, name: str, beside: int = 0) -> ImageStore:
         """Return an empty store for images of a level; `beside` are bytes of others that are needed with them."""
