@@ -70,3 +70,6 @@ VIEW_PIXELS = Limit("LAPGS_MAX_VIEW_PIXELS", 128_000_000, "pixels")
 
 FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
 """Of a camera path; an hour of video at 24 frames a second has 86,400."""
+
+LONGEST_NAME = 255
+"""Longest file name in bytes on common file systems."""

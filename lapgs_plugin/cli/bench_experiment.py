@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, TrainingStoppedError, UserInputError
+from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,9 +31,6 @@ SET_BY_EXPERIMENTS = {
     *("script", "arguments", "off", "record", "view", "view_port"),
 }
 """Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own."""
-
-LONGEST_NAME = 255
-"""Bytes that file systems allow in a file name."""
 
 
 class RunsFailedError(LapgsError):

@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
-from lapgs_plugin.limits import PHOTO_PIXELS, PHOTO_SIDE
+from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 from lapgs_plugin.scenes.source import is_file
 
 JPEG_QUALITY = 95
@@ -29,8 +29,6 @@ PNG_LEVEL = 4
 """Faster than zlib's default of 6, for slightly larger files."""
 Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own limit is below that of phones
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-LONGEST_NAME = 255
-"""Longest file name in bytes on common file systems."""
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
