@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,6 +83,7 @@ def run(
 
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script, require_script
+    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_rasterizer import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
@@ -100,19 +101,21 @@ def run(
             "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
-    checkout, words = require_script(script).parent, arguments or []
-    watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
+    path, words = require_script(script), arguments or []
+    watcher = context.with_resource(watching(view, view_port, path.parent.name, chosen))
     plain = off and not record
-    # On a GPU a script that runs as it is needs no adapter.
-    recognised = not plain or chosen == "cpu" or backbone is not None
-    kind: type[BackboneAdapter] | None = adapter_class(checkout, backbone) if recognised else None
+    # On a GPU a script that runs as it is may be any script.
+    source = CheckoutSource.read(path) if not plain or chosen == "cpu" or backbone is not None else None
+    kind: type[BackboneAdapter] | None = adapter_class(source.root, backbone) if source is not None else None
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
-    on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if kind and chosen == "cpu" else nullcontext()
+    on_device: AbstractContextManager[None] = nullcontext()
+    if chosen == "cpu" and source is not None and kind is not None:
+        on_device = cuda_on_cpu(kind.stand_in_for(source.root, words))
     try:
         with on_device, loaded_script(script, words) as loaded:
             if kind is None or plain:
