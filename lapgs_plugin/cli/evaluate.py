@@ -180,10 +180,11 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
+    where = " inside their masks (LPIPS: the photo outside)" if metrics["masked"] else ""
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
-        f"{metrics['num_views']} {kind} views; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
+        f"{metrics['num_views']} {kind} views{where}; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
         highlight=False,
     )

@@ -62,6 +62,7 @@ class SceneReference:
         background: RGB in [0, 1] behind the base field.
         kind: "colmap" or "transforms".
         images: name of the image folder in a COLMAP scene.
+        masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -72,6 +73,7 @@ class SceneReference:
     background: tuple[Share, Share, Share]
     kind: Name
     images: PathText = "images"
+    masks: PathText = "none"
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, render_image
+from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
@@ -314,6 +315,7 @@ class StageRun:
             target=target,
             accumulated=self._prediction(names),
             coarse_target=coarse_target,
+            weight=self.images.get_weights(names),
         )
         if not several or self.hooks.takes_batches:
             return [context]
@@ -329,6 +331,7 @@ class StageRun:
                 target=target[index],
                 accumulated=of(context.accumulated, index),
                 coarse_target=of(coarse_target, index),
+                weight=of(context.weight, index),
             )
             for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
         ]
@@ -397,7 +400,9 @@ class StageRun:
                 image = render_image(self.rasterizer, field, view.camera, self.background, degree)
                 below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
                 self.breakdown.mark("densification")
-                whole = image if below is None else image + below
+                whole = fill_outside(
+                    image if below is None else image + below, target, self.images.get_weights([view.name])
+                )
                 loss = photometric_loss(whole, target, self.settings.ssim_weight)
             return ScoredView(
                 render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss

@@ -358,9 +358,12 @@ class Trainer:
         eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
         with_coarse = self._supervision.needs_coarse and stage.level < self.plan.levels - 1
         stores = self._stores(views, eight_bit=eight_bit)
-        images = LevelImages(stores, stage.level, self._pyramid, with_coarse=with_coarse, exact=not on_gpu)
+        masked = any(view.mask is not None for view in views)
+        images = LevelImages(
+            stores, stage.level, self._pyramid, with_coarse=with_coarse, masked=masked, exact=not on_gpu
+        )
         for view in views:
-            images.put(view.name, view.image)
+            images.put(view.name, view.image, view.mask)
         return images
 
     def _out_of_memory(self) -> DeviceMemoryError:
@@ -435,7 +438,8 @@ class Trainer:
                 predict = cached if run.joint is None else run.joint.predict
                 image = add_prediction(image, None if predict is None else predict(view.name))
                 whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
-                values.append(psnr(whole, view.image.to(self.device)))
+                mask = None if view.mask is None else view.mask.to(self.device)
+                values.append(psnr(whole, view.image.to(self.device), mask))
             return math.fsum(values) / len(values)
 
     def _save_checkpoint(self, run: StageRun) -> None:
