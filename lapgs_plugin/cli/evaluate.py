@@ -191,6 +191,8 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]
         console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)
+    if (busy := metrics["gpu_busy_seconds"]) is not None:
+        console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
     for name, reason in metrics["lpips_missing"].items():
         console.print(f"LPIPS {name} was not measured: {reason}", highlight=False, markup=False)

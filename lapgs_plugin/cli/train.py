@@ -61,9 +61,10 @@ def train(
     from rich.console import Console
     from rich.markup import escape
 
+    from lapgs_plugin.runs.gpu_busy import require_cuda
     from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.scenes.masks import resolve_masks
-    from lapgs_plugin.training.backend import choose_rasterizer
+    from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other; give one of them")
@@ -78,6 +79,8 @@ def train(
         context.obj.train(settings, reference, control.rasterizer)
         return
     reference = replace(reference, masks=resolve_masks(scene, photos.masks))
+    if control.gpu_busy:
+        require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
@@ -238,6 +241,7 @@ def _run(
             checkpoint_every=control.checkpoint_every,
             test_every=control.test_every,
             breakdown=control.breakdown,
+            gpu_busy=control.gpu_busy,
             watcher=watcher,
         )
         trainer.run(resume)

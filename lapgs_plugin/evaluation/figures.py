@@ -28,7 +28,8 @@ from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
     *("psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
-    *("train_seconds", "overhead_seconds", "breakdown_seconds", "num_gaussians", "weighted_gaussians"),
+    *("train_seconds", "overhead_seconds", "breakdown_seconds", "gpu_busy_seconds"),
+    *("num_gaussians", "weighted_gaussians"),
     *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
     *("rasterizer", "versions"),
 }
@@ -176,7 +177,7 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         split, num_views: the measured views, "test" or "train", and their number.
         train_seconds and other figures of training: see `training_figures`.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
-            num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, memory_bytes.
+            num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, gpu_busy_seconds, memory_bytes.
         views: name, psnr, ssim and lpips_<variant> of each view, in the scene's order.
         rasterizer, versions: the rasterizer and the versions of packages that rendered the views.
     """
@@ -206,6 +207,7 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
         "mean_gaussians": record.mean_gaussians,
         "peak_gaussians": record.peak_gaussians,
         "breakdown_seconds": record.breakdown_seconds,
+        "gpu_busy_seconds": record.gpu_busy_seconds,
         "memory_bytes": record.memory_bytes,
     }
 

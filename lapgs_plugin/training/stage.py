@@ -23,6 +23,7 @@ from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
@@ -102,6 +103,7 @@ class StageRun:
         unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: finished fields while they are trained jointly; None before.
         breakdown: measures the parts of iterations.
+        busy: measures the work of the GPU.
         say: shows a line to the user.
         step_views: number of views of the last step.
 
@@ -124,6 +126,7 @@ class StageRun:
     unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
+    busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
     say: Callable[[str], None] = print
     step_views: int = 1
@@ -140,6 +143,7 @@ class StageRun:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
         while self.progress.iteration < self.stage.iterations:
+            self._profile()
             start = time.perf_counter()
             self.breakdown.mark("other")
             self.step_views = self.schedule.views_of_step(self.progress.iteration)
@@ -150,6 +154,13 @@ class StageRun:
             if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
+        self._profile()
+
+    def _profile(self) -> None:
+        """Start or end a profile if it is due, outside the timed region."""
+        if self.busy.due(self.progress.iteration):
+            self.settle()
+            self.busy.step(self.progress.iteration)
 
     def settle(self) -> None:
         """Wait for a GPU to finish its iterations, as part of the training time, and read their losses.

@@ -31,6 +31,7 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
+from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.manifest import LevelRecord
@@ -130,6 +131,7 @@ class Trainer:
             user stops a run.
         test_every: iterations between two measurements of held-out PSNR; None measures it at the end of each stage.
         breakdown: measure the parts of iterations.
+        gpu_busy: profile some iterations of each stage; needs a CUDA device.
         watcher: looks at the fields between iterations.
     """
 
@@ -143,6 +145,7 @@ class Trainer:
     checkpoint_every: int | None = None
     test_every: int | None = None
     breakdown: bool = False
+    gpu_busy: bool = False
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
@@ -150,6 +153,8 @@ class Trainer:
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)
+        if self.gpu_busy:
+            require_cuda(self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
@@ -298,6 +303,7 @@ class Trainer:
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
+            busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
         )
 
@@ -462,6 +468,7 @@ class Trainer:
             memory_bytes=self._memory.note(self._image_bytes),
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
+            gpu_busy_seconds=run.busy.seconds(),
         )
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
