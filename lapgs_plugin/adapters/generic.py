@@ -31,29 +31,23 @@ class Adapter(BackboneAdapter):
     )
 
     @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        return cls.info.recognises(folder) if cls.info.own_files else readable_source(folder) is not None
-
-    @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        """Return the stand-in that takes the settings that the checkout passes.
+        """Return the stand-in that offers what the checkout imports, and takes what it passes.
 
         Raises:
             MissingExtraError: there is none; the line names the rasterizer, and the place where it is imported.
         """
-        if cls.info.stand_in:
-            return cls.info.stand_in
-        from lapgs_plugin.reference_raster.standins import VARIANTS
+        from lapgs_plugin.reference_raster.standins import variant_for
 
+        found = variant_for(checkout)
+        if found is not None:
+            return found
         source = readable_source(checkout)
         assert source is not None, "recognised by it"
-        for use in source.rasterizers:
-            for name, variant in VARIANTS.items():
-                if variant.module == use.module and set(variant.settings) == use.settings:
-                    return name
         raise MissingExtraError(
-            f"no CPU stand-in for {', '.join(source.rasterizer_modules) or 'the rasterizer'}, which "
-            f"{', '.join(use.where for use in source.rasterizers)} imports; this checkout needs a CUDA device"
+            f"no CPU stand-in for {', '.join(source.rasterizer_modules) or 'a rasterizer'}, which "
+            f"{', '.join(use.where for use in source.rasterizers) or 'the checkout'} imports, with the settings and "
+            "inputs that the checkout passes; it needs a CUDA device"
         )
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:

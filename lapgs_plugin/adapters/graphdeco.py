@@ -11,9 +11,16 @@ from typing import TYPE_CHECKING
 
 from lapgs_plugin.adapters import generic
 from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.generic import readable_source
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.rasterizer import Semantics
+
+
+SETTINGS = {*generic.OF_A_CALL, "antialiasing"}
+"""Settings of graphdeco's rasterizers."""
+
+OTHER_INPUTS = {"scores", "culling"}
 
 
 class Adapter(generic.Adapter):
@@ -42,9 +49,18 @@ class Adapter(generic.Adapter):
         )
 
     @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        """Return whether a folder has the files of a checkout whose calls fit graphdeco's own rasterizers."""
+        source = readable_source(folder) if cls.info.recognises(folder) else None
+        if source is None or cls.info.own_files:
+            return cls.info.recognises(folder)
+        return all(
+            use.module == cls.info.rasterizer and not use.settings - SETTINGS and not use.inputs & OTHER_INPUTS
+            for use in source.rasterizers
+        )
+
+    @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        renderer = checkout / "gaussian_renderer" / "__init__.py"
-        if "antialiasing" not in renderer.read_text(encoding="utf-8", errors="replace"):
-            return "graphdeco"
+        found = super().stand_in_for(checkout, arguments)
         wants_sparse_adam = any(argument.rpartition("=")[2] == "sparse_adam" for argument in arguments)
-        return "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in
+        return "graphdeco-accel" if found == cls.info.stand_in and wants_sparse_adam else found

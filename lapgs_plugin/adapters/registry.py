@@ -11,6 +11,7 @@ from pathlib import Path
 from lapgs_plugin import adapters
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.generic import Adapter as GenericAdapter
+from lapgs_plugin.adapters.generic import readable_source
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.registry import Registry
 
@@ -64,7 +65,7 @@ def recognise(folder: Path) -> type[BackboneAdapter] | None:
         UserInputError: several are left, or an installed package's cannot be loaded.
     """
     found = [each for each in all_adapters() if each.recognises(folder)]
-    if not found and GenericAdapter.recognises(folder):
+    if not found and readable_source(folder) is not None:
         return GenericAdapter
     left = [each for each in found if not any(other.info.is_fork_of(each.info) for other in found)]
     if len(left) > 1:

@@ -19,7 +19,7 @@ from lapgs_plugin.runs.options import MeasuringOptions
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
 
-OF_OFF = {"off", "script", "arguments", "record", "backbone", "device", "verbose"}
+OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose"}
 """Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -79,34 +79,27 @@ def run(
     """
     import logging
 
-    import torch
-
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script, require_script
-    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_rasterizer import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
+    from lapgs_plugin.runs.gpu_busy import require_cuda
 
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
     if record and not off:
         raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
-    if device not in ("auto", "cuda", "cpu"):
-        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise UserInputError(
-            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
-        )
-    chosen = device if device != "auto" else "cuda" if available else "cpu"
+    if measuring.gpu_busy and off and not record:
+        raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
+    chosen = _chosen_device(device)
+    if measuring.gpu_busy:
+        require_cuda(chosen)
     path, words = require_script(script), arguments or []
     watcher = context.with_resource(watching(view, view_port, path.parent.name, chosen))
     plain = off and not record
-    # On a GPU a script that runs as it is may be any script.
-    source = CheckoutSource.read(path) if not plain or chosen == "cpu" or backbone is not None else None
-    kind: type[BackboneAdapter] | None = adapter_class(source.root, backbone) if source is not None else None
+    kind, root = _recognised(path, backbone, needed=not plain)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
@@ -114,15 +107,15 @@ def run(
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
     on_device: AbstractContextManager[None] = nullcontext()
-    if chosen == "cpu" and source is not None and kind is not None:
-        on_device = cuda_on_cpu(kind.stand_in_for(source.root, words))
+    if chosen == "cpu":
+        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, words))
     try:
         with on_device, loaded_script(script, words) as loaded:
             if kind is None or plain:
                 loaded.run_main()
                 return
             if off:
-                BareRunRecorder(kind(loaded), chosen).run()
+                BareRunRecorder(kind(loaded), chosen, measuring.gpu_busy).run()
                 return
             driver = HierarchyDriver(
                 kind(loaded),
@@ -131,6 +124,7 @@ def run(
                 resume=resume,
                 overwrite=overwrite,
                 breakdown=measuring.breakdown,
+                gpu_busy=measuring.gpu_busy,
                 watcher=watcher,
                 test_every=measuring.test_every,
             )
@@ -142,3 +136,30 @@ def run(
         if line is None:
             raise
         raise line from error
+
+
+def _chosen_device(device: str) -> str:
+    """Return "cuda" or "cpu" for a value of --device."""
+    import torch
+
+    if device not in ("auto", "cuda", "cpu"):
+        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise UserInputError(
+            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
+        )
+    return device if device != "auto" else "cuda" if available else "cpu"
+
+
+def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:
+    """Return the adapter of a script's checkout, None for another script if none is needed, and the checkout's root."""
+    from lapgs_plugin.checkouts.source import CheckoutSource
+
+    try:
+        root = CheckoutSource.read(script).root
+        return adapter_class(root, backbone), root
+    except UserInputError:
+        if needed or backbone is not None:
+            raise
+        return None, script.parent
