@@ -26,11 +26,10 @@ from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.rasterizers.extensions import CudaExtension
-from lapgs_plugin.rasterizers.signed_color import ColorPath, SignedColorRasterizer
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.dry_run import DryRun
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
@@ -111,7 +110,6 @@ class HierarchyDriver:
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite)
-        path = self._color_path()
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._adapter.first_points(len(scene.points.points))
@@ -122,6 +120,8 @@ class HierarchyDriver:
                 self._options.shares,
                 self._options.kind,
             )
+            residuals = self._options.levels > 1 and not self._options.nested
+            path = DryRun(self._context, call, scene, plan, self._activate).run(Path(scratch, "dry_run"), residuals)
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:
@@ -162,12 +162,8 @@ class HierarchyDriver:
             finished.append(active.as_finished)
             start += stage.iterations
 
-    def _color_path(self) -> ColorPath:
-        """Return how the installed rasterizer evaluates signed colour, which is found out by rendering."""
-        extension = CudaExtension(self._adapter.rasterizer, self._context.device)
-        if self._options.levels == 1 or self._options.nested:
-            return ColorPath.NATIVE  # no field is signed
-        return SignedColorRasterizer(extension, checkout=self._adapter.root).path
+    def _activate(self, stage: ActiveStage | None) -> None:
+        self._active = stage
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.

@@ -98,7 +98,7 @@ def test_a_checkout_with_other_names_trains_to_the_same_bits(copy: Path, scene: 
             for change in OTHER_NAMES:
                 edit(copy / "graphdeco" / change[0], *change[1:])
         folder, script = tmp_path / name, copy / "graphdeco" / "train.py"
-        more = ("--iterations", 30)
+        more = ("--iterations", 15)
         with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, *more, script=script) as adapter:
             assert "grow" in adapter.profile.density_control or name == "as it is"
             drive_residuals(adapter)
