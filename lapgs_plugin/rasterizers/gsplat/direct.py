@@ -117,7 +117,7 @@ def _channels_first(images: Tensor) -> Tensor:
 
 
 class _Render(torch.autograd.Function):
-    """(field, cameras) -> contiguous image (3, h, w), or images (c, 3, h, w) of several."""
+    """(field, cameras) -> image (3, h, w), or images (c, 3, h, w) of several, with interleaved colours in memory."""
 
     @staticmethod
     def forward(
@@ -132,7 +132,7 @@ class _Render(torch.autograd.Function):
         ctx.size, ctx.degree, ctx.signed, ctx.absgrad = cameras[3:], degree, signed, absgrad
         ctx.targets = targets
         box.append(found)
-        return _channels_first(images).contiguous()
+        return _channels_first(images)
 
     @staticmethod
     @once_differentiable
