@@ -250,7 +250,7 @@ class _DryStage:
 
     densified = optimizers_made
 
-    def iteration_begins(self, gaussians: Any, iteration: int = 0) -> None:
+    def iteration_begins(self, gaussians: Any) -> None:
         if self.record.iteration:
             raise _Enough
         self.record.iteration = 1
