@@ -311,7 +311,7 @@ def _with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]
 def _refuse_unrecognised(_: Tensor) -> None:
     raise UserInputError(
         "the checkout trains on a camera that is no view of its scene: no renderer was called with one, and the "
-        "rasterizer's matrices are none of the scene's; so a residual cannot be composed with the coarser levels, nor a "
+        "rasterizer's matrices are none of the scene's; so no residual can be composed with coarser levels, nor a "
         "mask be applied: train with --hierarchy nested and without --masks"
     )
 
