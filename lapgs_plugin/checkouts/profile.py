@@ -99,9 +99,14 @@ class Profile:
 
     def places(self, rasterizer: BoundRasterizer, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks objects of a rasterizer's module up, as owners and names."""
+        use = rasterizer.use
         found = [place for name in names for place in self.holders(vars(rasterizer.module)[name])]
-        # An import in a function looks the name up in the rasterizer's module at each call.
-        return found + [(rasterizer.module, name) for name in names if rasterizer.use.inside]
+        if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
+            found += [(rasterizer.module, name) for name in names]
+        holder = self.script.module if use.holder == "__main__" else sys.modules[use.holder]
+        # Under its own name there may be something that wraps it.
+        wrapped = [(holder, name) for name in names if name in vars(holder)]
+        return found + [place for place in wrapped if place not in found]
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
         """Return a model, made with the arguments that the script gives.

@@ -96,6 +96,10 @@ class StageRendering:
         found = (self._by_matrix.get(m) for value in _values(settings) for m in _matrices(value))
         return next((key for key in found if key is not None), None)
 
+    def _fits(self, key: str, image: Tensor) -> bool:
+        """Return whether an image has the size of a view at this level, as far as that is known."""
+        return self.accumulated is None or self.accumulated.get(key).shape == image.shape
+
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         if self.targets is not None:
@@ -151,7 +155,11 @@ class StageRendering:
         outputs = rasterizer(**inputs)
         place = _image_place(outputs, settings)
         stored = outputs if place is None else outputs[place]
-        image = self.compose(self.key(noted, settings), _channels_first(stored))
+        image = _channels_first(stored)
+        key = self.key(noted, settings)
+        if noted is None and key is not None and not self._fits(key, image):
+            key = None  # a viewer's camera at the place of a photo's
+        image = self.compose(key, image)
         if self.capture:
             self.captured = image
         image = _as_stored(image, stored)
