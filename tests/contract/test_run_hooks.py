@@ -97,7 +97,7 @@ class Term(StageHook):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path, tmp_path: Path) -> None:
-    """The first gradients after the dry run are equal with a hook's term and with the same term added to the checkout's L1."""
+    """The first gradients after the dry run are equal with a hook's term and with that term added to the loop's L1."""
     gradients = {}
     for how in ("hook", "loop"):
         folder = tmp_path / how
