@@ -13,6 +13,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_key, view_name
+from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.masks import fill_outside
@@ -220,11 +222,16 @@ class RasterizerWrapper:
 
         return make_settings
 
-    def entry(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the replacement of a rasterizer's class, or of a function that rasterizes."""
-        return self._rasterizer(original) if inspect.isclass(original) else self._function(original)
+    def entries(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
+        """Return where a checkout looks rasterizers up, as owners and names, each with its replacement's maker."""
+        return [
+            (*place, self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function)
+            for rasterizer in profile.rasterizers
+            for name in rasterizer.entries
+            for place in profile.places(rasterizer, name)
+        ]
 
-    def _rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = original(*args, **kwargs)
             stage, noted = self.stage, self.noted
