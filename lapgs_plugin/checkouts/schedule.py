@@ -321,11 +321,11 @@ class _Rewriter(ast.NodeTransformer):
         option = Operand(node, False, ast.Eq, node).option
         if option is not None and option in self._options and isinstance(getattr(node, "ctx", None), ast.Load):
             return ast.copy_location(ast.Constant(self._options[option]), node)
-        made = self.generic_visit(node)
+        made = cast("ast.expr", self.generic_visit(node))
         if place in self._moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
             at = self._moved[place]
             texts = f"{self._variable} < {at}", f"{self._variable} == {at}"
-            before, then = (cast("ast.Expression", ast.parse(text, mode="eval")).body for text in texts)
+            before, then = (ast.parse(text, mode="eval").body for text in texts)
             either = ast.BoolOp(ast.Or(), [ast.BoolOp(ast.And(), [made, before]), then])
             return ast.copy_location(either, node)
         return made
