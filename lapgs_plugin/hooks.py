@@ -24,6 +24,7 @@ from importlib.metadata import entry_points
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import Supervision
 from lapgs_plugin.ops.composition import add_prediction
@@ -45,6 +46,7 @@ class StageContext:
         target: (3, h, w) ground truth I^l of the view at the stage's level.
         accumulated: (3, h, w) Up(I_hat^(l+1)) of the view, unclamped; None for the base.
         coarse_target: (3, h, w) Up(I^(l+1)) of the ground truth; None unless the supervision needs it.
+        weight: (1, h, w) share of each pixel inside of the view's mask; None without masks.
     """
 
     stage: Stage
@@ -53,6 +55,7 @@ class StageContext:
     target: Tensor  # (3, h, w)
     accumulated: Tensor | None = None  # (3, h, w)
     coarse_target: Tensor | None = None  # (3, h, w)
+    weight: Tensor | None = None  # (1, h, w)
 
 
 class StageHook:
@@ -122,7 +125,7 @@ class SupervisionLoss(StageHook):
         prediction, target = image, context.target
         if context.accumulated is not None:  # the base is always compared with its target
             prediction, target = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
-        return photometric_loss(prediction, target, self._ssim_weight)
+        return photometric_loss(fill_outside(prediction, target, context.weight), target, self._ssim_weight)
 
 
 class HookDispatcher:

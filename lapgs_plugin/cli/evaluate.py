@@ -180,16 +180,19 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
+    where = " inside their masks (LPIPS: the photo outside)" if metrics["masked"] else ""
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
-        f"{metrics['num_views']} {kind} views; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
+        f"{metrics['num_views']} {kind} views{where}; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
         highlight=False,
     )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]
         console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)
+    if (busy := metrics["gpu_busy_seconds"]) is not None:
+        console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
     for name, reason in metrics["lpips_missing"].items():
         console.print(f"LPIPS {name} was not measured: {reason}", highlight=False, markup=False)

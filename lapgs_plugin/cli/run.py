@@ -19,7 +19,7 @@ from lapgs_plugin.runs.options import MeasuringOptions
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
 
-OF_OFF = {"off", "script", "arguments", "record", "backbone", "device", "verbose"}
+OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose"}
 """Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -86,12 +86,15 @@ def run(
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_rasterizer import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
+    from lapgs_plugin.runs.gpu_busy import require_cuda
 
     if off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
     if record and not off:
         raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
+    if measuring.gpu_busy and off and not record:
+        raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
     if device not in ("auto", "cuda", "cpu"):
         raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
     available = torch.cuda.is_available()
@@ -100,6 +103,8 @@ def run(
             "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
         )
     chosen = device if device != "auto" else "cuda" if available else "cpu"
+    if measuring.gpu_busy:
+        require_cuda(chosen)
     checkout, words = require_script(script).parent, arguments or []
     watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
     plain = off and not record
@@ -119,7 +124,7 @@ def run(
                 loaded.run_main()
                 return
             if off:
-                BareRunRecorder(kind(loaded), chosen).run()
+                BareRunRecorder(kind(loaded), chosen, measuring.gpu_busy).run()
                 return
             driver = HierarchyDriver(
                 kind(loaded),
@@ -128,6 +133,7 @@ def run(
                 resume=resume,
                 overwrite=overwrite,
                 breakdown=measuring.breakdown,
+                gpu_busy=measuring.gpu_busy,
                 watcher=watcher,
                 test_every=measuring.test_every,
             )

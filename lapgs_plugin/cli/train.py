@@ -61,18 +61,26 @@ def train(
     from rich.console import Console
     from rich.markup import escape
 
+    from lapgs_plugin.runs.gpu_busy import require_cuda
     from lapgs_plugin.runs.manifest import SceneReference
-    from lapgs_plugin.training.backend import choose_rasterizer
+    from lapgs_plugin.scenes.masks import resolve_masks
+    from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other; give one of them")
     watcher = context.with_resource(watching(view, view_port, out.absolute().name))
     reference = SceneReference(
-        str(scene.absolute()), photos.resolution, photos.eval, photos.background_color, images=photos.images, kind=""
+        *(str(scene.absolute()), photos.resolution, photos.eval, photos.background_color),
+        images=photos.images,
+        kind="",
+        masks=photos.masks,
     )
     if isinstance(context.obj, Rehearsal):
         context.obj.train(settings, reference, control.rasterizer)
         return
+    reference = replace(reference, masks=resolve_masks(scene, photos.masks))
+    if control.gpu_busy:
+        require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
     console = Console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
@@ -95,6 +103,7 @@ def _wanted(reference: SceneReference, settings: TrainSettings, rasterizer: str)
         "resolution": reference.resolution,
         "images": reference.images,
         "eval": reference.eval,
+        "masks": reference.masks,
         "background": reference.background,
         "rasterizer": rasterizer,
         **option_values(settings),
@@ -165,6 +174,7 @@ def _load(reference: SceneReference) -> Scene:
         resolution=reference.resolution,
         images=reference.images,
         eval=reference.eval,
+        masks=reference.masks,
         background=reference.background,
     )
 
@@ -204,6 +214,7 @@ def _run(
     import torch
 
     from lapgs_plugin.jit.threads import one_pool
+    from lapgs_plugin.scenes.masks import share_inside
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import ProgressMonitor
     from lapgs_plugin.training.trainer import Trainer
@@ -211,6 +222,13 @@ def _run(
     if control.threads is not None:
         torch.set_num_threads(control.threads)
     manifest = archive.manifest
+    masks = [view.mask for view in (*scene.train, *scene.test)]
+    if any(mask is not None for mask in masks):
+        console.print(
+            f"masks ({manifest.scene.masks}): {share_inside(masks):.0%} of the pixels are trained on and measured",
+            highlight=False,
+            markup=False,
+        )
     placed = training_rasterizer(manifest.rasterizer, settings)
     with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
         trainer = Trainer(
@@ -223,6 +241,7 @@ def _run(
             checkpoint_every=control.checkpoint_every,
             test_every=control.test_every,
             breakdown=control.breakdown,
+            gpu_busy=control.gpu_busy,
             watcher=watcher,
         )
         trainer.run(resume)

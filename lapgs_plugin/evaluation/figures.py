@@ -8,10 +8,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from torch import Tensor
+
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import psnr, ssim
+from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
@@ -25,7 +28,8 @@ from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
     *("psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
-    *("train_seconds", "overhead_seconds", "breakdown_seconds", "num_gaussians", "weighted_gaussians"),
+    *("train_seconds", "overhead_seconds", "breakdown_seconds", "gpu_busy_seconds"),
+    *("num_gaussians", "weighted_gaussians"),
     *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
     *("rasterizer", "versions"),
 }
@@ -58,16 +62,22 @@ class ViewMetrics:
 
 
 def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics) -> ViewMetrics:
-    """Compare a rendered view with its photo at every level, on the renderer's device."""
-    photo = view.image.to(renderer.device)
-    targets = renderer.pyramid.gaussian(photo, renderer.levels)
-    level_psnr = {level: psnr(image, targets[level]) for level, image in composition.composed.items()}
+    """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device."""
+    photo, mask = view.image.to(renderer.device), None
+    targets: list[tuple[Tensor, Tensor | None]]
+    if view.mask is None:
+        targets = [(each, None) for each in renderer.pyramid.gaussian(photo, renderer.levels)]
+    else:
+        mask = view.mask.to(renderer.device)
+        targets = [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]
+    level_psnr = {level: psnr(image, *targets[level]) for level, image in composition.composed.items()}
     upsampled = {
-        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), photo)
+        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), photo, mask)
         for level, image in composition.composed.items()
     }
     whole = composition.composed[0]
-    return ViewMetrics(view.name, level_psnr[0], ssim(whole, photo), lpips.measure(whole, photo), level_psnr, upsampled)
+    distances = lpips.measure(fill_outside(whole, photo, mask), photo)
+    return ViewMetrics(view.name, level_psnr[0], ssim(whole, photo, mask), distances, level_psnr, upsampled)
 
 
 def evaluate_run(
@@ -113,6 +123,7 @@ def evaluate_run(
         **run_figures(archive.manifest, split, measured, renderer.rasterizer.name),
         "lpips_missing": dict(distances.missing),
         "fps": speed.fps,
+        "masked": any(view.mask is not None for view in views),
     }
     archive.write_metrics(metrics)
     return metrics
@@ -162,10 +173,11 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         psnr, ssim, lpips_<variant>: means over the views, at full resolution.
         lpips_missing: by variant, why it could not be measured; added by `evaluate_run`.
         fps: frames a second of the composed image, the median over some views; added by `evaluate_run`.
+        masked: whether pixels outside of masks were left out; added by `evaluate_run`, absent in older files.
         split, num_views: the measured views, "test" or "train", and their number.
         train_seconds and other figures of training: see `training_figures`.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
-            num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, memory_bytes.
+            num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, gpu_busy_seconds, memory_bytes.
         views: name, psnr, ssim and lpips_<variant> of each view, in the scene's order.
         rasterizer, versions: the rasterizer and the versions of packages that rendered the views.
     """
@@ -195,6 +207,7 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
         "mean_gaussians": record.mean_gaussians,
         "peak_gaussians": record.peak_gaussians,
         "breakdown_seconds": record.breakdown_seconds,
+        "gpu_busy_seconds": record.gpu_busy_seconds,
         "memory_bytes": record.memory_bytes,
     }
 

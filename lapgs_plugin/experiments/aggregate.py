@@ -53,6 +53,7 @@ def _seconds(heading: str, name: str) -> Column:
 COLUMNS: Mapping[str, Column] = {
     "minutes": Column("Time (min)", "lower", ("train_seconds",), 1 / 60),
     "train_seconds": Column("Time (s)", "lower", ("train_seconds",), decimals=1),
+    "gpu_busy_seconds": Column("GPU busy (s)", "lower", ("gpu_busy_seconds",), decimals=1),
     "overhead_seconds": Column("Overhead (s)", "lower", ("overhead_seconds",), decimals=1),
     "psnr": Column("PSNR", "higher", ("psnr",)),
     "ssim": Column("SSIM", "higher", ("ssim",), decimals=3),

@@ -158,7 +158,7 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
 
 def _lapgs_run(spec: RunSpec, bare: bool) -> tuple[str, ...]:
     if bare:
-        return (*LAPGS, "run", "--off", "--record")
+        return (*LAPGS, "run", "--off", "--record", *_as_options(spec.options))
     return (*LAPGS, "run", "--overwrite", "--seed", str(spec.seed), *_as_options(spec.options))
 
 

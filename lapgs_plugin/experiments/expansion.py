@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.schema import Backbone, Experiment, SampleScene, Scenes, Variant, nearest
+from lapgs_plugin.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
 from lapgs_plugin.untrusted import STRICT
@@ -160,7 +160,8 @@ def _spec(
         # Stored even when the file does not set it: a changed default must make a new run.
         options = {"hierarchy": DEFAULT_HIERARCHY.value, **options}
     elif backbone.checkout is not None:
-        options = {}  # a script that runs by itself has no hierarchy
+        # A script that runs by itself has no hierarchy.
+        options = {name: value for name, value in options.items() if name in OF_BARE_RUNS}
     return RunSpec(
         scene=scene.name,
         dataset=scene.dataset,

@@ -3,6 +3,7 @@
     run, scene, dataset, images, resolution, backbone, method, iterations, seed, options, arguments    settings
     psnr, ssim, lpips_*, fps            and every other number of metrics.json
     measured_by                         "lapgs eval" or "training": origin of the image metrics
+    gpu_busy_seconds                    of the optimization, with --gpu-busy
     train_seconds, overhead_seconds, overhead_<what>_seconds, wall_seconds
     gaussians, gaussians_level_<l>      of the archived fields; peak_gaussians, mean_gaussians during training
     peak_memory_bytes, peak_memory_without_images_bytes    on a GPU
@@ -32,7 +33,13 @@ from lapgs_plugin.runs.training_figures import training_figures
 
 LOGGED_METRICS = ("psnr", "ssim")
 """Image metrics that training records itself."""
-SINGLE = ("peak_gaussians", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes")
+SINGLE = (
+    "gpu_busy_seconds",
+    "peak_gaussians",
+    "mean_gaussians",
+    "peak_memory_bytes",
+    "peak_memory_without_images_bytes",
+)
 """Figures of training that become columns unchanged, if they were measured."""
 EVALUATED, RECORDED = "lapgs eval", "training"
 
@@ -108,7 +115,7 @@ def _bare_figures(folder: Path) -> dict[str, Any]:
         "gaussians_level_0": count,
         **{name: values[name] for name in ("peak_gaussians", "mean_gaussians")},
     }
-    row |= {name: values[name] for name in LOGGED_METRICS if name in values}
+    row |= {name: values[name] for name in ("gpu_busy_seconds", *LOGGED_METRICS) if name in values}
     if memory := values["memory_bytes"]:
         row["peak_memory_bytes"] = memory["peak"]
         row["peak_memory_without_images_bytes"] = memory["peak"] - memory["images"]

@@ -17,6 +17,8 @@ from lapgs_plugin.untrusted import read_toml
 
 T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+OF_BARE_RUNS = {"gpu_busy"}
+"""Options that a checkout's script by itself can be run with."""
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without leading dashes and with underscores."""
 
@@ -210,7 +212,7 @@ class Experiment(_StrictModel):
             where = f"variants.{number}: variant {variant.name!r}"
             if variant.method == "bare" and "levels" in variant.options:
                 yield f"{where} is bare, which is one level; leave levels out"
-            if variant.method == "bare" and variant.options and all(checkouts):
+            if variant.method == "bare" and variant.options.keys() - OF_BARE_RUNS and all(checkouts):
                 yield f"{where} is bare: options of `lapgs run` have no effect; set the script's arguments"
             if variant.arguments and not any(checkouts):
                 yield f"{where} has arguments, but no checkout whose script takes them"

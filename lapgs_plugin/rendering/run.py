@@ -54,6 +54,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         resolution=reference.resolution,
         images=reference.images,
         eval=reference.eval,
+        masks=reference.masks,
         background=reference.background,
     )
     require_same_scene(archive, scene.path, scene.smallest_size)

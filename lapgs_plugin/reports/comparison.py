@@ -13,7 +13,7 @@ from lapgs_plugin.runs.manifest import Manifest
 Metrics = dict[str, Any]
 """Content of metrics.json, see `figures.run_figures`."""
 
-OPTIONAL_ROWS = {"mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
+OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
 PAIR = 2
 
@@ -66,6 +66,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
             if any(LPIPS_KEY.format(name) in each or name in each["lpips_missing"] for each in metrics)
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
+        ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),
         ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
         ("num_gaussians", "Gaussians to render", "{:,.0f}", _ratio),
         ("weighted_gaussians", "Gaussians, mean of levels by iterations", "{:,.0f}", _ratio),

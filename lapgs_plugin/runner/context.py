@@ -37,6 +37,7 @@ class RunContext:
     parts: IterationParts
     watcher: Watcher
     test_every: int | None
+    gpu_busy: bool
 
     def render(
         self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor

@@ -55,6 +55,7 @@ class HierarchyDriver:
         overwrite: replace the run in the output folder.
         hooks: hooks that run after those registered by entry point.
         breakdown: measure the parts of iterations.
+        gpu_busy: profile some iterations of each stage; needs a CUDA device.
         watcher: may look at the fields between iterations.
         test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
 
@@ -72,6 +73,7 @@ class HierarchyDriver:
         overwrite: bool = False,
         hooks: Sequence[StageHook] = (),
         breakdown: bool = False,
+        gpu_busy: bool = False,
         watcher: Watcher | None = None,
         test_every: int | None = None,
     ) -> None:
@@ -88,6 +90,7 @@ class HierarchyDriver:
             parts=IterationParts(place, breakdown),
             watcher=watcher or Watcher(),
             test_every=test_every,
+            gpu_busy=gpu_busy,
         )
         self._active: ActiveStage | None = None
         self._replacements = StageReplacements(self._context, lambda: self._active, self._train)

@@ -270,6 +270,7 @@ def _as_recorded(record: LevelRecord, noted: Mapping[str, Any]) -> LevelRecord:
         peak_gaussians=noted["peak_gaussians"],
         mean_gaussians=noted["mean_gaussians"],
         memory_bytes=noted["memory_bytes"],
+        gpu_busy_seconds=noted.get("gpu_busy_seconds"),
         overhead_seconds={"saving": noted["saving_seconds"]},
     )
 

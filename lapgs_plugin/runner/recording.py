@@ -26,6 +26,7 @@ from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
+from lapgs_plugin.runs.gpu_busy import GpuBusy
 
 logger = logging.getLogger(__name__)
 
@@ -39,14 +40,16 @@ class BareRunRecorder:
     Args:
         adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
+        gpu_busy: profile some iterations; needs a CUDA device.
     """
 
-    def __init__(self, adapter: BackboneAdapter, device: str) -> None:
+    def __init__(self, adapter: BackboneAdapter, device: str, gpu_busy: bool = False) -> None:
         self._adapter, self._device = adapter, device
+        self._profiles, self._busy = gpu_busy, GpuBusy()
         self._call: TrainingCall | None = None
         self._scene: Any = None
         self._began: float | None = None
-        self._seconds = self._saving = 0.0
+        self._seconds = self._saving = self._profiling = 0.0
         self._iteration = self._peak = self._summed = 0
         self._memory: dict[str, int] = {}
         self._timeline: list[dict[str, float]] = []
@@ -86,9 +89,10 @@ class BareRunRecorder:
         def training(*args: Any, **kwargs: Any) -> Any:
             self._call = TrainingCall.bind(original, args, kwargs)
             result = original(*args, **kwargs)
+            self._profile()
             self._synchronize()
             if self._began is not None:
-                self._seconds = time.perf_counter() - self._began - self._saving
+                self._seconds = self._elapsed(self._began)
             if self._device == "cuda":
                 self._memory = {"peak": torch.cuda.max_memory_allocated(), "images": self._image_bytes()}
             return result
@@ -125,13 +129,27 @@ class BareRunRecorder:
             if self._device == "cuda":
                 torch.cuda.reset_peak_memory_stats()
             self._began = time.perf_counter()
+            if self._profiles and self._call is not None:
+                self._busy = GpuBusy(self._call.opt.iterations)
+        self._profile()
         self._iteration += 1
         self._summed += count
         self._peak = max(self._peak, count)
         assert self._call is not None, "training() makes iterations"
         if iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
-            elapsed = time.perf_counter() - self._began - self._saving
+            elapsed = self._elapsed(self._began)
             self._timeline.append({"iteration": iteration, "elapsed": elapsed, "num_gaussians": count})
+
+    def _profile(self) -> None:
+        """Start or end a profile if it is due; its time does not count."""
+        if self._busy.due(self._iteration):
+            self._synchronize()
+            start = time.perf_counter()
+            self._busy.step(self._iteration)
+            self._profiling += time.perf_counter() - start
+
+    def _elapsed(self, began: float) -> float:
+        return time.perf_counter() - began - self._saving - self._profiling
 
     def _record(self) -> dict[str, Any]:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
@@ -144,6 +162,7 @@ class BareRunRecorder:
             "peak_gaussians": max(self._peak, len(gaussians._xyz)),
             "mean_gaussians": self._summed / self._iteration,
             "memory_bytes": self._memory,
+            **({} if (busy := self._busy.seconds()) is None else {"gpu_busy_seconds": busy}),
             **self._held_out(gaussians),
             "timeline": self._timeline,
         }

@@ -13,6 +13,7 @@ from lapgs_plugin.adapters.base import StageWindow
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import RunContext, StageResult
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Overhead, PeakMemory
 
@@ -35,6 +36,7 @@ class StageRecord:
         self.iteration = self.peak = 0
         self._gaussian_steps = 0  # Gaussians, summed over the iterations
         self._began: float | None = None
+        self._busy = GpuBusy(window.stage.iterations if context.gpu_busy else 0)
         self._excluded = 0.0  # seconds since `_began` that are not optimization
         self._memory: PeakMemory  # set by `start`
         self._memory_bytes: dict[str, int] = {}
@@ -53,6 +55,7 @@ class StageRecord:
 
     def count(self, iteration: int, gaussians: int) -> None:
         """Note the number of Gaussians of an iteration that is about to begin."""
+        self._profile(iteration - 1)
         self.iteration = iteration
         self.peak = max(self.peak, gaussians)
         self._gaussian_steps += gaussians
@@ -87,6 +90,7 @@ class StageRecord:
 
     def stop(self, image_bytes: int) -> None:
         """Stop the clock of optimization and measure the memory."""
+        self._profile(self.iteration)
         self._context.parts.breakdown.pause()
         self._synchronize()
         self._train_seconds = self._seconds()
@@ -109,11 +113,18 @@ class StageRecord:
                 memory_bytes=self._memory_bytes,
                 mean_gaussians=self._gaussian_steps / stage.iterations,
                 breakdown_seconds=self._context.parts.breakdown.seconds(),
+                gpu_busy_seconds=self._busy.seconds(),
             ),
             field,
             inherited if stage.level > 0 and any(inherited.values()) else None,
             joint_fields,
         )
+
+    def _profile(self, done: int) -> None:
+        """Start or end a profile if it is due after so many iterations."""
+        if self._busy.due(done):
+            with self.outside("profile"):
+                self._busy.step(done)
 
     def _write_history(self, iteration: int, values: Mapping[str, Any]) -> None:
         self._archive.append_history({"level": self._window.stage.level, "iteration": iteration, **values})

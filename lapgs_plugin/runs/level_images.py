@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lapgs_plugin.hierarchy.masks import masked_gaussian
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
@@ -92,15 +93,24 @@ class LevelImages:
         level: l.
         pyramid: makes the images, on the stores' device.
         with_coarse: also store I^(l+1).
+        masked: whether views have masks.
         exact: keep the images as float32 tensors, for training on a CPU.
 
     Attributes:
         targets: I^l.
         coarse: Up(I^(l+1)); None unless asked for.
+        weights: share of each pixel inside of the mask; None without masks.
     """
 
     def __init__(
-        self, stores: ImageStores, level: int, pyramid: Pyramid, *, with_coarse: bool = False, exact: bool = False
+        self,
+        stores: ImageStores,
+        level: int,
+        pyramid: Pyramid,
+        *,
+        with_coarse: bool = False,
+        masked: bool = False,
+        exact: bool = False,
     ) -> None:
         self._level, self._pyramid, self._device = level, pyramid, stores.device
         self.targets: ImageStore | HeldImages = (
@@ -110,17 +120,29 @@ class LevelImages:
         if with_coarse:
             precision = "float32" if exact else "float16"
             self.coarse = stores.make_upsampled(level + 1, precision, f"coarse_{level}", pyramid)
+        self.weights: ImageStore | HeldImages | None = None
+        if masked:
+            self.weights = HeldImages() if exact else stores.make(level, "uint8", f"weights_{level}")
 
-    def put(self, name: str, image: Tensor, *, with_coarse: bool = True) -> None:
+    def put(self, name: str, image: Tensor, mask: Tensor | None = None, *, with_coarse: bool = True) -> None:
         """Make and store the images of a view.
 
         Args:
             name: of the view.
             image: (3, h, w) at full size.
+            mask: (1, h, w), False where the image is ignored; None uses all of it.
             with_coarse: False for a view whose Up(I^(l+1)) is not needed.
         """
         coarse = self.coarse if with_coarse else None
-        images = self._pyramid.gaussian(image.to(self._device), self._level + 1 + (coarse is not None))
+        image, levels = image.to(self._device), self._level + 1 + (coarse is not None)
+        if mask is None:
+            images = self._pyramid.gaussian(image, levels)
+            weight = torch.ones_like(images[self._level][:1])
+        else:
+            masked = masked_gaussian(self._pyramid, image, mask.to(self._device), levels)
+            images, weight = [each for each, _ in masked], masked[self._level][1]
+        if self.weights is not None:
+            self.weights.put(name, weight)
         target = images[self._level]
         self.targets.put(name, target)
         if coarse is not None:
@@ -139,10 +161,17 @@ class LevelImages:
         """Return both (b, 3, h, w) for several views of one size."""
         return self.targets.get_batch(names), None if self.coarse is None else self.coarse.get_batch(names)
 
+    def get_weights(self, names: Sequence[str]) -> Tensor | None:
+        """Return the weights (1, h, w) of a view or (b, 1, h, w) of several; None without masks."""
+        if self.weights is None:
+            return None
+        return self.weights.get_batch(names) if len(names) > 1 else self.weights.get(names[0])
+
     @property
     def stores(self) -> Iterable[ImageStore | HeldImages]:
         """The stores of the images."""
-        return (self.targets,) if self.coarse is None else (self.targets, self.coarse.store)
+        coarse = None if self.coarse is None else self.coarse.store
+        return tuple(store for store in (self.targets, coarse, self.weights) if store is not None)
 
     @property
     def bytes_on_device(self) -> int:

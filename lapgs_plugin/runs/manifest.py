@@ -62,6 +62,7 @@ class SceneReference:
         background: RGB in [0, 1] behind the base field.
         kind: "colmap" or "transforms".
         images: name of the image folder in a COLMAP scene.
+        masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -72,6 +73,7 @@ class SceneReference:
     background: tuple[Share, Share, Share]
     kind: Name
     images: PathText = "images"
+    masks: PathText = "none"
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class LevelRecord:
         memory_bytes: on a GPU, the "peak" of its memory during training and the part of it that was "images".
         mean_gaussians: Gaussians being optimized, mean over the iterations; None when that was not recorded.
         breakdown_seconds: optimization by part of an iteration (`profiling.PARTS`); empty when not measured.
+        gpu_busy_seconds: estimate of the seconds that the GPU executed kernels; None when not measured.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -106,6 +109,7 @@ class LevelRecord:
     memory_bytes: MemoryBytes = field(default_factory=dict)
     mean_gaussians: NonNegativeFloat | None = None
     breakdown_seconds: dict[str, NonNegativeFloat] = field(default_factory=dict)
+    gpu_busy_seconds: NonNegativeFloat | None = None
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:

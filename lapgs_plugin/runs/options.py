@@ -24,3 +24,8 @@ class MeasuringOptions:
         "Measure the time of each part of an iteration: forward, loss, backward, densification, optimizer, other.",
         panel=PANEL,
     )
+    gpu_busy: bool = option(
+        False,
+        "Estimate the seconds that the GPU executes kernels, from profiles of some iterations of each stage.",
+        panel=PANEL,
+    )

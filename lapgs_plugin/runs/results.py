@@ -57,6 +57,7 @@ class MetricsOfLevel(TypedDict):
     mean_gaussians: NonNegativeFloat | None
     peak_gaussians: NonNegativeInt
     breakdown_seconds: dict[str, NonNegativeFloat]
+    gpu_busy_seconds: NotRequired[NonNegativeFloat | None]
     memory_bytes: MemoryBytes
 
 
@@ -79,6 +80,7 @@ class Metrics(TypedDict):
     train_seconds: NotRequired[NonNegativeFloat]
     overhead_seconds: NotRequired[dict[str, NonNegativeFloat]]
     breakdown_seconds: NotRequired[dict[str, NonNegativeFloat]]
+    gpu_busy_seconds: NotRequired[NonNegativeFloat | None]
     num_gaussians: NotRequired[dict[str, NonNegativeInt]]
     weighted_gaussians: NotRequired[NonNegativeFloat]
     mean_gaussians: NotRequired[NonNegativeFloat | None]
@@ -109,6 +111,7 @@ class BareRecord(TypedDict):
     peak_gaussians: NonNegativeInt
     mean_gaussians: NonNegativeFloat
     memory_bytes: MemoryBytes
+    gpu_busy_seconds: NotRequired[NonNegativeFloat]
     psnr: NotRequired[float]
     ssim: NotRequired[float]
     timeline: list[Timeline]

@@ -18,6 +18,7 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     Keys:
         train_seconds: seconds of optimization over all stages; overhead_seconds: all other seconds, by name.
         breakdown_seconds: seconds of the optimization by part (`profiling.PARTS`); empty unless all levels have them.
+        gpu_busy_seconds: seconds that the GPU executed kernels in the optimization; None unless all levels have it.
         num_gaussians: by level, Gaussians of the fields that the image is rendered from; of nested levels the last.
         peak_gaussians: the most that were optimized at a time.
         weighted_gaussians: mean of the levels' Gaussians, weighted by iterations, as in the paper's plot of time.
@@ -27,11 +28,13 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     iterations = [record.iterations for record in records]
     means = [record.mean_gaussians for record in records if record.mean_gaussians is not None]
     memory = [record.memory_bytes for record in records if record.memory_bytes]
+    busy = [record.gpu_busy_seconds for record in records if record.gpu_busy_seconds is not None]
     whole = all(record.breakdown_seconds for record in records)
     return {
         "train_seconds": math.fsum(record.train_seconds for record in records),
         "overhead_seconds": _sums(record.overhead_seconds for record in records),
         "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
+        "gpu_busy_seconds": math.fsum(busy) if len(busy) == len(records) else None,
         "num_gaussians": {str(record.level): record.num_gaussians for record in _rendered(records)},
         "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
         "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,

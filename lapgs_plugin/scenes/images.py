@@ -42,6 +42,15 @@ def image_size(path: Path) -> tuple[int, int]:
     return _image_plane(path, _open(path))
 
 
+def has_alpha(path: Path) -> bool:
+    """Return whether an image file has an alpha channel.
+
+    Raises:
+        SceneError: as `image_size`.
+    """
+    return _channels(_open(path).spec()).alpha >= 0
+
+
 def check_image(path: Path) -> tuple[int, int]:
     """Decode an image file completely, a few rows at a time, and return its width and height in pixels.
 

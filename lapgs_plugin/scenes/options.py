@@ -23,6 +23,11 @@ class SceneOptions:
     )
     images: str = option("images", "Image folder of a COLMAP scene, such as images_4.")
     eval: bool = option(False, "Hold out every eighth view for `lapgs eval`.")
+    masks: str = option(
+        "auto",
+        "Masks of the photos: a folder of images that are black where a photo is ignored, alpha (the photos' own alpha "
+        "channels), none, or auto (the scene's folder masks/ if there is one).",
+    )
     background: str = option(
         "black", "Background of renders and of transparent pixels: black, white or R,G,B from 0 to 1."
     )

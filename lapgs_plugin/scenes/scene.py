@@ -19,6 +19,7 @@ from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.masks import ALPHA, AUTO, NONE, alpha_mask, find_masks, read_mask, resolve_masks
 from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
@@ -38,11 +39,13 @@ class View:
             scene or to the scene folder of other layouts.
         camera: size, intrinsics and pose, float32; its size is the image's.
         image: (3, h, w) float32 RGB on the CPU, in [0, 1] unless the file holds wider values (EXR).
+        mask: (1, h, w) bool, False where the image is ignored; None uses all of it.
     """
 
     name: str
     camera: Camera
     image: Tensor  # (3, h, w)
+    mask: Tensor | None = None  # (1, h, w)
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ def load_scene(
     resolution: str = "full",
     images: str = "images",
     eval: bool = False,
+    masks: str = AUTO,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: bool | ProgressCallback = True,
 ) -> Scene:
@@ -97,18 +101,21 @@ def load_scene(
             sizes and pixels, and with the principal point in the middle of the image.
         images: name of the image folder, such as "images_4" for smaller copies.
         eval: hold out every eighth view in name order, or the views of `transforms_test.json`.
+        masks: as `masks.resolve_masks` takes it.
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
 
     Raises:
-        SceneError: the folder, its model or an image cannot be used.
-        UserInputError: the resolution cannot be parsed.
+        SceneError: the folder, its model, an image or a mask cannot be used.
+        UserInputError: the resolution cannot be parsed, or there is no such folder of masks.
     """
     rule = parse_resolution(resolution)
     path = Path(path)
+    masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
     frames = [*source.train, *source.test]
+    mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
     if short:
@@ -117,7 +124,8 @@ def load_scene(
             *(resolution, len(short), len(frames), max(short)),
         )
     as_3dgs = rule.backbone is not None
-    views = _load_views(frames, cameras, partial(_read, source.kind, background, as_3dgs), progress)
+    read = partial(_read, source.kind, background, as_3dgs)
+    views = _load_views(frames, cameras, read, partial(_read_mask, masks, mask_files), progress)
     return Scene(
         path=path,
         kind=source.kind,
@@ -239,17 +247,26 @@ def _read(
     return read_image(path, size=size, background=background)
 
 
+def _read_mask(masks: str, files: dict[str, Path], frame: Frame, size: tuple[int, int]) -> Tensor | None:
+    """Read the mask of a view (1, h, w); None without one. `masks` is a result of `resolve_masks`."""
+    if masks == ALPHA:
+        return alpha_mask(frame.path, size)
+    return read_mask(files[frame.name], frame.path, size) if files else None
+
+
 def _load_views(
     frames: Sequence[Frame],
     cameras: Sequence[Camera],
     read: Callable[[Path, tuple[int, int]], Tensor],
+    read_its_mask: Callable[[Frame, tuple[int, int]], Tensor | None],
     progress: bool | ProgressCallback,
 ) -> list[View]:
     """Read all images in parallel, in the order of `frames`; raise the first error in that order."""
 
     def load(posed: tuple[Frame, Camera]) -> View:
         frame, camera = posed
-        return View(frame.name, camera, read(frame.path, (camera.width, camera.height)))
+        size = (camera.width, camera.height)
+        return View(frame.name, camera, read(frame.path, size), read_its_mask(frame, size))
 
     items = list(zip(frames, cameras, strict=True))
     return in_threads("Reading images", "images", load, items, threads=_workers(), progress=progress)

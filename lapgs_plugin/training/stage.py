@@ -17,11 +17,13 @@ from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, render_image
+from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
@@ -101,6 +103,7 @@ class StageRun:
         unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: finished fields while they are trained jointly; None before.
         breakdown: measures the parts of iterations.
+        busy: measures the work of the GPU.
         say: shows a line to the user.
         step_views: number of views of the last step.
 
@@ -123,6 +126,7 @@ class StageRun:
     unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
+    busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
     say: Callable[[str], None] = print
     step_views: int = 1
@@ -139,6 +143,7 @@ class StageRun:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
         while self.progress.iteration < self.stage.iterations:
+            self._profile()
             start = time.perf_counter()
             self.breakdown.mark("other")
             self.step_views = self.schedule.views_of_step(self.progress.iteration)
@@ -149,6 +154,13 @@ class StageRun:
             if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
+        self._profile()
+
+    def _profile(self) -> None:
+        """Start or end a profile if it is due, outside the timed region."""
+        if self.busy.due(self.progress.iteration):
+            self.settle()
+            self.busy.step(self.progress.iteration)
 
     def settle(self) -> None:
         """Wait for a GPU to finish its iterations, as part of the training time, and read their losses.
@@ -314,6 +326,7 @@ class StageRun:
             target=target,
             accumulated=self._prediction(names),
             coarse_target=coarse_target,
+            weight=self.images.get_weights(names),
         )
         if not several or self.hooks.takes_batches:
             return [context]
@@ -329,6 +342,7 @@ class StageRun:
                 target=target[index],
                 accumulated=of(context.accumulated, index),
                 coarse_target=of(coarse_target, index),
+                weight=of(context.weight, index),
             )
             for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
         ]
@@ -397,7 +411,9 @@ class StageRun:
                 image = render_image(self.rasterizer, field, view.camera, self.background, degree)
                 below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
                 self.breakdown.mark("densification")
-                whole = image if below is None else image + below
+                whole = fill_outside(
+                    image if below is None else image + below, target, self.images.get_weights([view.name])
+                )
                 loss = photometric_loss(whole, target, self.settings.ssim_weight)
             return ScoredView(
                 render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss

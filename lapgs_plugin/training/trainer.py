@@ -31,6 +31,7 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
+from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.manifest import LevelRecord
@@ -130,6 +131,7 @@ class Trainer:
             user stops a run.
         test_every: iterations between two measurements of held-out PSNR; None measures it at the end of each stage.
         breakdown: measure the parts of iterations.
+        gpu_busy: profile some iterations of each stage; needs a CUDA device.
         watcher: looks at the fields between iterations.
     """
 
@@ -143,6 +145,7 @@ class Trainer:
     checkpoint_every: int | None = None
     test_every: int | None = None
     breakdown: bool = False
+    gpu_busy: bool = False
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
@@ -150,6 +153,8 @@ class Trainer:
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)
+        if self.gpu_busy:
+            require_cuda(self.device)
         self._overhead = Overhead()
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
@@ -298,6 +303,7 @@ class Trainer:
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
+            busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
         )
 
@@ -358,9 +364,12 @@ class Trainer:
         eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
         with_coarse = self._supervision.needs_coarse and stage.level < self.plan.levels - 1
         stores = self._stores(views, eight_bit=eight_bit)
-        images = LevelImages(stores, stage.level, self._pyramid, with_coarse=with_coarse, exact=not on_gpu)
+        masked = any(view.mask is not None for view in views)
+        images = LevelImages(
+            stores, stage.level, self._pyramid, with_coarse=with_coarse, masked=masked, exact=not on_gpu
+        )
         for view in views:
-            images.put(view.name, view.image)
+            images.put(view.name, view.image, view.mask)
         return images
 
     def _out_of_memory(self) -> DeviceMemoryError:
@@ -435,7 +444,8 @@ class Trainer:
                 predict = cached if run.joint is None else run.joint.predict
                 image = add_prediction(image, None if predict is None else predict(view.name))
                 whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
-                values.append(psnr(whole, view.image.to(self.device)))
+                mask = None if view.mask is None else view.mask.to(self.device)
+                values.append(psnr(whole, view.image.to(self.device), mask))
             return math.fsum(values) / len(values)
 
     def _save_checkpoint(self, run: StageRun) -> None:
@@ -458,6 +468,7 @@ class Trainer:
             memory_bytes=self._memory.note(self._image_bytes),
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
+            gpu_busy_seconds=run.busy.seconds(),
         )
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)

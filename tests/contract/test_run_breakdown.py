@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.runs import gpu_busy
 from lapgs_plugin.runs.profiling import PARTS
 from tests.contract.stub_runs import NAMES, STUBS, run_hierarchy, run_residuals
 
@@ -38,13 +39,17 @@ class Slow(StageHook):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_delays_land_in_their_parts(scene: Path, tmp_path: Path, name: str) -> None:
+def test_delays_land_in_their_parts(scene: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: 0.25)  # stands in for a GPU's profile
     hook = Slow()
     backward = torch.Tensor.backward
-    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", *TINY, hooks=(hook,), breakdown=True)
+    archive, _ = run_hierarchy(
+        STUBS[name], scene, tmp_path / "run", *TINY, hooks=(hook,), breakdown=True, gpu_busy=True
+    )
     assert torch.Tensor.backward is backward
     assert hook.densified[0] > 0 or name == "taming"  # in so few iterations no Gaussian qualifies there
     for record in archive.manifest.records:
+        assert record.gpu_busy_seconds == pytest.approx(0.25 * record.iterations / (record.iterations // 5))
         parts = record.breakdown_seconds
         assert tuple(parts) == PARTS
         assert math.fsum(parts.values()) == pytest.approx(record.train_seconds, rel=0.03)  # 0.2 % seen

@@ -17,15 +17,25 @@ from lapgs_plugin.fields.gaussian_field import count_gaussians
 from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runner.imported import import_run, read_foreign_run
 from lapgs_plugin.runner.recording import BareRunRecorder
+from lapgs_plugin.runs import gpu_busy
 from tests.contract.stub_runs import ITERATIONS, NAMES, STUBS, Result, arguments, captured, loaded, run_bare
 
 SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 
 
+PROFILED = 0.5
+"""Seconds of kernels that the stand-in of a GPU's profile finds each time."""
+
+
+@pytest.fixture(autouse=True)
+def _profile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: PROFILED)
+
+
 def record(name: str, scene: Path, folder: Path) -> Result:
     results: list[Result] = []
     with captured(folder, results), loaded(STUBS[name], scene, folder, *SAVING) as adapter:
-        BareRunRecorder(adapter, "cpu").run()
+        BareRunRecorder(adapter, "cpu", gpu_busy=True).run()
     return results[0]
 
 
@@ -53,6 +63,8 @@ def test_a_recorded_run_is_the_bare_run_to_the_bit(name: str, scene: Path, tmp_p
     assert values["mean_gaussians"] == pytest.approx(sum(counts) / ITERATIONS)
     assert values["peak_gaussians"] >= max(*counts, values["num_gaussians"])
     assert values["saving_seconds"] > 0
+    each = PROFILED / (ITERATIONS // gpu_busy.WINDOWS)
+    assert values["gpu_busy_seconds"] == pytest.approx(each * ITERATIONS)
     assert values["train_seconds"] + values["saving_seconds"] < wall
     assert values["timeline"][-1]["elapsed"] <= values["train_seconds"]
 
@@ -65,6 +77,7 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
     archive = import_run(foreign, tmp_path / "imported", codebase="graphdeco")
     (level,) = archive.manifest.records
     assert (level.train_seconds, level.mean_gaussians) == (values["train_seconds"], values["mean_gaussians"])
+    assert level.gpu_busy_seconds == values["gpu_busy_seconds"]
     assert level.overhead_seconds["saving"] == values["saving_seconds"]
     assert len(archive.history()) == ITERATIONS
     # The script's own render against our rasterizer on the saved field: rounding, worst seen 7e-8 dB; where
@@ -81,6 +94,7 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
         (("--record", "--test-every", 5), "--test-every"),
         (("--resume", "--prune", 0.0, "--levels", 2), "--levels, --prune, --resume"),
         (("--no-fused-adam",), "--fused-adam"),
+        (("--gpu-busy",), "--gpu-busy"),
     ],
 )
 def test_options_that_off_has_no_use_for(scene: Path, tmp_path: Path, given: tuple[Any, ...], named: str) -> None:

@@ -17,9 +17,11 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs import gpu_busy
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.profiling import PARTS
+from lapgs_plugin.training import trainer
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -72,11 +74,21 @@ def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, m
         step(*inputs, **options)
 
     monkeypatch.setattr(TrainableField, "step", slow_step)
+    monkeypatch.setattr(trainer, "require_cuda", lambda _: None)
+    monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: 0.25)  # stands in for a GPU's profile
     with make_archive(tmp_path / "run", SETTINGS) as archive:
         Trainer(
-            ring_scene(), SETTINGS, archive, SlowRasterizer(), user_hooks=[SlowHook()], breakdown=True, test_every=3
+            ring_scene(),
+            SETTINGS,
+            archive,
+            SlowRasterizer(),
+            user_hooks=[SlowHook()],
+            breakdown=True,
+            gpu_busy=True,
+            test_every=3,
         ).run()
     for record in RunArchive.open(tmp_path / "run").manifest.records:
+        assert record.gpu_busy_seconds == pytest.approx(0.25 * record.iterations / (record.iterations // 5))
         parts = record.breakdown_seconds
         assert tuple(parts) == PARTS
         assert math.fsum(parts.values()) == pytest.approx(record.train_seconds, rel=0.02)  # 0.1 % seen

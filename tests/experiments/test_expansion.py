@@ -163,10 +163,17 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
     assert after.index("--dense") > after.index("--densify_until_iter"), "the experiment's own words win"
 
     training, importing, _ = run_steps(
-        run_spec(checkout="fastgs", rasterizer=None, method="bare", arguments=["--mult", "0.7"], iterations=30_000),
+        run_spec(
+            checkout="fastgs",
+            rasterizer=None,
+            method="bare",
+            options={"gpu_busy": True},
+            arguments=["--mult", "0.7"],
+            iterations=30_000,
+        ),
         *(place, tmp_path, tmp_path / "r", []),
     )
-    assert training.command[3:6] == ("run", "--off", "--record")
+    assert training.command[3:7] == ("run", "--off", "--record", "--gpu-busy")
     assert "--iterations" not in training.command, "30,000 is what the script does by itself"
     assert words_after(importing.command, "--set", "--out") == ["mult=0.7", str(tmp_path / "r" / "lapgs")]
 

@@ -25,6 +25,7 @@ def metrics(**changes: Any) -> dict[str, Any]:
         "weighted_gaussians": 1_356_666.7,
         "mean_gaussians": 1_200_000.0,
         "peak_gaussians": 1_500_000,
+        "gpu_busy_seconds": None,
         "peak_memory_bytes": None,
         "peak_memory_without_images_bytes": None,
         "lpips_missing": {},

@@ -211,7 +211,7 @@ def test_terms_of_the_loss_add_up_with_their_gradients() -> None:
 
 
 def test_a_hook_sees_no_more_than_the_context() -> None:
-    assert set(vars(context())) == {"stage", "iteration", "view", "target", "accumulated", "coarse_target"}
+    assert set(vars(context())) == {"stage", "iteration", "view", "target", "accumulated", "coarse_target", "weight"}
     with pytest.raises(FrozenInstanceError):
         context().iteration = 1  # type: ignore[misc]  # that it is refused is what is tested
 

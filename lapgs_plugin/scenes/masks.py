@@ -1,0 +1,118 @@
+"""Find and read masks of photos: white where a photo shows the scene, black where it is ignored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.scenes.images import has_alpha, image_size, read_image
+from lapgs_plugin.scenes.source import is_file, is_folder
+
+MASKS = "masks"
+"""Folder of masks in a scene that `lapgs prepare` writes."""
+AUTO, NONE, ALPHA = "auto", "none", "alpha"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+
+def resolve_masks(scene: Path, setting: str) -> str:
+    """Return what a value of --masks means for a scene: "none", "alpha", or a folder relative to the scene or absolute.
+
+    Raises:
+        UserInputError: there is no such folder.
+    """
+    if setting == AUTO:
+        return MASKS if is_folder(scene / MASKS) else NONE
+    if setting in (NONE, ALPHA) or is_folder(scene / setting):
+        return setting
+    if not is_folder(Path(setting)):
+        raise UserInputError(f"--masks {setting}: no such folder; expected a folder of masks, alpha or none")
+    return str(Path(setting).absolute())
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the mask file of each image by its name.
+
+    The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder.
+
+    Raises:
+        SceneError: an image has no mask, or several.
+    """
+    found = {name: _mask_of(folder, name) for name in names}
+    if missing := [name for name, path in found.items() if path is None]:
+        stem = PurePosixPath(missing[0]).with_suffix("")
+        raise SceneError(
+            f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
+            f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
+            "whole photo), or leave masks out with --masks none"
+        )
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def _mask_of(folder: Path, name: str) -> Path | None:
+    stem = PurePosixPath(name).with_suffix("").as_posix()
+    spellings = [f"{name}.png", *(f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES)]
+    files = [folder / each for each in spellings if is_file(folder / each)]
+    if len(files) > 1:
+        raise SceneError(
+            f"{folder}: photo {printable(name)} has the masks {printable(files[0].name)} and "
+            f"{printable(files[1].name)}, expected one; remove the other"
+        )
+    return files[0] if files else None
+
+
+def read_mask(path: Path, photo: Path, size: tuple[int, int]) -> Tensor:
+    """Read the mask of a photo, at the size of its view.
+
+    Values above half of the mask's largest are inside. So masks of 0 and 1 are read like those of 0 and 255.
+
+    Args:
+        path: the mask.
+        photo: its photo, whose shape the mask must have.
+        size: (width, height) of the result.
+
+    Returns:
+        (1, h, w) bool, True inside.
+
+    Raises:
+        SceneError: it cannot be read, has another shape, or is black everywhere.
+    """
+    width, height = image_size(path)
+    expected = image_size(photo)
+    # Masks may be smaller or larger copies, whose sides were rounded.
+    if abs(width / expected[0] - height / expected[1]) > 1.0 / expected[0] + 1.0 / expected[1]:
+        raise SceneError(
+            f"{path}: the mask is {width}x{height} pixels, its photo {expected[0]}x{expected[1]}; expected the same "
+            "size, make it again from this photo"
+        )
+    return _inside(read_image(path, size=size).mean(0, keepdim=True), path)
+
+
+def alpha_mask(photo: Path, size: tuple[int, int]) -> Tensor | None:
+    """Return where a photo is opaque, (1, h, w) bool; None if it has no alpha channel or is opaque everywhere.
+
+    Raises:
+        SceneError: it cannot be read or is transparent everywhere.
+    """
+    if not has_alpha(photo):
+        return None
+    black, white = (read_image(photo, size=size, background=(each,) * 3, clamp=False)[:1] for each in (0.0, 1.0))
+    opaque = 1.0 - (white - black)
+    return None if bool((opaque > 0.5).all()) else _inside(opaque, photo)
+
+
+def _inside(values: Tensor, path: Path) -> Tensor:
+    highest = float(values.max())
+    if highest <= 0.5 / 255:
+        raise SceneError(
+            f"{path}: the mask is black everywhere, expected white where the photo shows the scene; leave the photo out"
+        )
+    return values > 0.5 * min(highest, 1.0)
+
+
+def share_inside(masks: Sequence[Tensor | None]) -> float:
+    """Return the share of pixels inside of masks, the mean over views; None is a view without a mask."""
+    return float(torch.stack([torch.ones(()) if mask is None else mask.float().mean() for mask in masks]).mean())
