@@ -37,6 +37,7 @@ class MetricsOfView(TypedDict):
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     name: str
     psnr: float
+    fitted_psnr: NotRequired[float]
     ssim: float
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]
@@ -66,6 +67,7 @@ class Metrics(TypedDict):
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     psnr: NotRequired[float]
+    fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]

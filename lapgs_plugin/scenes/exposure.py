@@ -82,6 +82,10 @@ def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
     step = max(1, round(max(view.camera.width, view.camera.height) / SIDE))
     small = torch.nn.functional.avg_pool2d(view.image[None], step) if step > 1 else view.image[None]
     x, y, seen = _visible(view.camera, points)
+    if view.mask is not None:
+        row, column = (y * view.camera.height).long(), (x * view.camera.width).long()
+        inside = view.mask[0, row.clamp(0, view.camera.height - 1), column.clamp(0, view.camera.width - 1)]
+        seen = seen & inside
     grid = torch.stack([2 * x - 1, 2 * y - 1], -1).nan_to_num()
     colors = torch.nn.functional.grid_sample(small, grid[None, None], padding_mode="border", align_corners=False)
     middle = x[seen].median() if bool(seen.any()) else x.new_zeros(())

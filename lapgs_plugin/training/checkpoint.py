@@ -53,6 +53,15 @@ class ModelState(TypedDict):
     signed: bool
 
 
+class ExposureState(TypedDict):
+    """Result of `exposure.ViewExposures.state`."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    transforms: Tensor
+    gradient: Tensor | None
+    moments: dict[str, Tensor]
+
+
 class StageState(TypedDict):
     """Result of `stage.StageRun.state`, and the overhead so far."""
 
@@ -63,6 +72,7 @@ class StageState(TypedDict):
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
+    exposure: NotRequired[ExposureState | None]
     random: Tensor
     random_gpu: NotRequired[Tensor]
     overhead: dict[str, NonNegativeFloat]
@@ -118,6 +128,29 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
         raise RunFolderError(
             f"{path} is damaged: densifier is not the state of this run's density control for {count} Gaussians; "
             f"{ADVICE}"
+        )
+
+
+def check_exposure(state: ExposureState | None, views: int | None, path: Path) -> None:
+    """Check the state of colour transforms.
+
+    Args:
+        state: from a checkpoint; None without transforms.
+        views: number of training views; None if the run has no transforms.
+        path: of the checkpoint, for the message.
+
+    Raises:
+        RunFolderError: it is of another number of views, or damaged.
+    """
+    if state is None and views is None:
+        return
+    shape = torch.Size([views or 0, 3, 4])
+    tensors = [] if state is None else [state["transforms"], state["gradient"], *state["moments"].values()]
+    right = state is not None and views is not None and state["moments"].keys() in (set(), MOMENTS)
+    shapes = ((each, shape if each.ndim else torch.Size([])) for each in tensors if each is not None)
+    if not (right and all(_is_finite(each, wanted, torch.float32) for each, wanted in shapes)):
+        raise RunFolderError(
+            f"{path} is damaged: exposure is not the state of colour transforms for {views or 0} views; {ADVICE}"
         )
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.ops.color_transform import transform_colors, triton_works
+from lapgs_plugin.runs.archive import Exposures
 
 DIFFERENT = 0.08
 """Spread of exposure in stops, see `MeasuredExposure`, from which on photos count as different."""
@@ -23,9 +24,6 @@ FIRST_RATE, LAST_RATE = 1e-2, 1e-3
 BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
 
-Archived = dict[str, list[list[float]]]
-"""Transforms (3, 4) by view, as they are archived."""
-
 
 def identities(views: int) -> Tensor:
     """Return (v, 3, 4) transforms that change nothing."""
@@ -33,7 +31,7 @@ def identities(views: int) -> Tensor:
 
 
 def from_gains(gains: Tensor) -> Tensor:
-    """Return (v, 3, 4) transforms that multiply channels by 2 to the power of (v, 3) gains; their mean is the identity."""
+    """Return (v, 3, 4) transforms that multiply channels by 2 to the power of (v, 3) gains; their mean is (I, 0)."""
     factors = gains.exp2()
     transforms = identities(len(gains))
     transforms[:, :, :3] *= (factors / factors.mean(dim=0))[:, :, None]
@@ -66,9 +64,7 @@ class ViewExposures:
         triton_works(self.transforms)  # compiles its kernels now, not in the first iteration
 
     @classmethod
-    def create(
-        cls, names: Sequence[str], start: Tensor, device: torch.device, done: int, total: int
-    ) -> ViewExposures:
+    def create(cls, names: Sequence[str], start: Tensor, device: torch.device, done: int, total: int) -> ViewExposures:
         """Start a stage from transforms (v, 3, 4), which are copied, with empty moments."""
         return cls(names, torch.nn.Parameter(start.detach().clone().to(device)), done, total)
 
@@ -94,13 +90,13 @@ class ViewExposures:
         self._adam.step()
         self._adam.zero_grad()
         with torch.no_grad():
-            self.transforms -= self.transforms.mean(dim=0) - torch.eye(3, 4, device=self.transforms.device)
+            self.transforms.sub_(self.transforms.mean(dim=0) - torch.eye(3, 4, device=self.transforms.device))
 
     def forget_gradients(self) -> None:
         """Drop gradients of the pass so far."""
         self._adam.zero_grad()
 
-    def archived(self) -> Archived:
+    def archived(self) -> Exposures:
         """Return the transforms by view, as they are archived."""
         return dict(zip(self.names, self.transforms.detach().cpu().tolist(), strict=True))
 
@@ -123,7 +119,7 @@ class ViewExposures:
             self._adam.state[self.transforms] = {key: value.clone() for key, value in moments.items()}
 
 
-def start_from(archived: Archived, names: Sequence[str]) -> Tensor:
+def start_from(archived: Exposures, names: Sequence[str]) -> Tensor:
     """Return the (v, 3, 4) transforms of a finished level for views; the identity for views that it does not have."""
     transforms = identities(len(names))
     for index, name in enumerate(names):

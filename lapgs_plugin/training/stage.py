@@ -29,6 +29,7 @@ from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
@@ -102,6 +103,7 @@ class StageRun:
         joint_from: the iteration from which finished fields are trained jointly; None if they never are.
         unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: finished fields while they are trained jointly; None before.
+        exposures: colour transforms of the training views; None without compensation of exposure.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
@@ -125,6 +127,7 @@ class StageRun:
     joint_from: int | None = None
     unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
+    exposures: ViewExposures | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
@@ -240,6 +243,8 @@ class StageRun:
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.joint is not None:
             self.joint.step(means_rate, rest, scale)
+        if self.exposures is not None:
+            self.exposures.after_step(last, len(iterations))
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -279,6 +284,8 @@ class StageRun:
         for model in models:
             for param in model.params.values():
                 param.grad = None
+        if self.exposures is not None:
+            self.exposures.forget_gradients()
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
@@ -287,7 +294,8 @@ class StageRun:
             assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
             self.joint = self.unfreeze(None)
         views = [self._view(iteration) for iteration in iterations]
-        contexts = self._contexts(iterations, [view.name for view in views])
+        names = [view.name for view in views]
+        contexts = self._contexts(iterations, names)
         self._prefetch(then)
         for context in contexts:
             self.hooks.before_render(context)
@@ -295,10 +303,10 @@ class StageRun:
         gaussians = self.model.field
         rendered, result = self._render(gaussians, [view.camera for view in views], last)
         self.breakdown.mark("loss")
-        images = [rendered] if len(contexts) == 1 else rendered.unbind()
+        parts = [(names, rendered)] if len(contexts) == 1 else zip(([name] for name in names), rendered, strict=True)
         losses = [
-            self.hooks.loss(context, self.hooks.compose(context, image))
-            for context, image in zip(contexts, images, strict=True)
+            self.hooks.loss(context, self._exposed(shown, self.hooks.compose(context, image)))
+            for context, (shown, image) in zip(contexts, parts, strict=True)
         ]
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         kept = loss.detach()
@@ -363,6 +371,10 @@ class StageRun:
             return result.image, result
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
+    def _exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
+        """Return the composed image of a view, or images of several, at the exposure of their photos."""
+        return image if self.exposures is None else self.exposures.apply(names, image)
+
     def _is_joint(self, iteration: int) -> bool:
         """Return whether finished fields are trained jointly in an iteration."""
         return self.joint_from is not None and iteration >= self.joint_from
@@ -411,9 +423,8 @@ class StageRun:
                 image = render_image(self.rasterizer, field, view.camera, self.background, degree)
                 below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
                 self.breakdown.mark("densification")
-                whole = fill_outside(
-                    image if below is None else image + below, target, self.images.get_weights([view.name])
-                )
+                composed = self._exposed([view.name], image if below is None else image + below)
+                whole = fill_outside(composed, target, self.images.get_weights([view.name]))
                 loss = photometric_loss(whole, target, self.settings.ssim_weight)
             return ScoredView(
                 render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
@@ -465,6 +476,7 @@ class StageRun:
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "joint": None if self.joint is None else self.joint.state(),
+            "exposure": None if self.exposures is None else self.exposures.state(),
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -483,6 +495,9 @@ class StageRun:
         if (joint := state.get("joint")) is not None:
             assert self.unfreeze is not None
             self.joint = self.unfreeze(joint)
+        if (exposure := state.get("exposure")) is not None:
+            assert self.exposures is not None, "the trainer looks for it"
+            self.exposures.restore(exposure)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)

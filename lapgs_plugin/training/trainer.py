@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
@@ -38,13 +39,15 @@ from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
+from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
+from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_exposure, check_moments
+from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import OFF, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import level_views
 
@@ -156,6 +159,7 @@ class Trainer:
         if self.gpu_busy:
             require_cuda(self.device)
         self._overhead = Overhead()
+        self._first_exposures: Tensor | None = None
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
         self._test_cache: UpsampledImages | None = None
@@ -175,6 +179,7 @@ class Trainer:
             DeviceMemoryError: the GPU is full; the same is kept.
         """
         checkpoint = self._checkpoint() if resume else None
+        self._first_exposures = self._compensated(checkpoint)
         with stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
@@ -202,6 +207,38 @@ class Trainer:
             check_checkpoint(state, path, stage, self.settings, self.archive.available_levels)
         return state
 
+    def _compensated(self, checkpoint: dict[str, Any] | None) -> Tensor | None:
+        """Return the colour transforms (v, 3, 4) that the run starts with; None if it does not compensate exposure."""
+        names, (*_, last) = [view.name for view in self.scene.train], (None, *self.archive.available_levels)
+        if last is not None:
+            archived = self.archive.exposure(last)
+            return None if archived is None else start_from(archived, names)
+        if checkpoint is not None:
+            return None if checkpoint.get("exposure") is None else identities(len(names))  # `restore` has the others
+        choice = self.settings.exposure
+        if choice == OFF or not self._supervision.composes:
+            return None
+        measured = measure_exposure(self.scene)
+        found, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
+        if choice == AUTO and not differ:
+            return None
+        self.monitor.say(
+            f"exposure differs by {found}: each photo gets a colour transform; --exposure off trains without"
+            if differ
+            else f"exposure differs by {found}, hardly at all; each photo gets a colour transform all the same"
+        )
+        return from_gains(measured.gains) if differ else identities(len(names))
+
+    def _exposures(self, stage: Stage) -> ViewExposures | None:
+        """Return the colour transforms of a stage, as the stage before left them."""
+        if self._first_exposures is None:
+            return None
+        names, levels = [view.name for view in self.scene.train], self.archive.available_levels
+        before = self.archive.exposure(levels[-1]) if levels else None
+        start = self._first_exposures if before is None else start_from(before, names)
+        done = sum(each.iterations for each in self.plan if each.level > stage.level)
+        return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
+
     def _moments(self, level: int, field: GaussianField) -> dict[str, Any]:
         """Return Adam's state that the next level inherits from a finished one with its field."""
         moments = self.archive.optimizer_state(level)
@@ -216,6 +253,8 @@ class Trainer:
         if checkpoint is not None:
             path = self.archive.path(CHECKPOINT)
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
+            views = None if run.exposures is None else len(run.exposures.names)
+            check_exposure(checkpoint.get("exposure"), views, path)
             run.restore(checkpoint)
             if self.breakdown and not run.breakdown.measures:
                 self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
@@ -302,6 +341,7 @@ class Trainer:
             densifier=self.settings.strategy_of(stage).density_control(schedule, self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
+            exposures=self._exposures(stage),
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
@@ -471,7 +511,9 @@ class Trainer:
             gpu_busy_seconds=run.busy.seconds(),
         )
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
-        self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
+        along = None if run.joint is None else run.joint.fields
+        exposure = None if run.exposures is None else run.exposures.archived()
+        self.archive.finish_level(record, field, moments, along, exposure)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property

@@ -86,9 +86,7 @@ class _Transformed(torch.autograd.Function):
         views, _, n = image.shape
         by_image, by_transform = image.new_empty(views, 3, n), torch.zeros_like(transform)
         launch: Any = _gradients[(triton.cdiv(n, BLOCK), views)]
-        launch(
-            image, transform, by_out, by_image, by_transform, n, *image.stride(), *by_out.stride(), block=BLOCK
-        )
+        launch(image, transform, by_out, by_image, by_transform, n, *image.stride(), *by_out.stride(), block=BLOCK)
         return by_image, by_transform
 
 
