@@ -27,6 +27,8 @@ class HistoryEntry(TypedDict):
     elapsed: NotRequired[NonNegativeFloat]
     loss: NotRequired[float]
     psnr: NotRequired[float]
+    sampled_psnr: NotRequired[float]
+    sampled_fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     num_gaussians: NotRequired[NonNegativeInt]
 

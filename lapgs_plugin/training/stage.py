@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -185,6 +185,11 @@ class StageRun:
     def passed(self, every: int) -> bool:
         """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
         return self.progress.iteration % every < self.step_views or self.progress.iteration == self.stage.iterations
+
+    def reached(self, iterations: Collection[int]) -> bool:
+        """Return whether the last step had one of some iterations."""
+        last = self.progress.iteration
+        return any(iteration in iterations for iteration in range(last - self.step_views + 1, last + 1))
 
     @property
     def num_optimized(self) -> int:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
@@ -46,6 +47,7 @@ from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains,
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.quality import SAMPLED_VIEWS, SAMPLES_OF_A_STAGE, QualityWatch, spread_views
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import OFF, TrainSettings
 from lapgs_plugin.training.stage import StageRun
@@ -132,7 +134,8 @@ class Trainer:
         monitor: shows progress.
         checkpoint_every: iterations between two checkpoints; None writes one every minute. One is also written when the
             user stops a run.
-        test_every: iterations between two measurements of held-out PSNR; None measures it at the end of each stage.
+        test_every: iterations between two measurements of all held-out views; None measures all at the end of each
+            stage, and some of them a few times before.
         breakdown: measure the parts of iterations.
         gpu_busy: profile some iterations of each stage; needs a CUDA device.
         watcher: looks at the fields between iterations.
@@ -160,6 +163,8 @@ class Trainer:
             require_cuda(self.device)
         self._overhead = Overhead()
         self._first_exposures: Tensor | None = None
+        self._quality = QualityWatch()
+        self._samples: frozenset[int] = frozenset()  # iterations of the stage after which some views are measured
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
         self._test_cache: UpsampledImages | None = None
@@ -250,6 +255,7 @@ class Trainer:
         self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
         self._memory = PeakMemory(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint))
+        self._samples = run.schedule.sampled(SAMPLES_OF_A_STAGE)
         if checkpoint is not None:
             path = self.archive.path(CHECKPOINT)
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
@@ -432,12 +438,14 @@ class Trainer:
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
+        due_sample = self.test_every is None and run.reached(self._samples)
         due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
-        if due_test or due_tick or stop.requested:
+        if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
-        psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
-        if psnr is not None or due_tick:
-            self._tick(run, psnr)
+        measured = self._held_out(run, due_test, due_sample)
+        if measured or due_tick:
+            self._tick(run, measured)
+        self._watch_quality(run, measured)
         if self.watcher.wants_look():
             run.settle()
             with self._overhead.timed("view"):
@@ -455,7 +463,7 @@ class Trainer:
             return run.progress.iteration % self.checkpoint_every < run.step_views
         return time.monotonic() - self._last_checkpoint >= CHECKPOINT_SECONDS
 
-    def _tick(self, run: StageRun, psnr: float | None) -> None:
+    def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self._last_tick
         progress = run.progress
         self._last_tick = (progress.seconds, progress.iteration)
@@ -467,26 +475,49 @@ class Trainer:
             loss=progress.loss,
             num_gaussians=run.num_optimized,
             rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
-            psnr=psnr,
+            **measured,
         )
         self.archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
         self.monitor.tick(run.stage, tick)
 
+    def _held_out(self, run: StageRun, every: bool, sample: bool) -> dict[str, float]:
+        """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
+        some = spread_views(self.scene.test, SAMPLED_VIEWS) if self.scene.test and sample else []
+        views = self.scene.test if every else some
+        with self._overhead.timed("evaluation") if views else nullcontext():
+            found = {view.name: self._psnr(run, view) for view in views}
+        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
+        if some:
+            plain, fitted = zip(*(found[view.name] for view in some), strict=True)
+            measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}
+        return measured
+
     @torch.no_grad()
-    def _held_out_psnr(self, run: StageRun) -> float:
-        """Return the mean PSNR in dB of the held-out views, composed so far and upsampled to full resolution."""
-        with self._overhead.timed("evaluation"):
-            values = []
-            for view in self.scene.test:
-                camera = level_camera(view.camera, run.stage.level)
-                image = self.rasterizer(run.model.field, camera, background=run.background).image
-                cached = None if self._test_cache is None else self._test_cache.get
-                predict = cached if run.joint is None else run.joint.predict
-                image = add_prediction(image, None if predict is None else predict(view.name))
-                whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
-                mask = None if view.mask is None else view.mask.to(self.device)
-                values.append(psnr(whole, view.image.to(self.device), mask))
-            return math.fsum(values) / len(values)
+    def _psnr(self, run: StageRun, view: View) -> tuple[float, float]:
+        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, as it is and fitted."""
+        camera = level_camera(view.camera, run.stage.level)
+        image = self.rasterizer(run.model.field, camera, background=run.background).image
+        cached = None if self._test_cache is None else self._test_cache.get
+        predict = cached if run.joint is None else run.joint.predict
+        image = add_prediction(image, None if predict is None else predict(view.name))
+        whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
+        mask = None if view.mask is None else view.mask.to(self.device)
+        photo = view.image.to(self.device)
+        return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
+
+    def _watch_quality(self, run: StageRun, measured: Mapping[str, float]) -> None:
+        """Say it if held-out views got worse while the training loss fell."""
+        key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
+        found, level = measured.get(key), run.stage.level
+        if found is None or not self._quality.falls(level, found, run.progress.loss):
+            return
+        helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
+        if run.exposures is None and self._supervision.composes:
+            helps.insert(0, "--exposure on if brightness or colours of the photos change")
+        self.monitor.say(
+            f"level {level}, iteration {run.progress.iteration}: held-out PSNR fell to {found:.1f} dB from "
+            f"{self._quality.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
+        )
 
     def _save_checkpoint(self, run: StageRun) -> None:
         with self._overhead.timed("checkpoints"):
