@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, continues_field, nested_densify_until
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage
 
 if TYPE_CHECKING:
     import torch
@@ -173,11 +173,6 @@ class StageWindow:
     residual_color_rate: float
     threshold_factor: float
 
-    @property
-    def continues_field(self) -> bool:
-        """Whether this stage continues training the previous level's field."""
-        return continues_field(self.stage, self.levels)
-
     def scaled(self, iterations: int) -> int:
         """Return a number of iterations of the whole run's schedule as the same share of this stage."""
         return round(iterations * self.stage.iterations / self.total)
@@ -270,8 +265,7 @@ class BackboneAdapter(ABC):
         dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
-        until = window.scaled(opt.densify_until_iter)
-        opt.densify_until_iter = nested_densify_until(until) if window.continues_field else until
+        opt.densify_until_iter = window.scaled(opt.densify_until_iter)
         opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
         for name in self.info.densify_thresholds:
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
@@ -315,6 +309,18 @@ class BackboneAdapter(ABC):
 
     def stage_scene(self, scene: Any) -> None:  # noqa: B027 - few need it
         """Receive the scene that a stage trains on, before its first iteration."""
+
+    def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:  # noqa: B027 - few need it
+        """Bring a model to the state that its class has after an iteration of the whole run, besides its parameters.
+
+        Args:
+            call: the call of the script's `training` that continues after `iteration`.
+            gaussians: the checkout's model, with parameters, optimizer state and SH degree of that iteration.
+            iteration: the last finished one.
+
+        Raises:
+            UserInputError: the checkout cannot continue there.
+        """
 
     def new_model(self, call: TrainingCall) -> Any:
         """Return a GaussianModel without Gaussians, made as the script makes it."""

@@ -6,10 +6,12 @@ Imports succeed, and so do the few functions that training calls. Any other name
 
 from __future__ import annotations
 
+import pickle
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sized
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
@@ -25,9 +27,15 @@ __all__ = ["absent_modules"]
 Item = TypeVar("Item")
 
 
-def absent_modules() -> dict[str, ModuleType]:
-    """Return stand-ins for the known packages that are not installed, by full module name."""
+def absent_modules(logs: bool = False) -> dict[str, ModuleType]:
+    """Return stand-ins for the known packages that are not installed, by full module name.
+
+    Args:
+        logs: also for TensorBoard, which most checkouts do without by themselves.
+    """
     found: dict[str, ModuleType] = {}
+    if logs and find_spec("tensorboard") is None:
+        found[_LOGS] = _AbsentModule(_LOGS, "tensorboard", {"SummaryWriter": _NoLog})
     for package, (distribution, modules) in _PACKAGES.items():
         if package in sys.modules or find_spec(package) is not None:
             continue
@@ -120,6 +128,25 @@ class _Progress(Generic[Item]):
         self._closed = True
 
 
+def _dump(value: object, path: str) -> None:
+    """Pickle a value to a file, which joblib can read."""
+    Path(path).write_bytes(pickle.dumps(value))
+
+
+class _NoLog:
+    """Take the place of TensorBoard's SummaryWriter, and write nothing."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        """Take the arguments of the class."""
+
+    def add_scalar(self, *_: object, **__: object) -> None:
+        """Do nothing."""
+
+    add_histogram = add_images = add_image = close = flush = add_scalar
+
+
+_LOGS = "torch.utils.tensorboard"
+
 _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
     # Taming-3DGS finds edges with the two transforms; only LPIPS uses the networks.
     "torchvision": (
@@ -135,5 +162,12 @@ _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
     # The viewers of FastGS and Taming-3DGS use it; they are off by default.
     "websockets": ("websockets", {"websockets": {}}),
     "tqdm": ("tqdm", {"tqdm": {"tqdm": _Progress}}),
+    # Mip-Splatting imports it without using it.
+    "open3d": ("open3d", {"open3d": {}}),
+    # 2DGS draws curves and depths with it.
+    "matplotlib": ("matplotlib", {"matplotlib": {}, "matplotlib.pyplot": {}, "matplotlib.cm": {}}),
+    # EfficientGS reads scenes that it has packed, and logs; its logs are left out.
+    "joblib": ("joblib", {"joblib": {"dump": _dump}}),
+    "h5py": ("h5py", {"h5py": {}}),
 }
 """For each package, the distribution to install and the names that its modules offer here."""

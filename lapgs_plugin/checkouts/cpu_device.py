@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from lapgs_plugin.checkouts.absent_modules import absent_modules
-from lapgs_plugin.reference_raster.standins import install
+from lapgs_plugin.reference_raster.standins import VARIANTS, install
 
 __all__ = ["cuda_on_cpu"]
 
@@ -43,7 +43,7 @@ def cuda_on_cpu(variant: str) -> Iterator[None]:
     import_module("torch._dynamo")  # it has tables of torch.cuda's functions, and optimizers import it later
     with ExitStack() as stack:
         stack.enter_context(install(variant))
-        stack.enter_context(_replaced(sys.modules, absent_modules()))
+        stack.enter_context(_replaced(sys.modules, absent_modules(VARIANTS[variant].needs_logs)))
         stack.enter_context(_replaced(vars(torch.cuda), _WITHOUT_CUDA))
         stack.enter_context(_replaced(vars(torch), {"load": _loading_to_cpu(torch.load)}))
         mode = _CudaMeansCpu()

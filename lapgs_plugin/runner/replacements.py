@@ -60,8 +60,9 @@ class StageReplacements:
         ]
 
     def _window(self) -> StageWindow | None:
+        """Return the running stage if its schedule is not the checkout's own."""
         stage = self._running()
-        return None if stage is None else stage.window
+        return None if stage is None or stage.keeps_schedule else stage.window
 
     def _imported(self, name: str) -> ModuleType:
         """Return a module that the script has imported."""
@@ -137,7 +138,7 @@ class StageReplacements:
     def _before_iteration(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def update_learning_rate(gaussians: Any, iteration: int) -> Any:
             if (stage := self._running()) is not None:
-                stage.iteration_begins(gaussians, iteration)
+                stage.iteration_begins(gaussians)
             return original(gaussians, iteration)
 
         return update_learning_rate

@@ -105,12 +105,6 @@ class StageImages:
         """Bytes of this stage's images on the GPU."""
         return sum(store.bytes_on_device for store in self._all_stores)
 
-    @property
-    def wait_elsewhere(self) -> bool:
-        """Whether some images must be copied to the device before use."""
-        from_memory = self._device.type == "cuda"
-        return any(store.bytes_on_disk or (from_memory and store.bytes_in_memory) for store in self._all_stores)
-
     def close(self) -> None:
         """Drop all images."""
         for store in self._all_stores:

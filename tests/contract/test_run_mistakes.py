@@ -33,6 +33,7 @@ from tests.contract.stub_runs import (
     arguments,
     captured,
     drive,
+    drive_residuals,
     forgetting_stubs,
     loaded,
     run_bare,
@@ -213,8 +214,8 @@ def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_pat
                 self.prune_points(torch.ones(len(self.get_xyz), dtype=torch.bool))
 
         setattr(model, method, spy)
-        with pytest.raises(TrainingDivergedError, match=r"no Gaussian at level 0, iteration [0-9]+ of 45") as caught:
-            drive(adapter)
+        with pytest.raises(TrainingDivergedError, match=r"no Gaussian at level 0, iteration [0-9]+ of 60") as caught:
+            drive_residuals(adapter)
     assert "finished levels (1) are kept" in one_line(caught.value)
     assert RunArchive.open(folder).available_levels == (1,)
 

@@ -19,9 +19,10 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster.standins import fused_ssim, simple_knn
 from lapgs_plugin.reference_raster.standins.binding import rasterizer_module
-from lapgs_plugin.reference_raster.standins.variants import VARIANTS
+from lapgs_plugin.reference_raster.standins.choice import variant_for
+from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS
 
-__all__ = ["VARIANTS", "install", "stand_ins"]
+__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "variant_for"]
 
 
 def stand_ins(variant: str) -> dict[str, ModuleType]:
@@ -32,11 +33,15 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
     """
     if variant not in VARIANTS:
         raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
-    name = VARIANTS[variant].module
     ssim = {"fusedssim": fused_ssim.fusedssim, "fusedssim_backward": fused_ssim.fusedssim_backward}
-    found = {
-        name: _module(name, rasterizer_module(variant), package=True),
-        f"{name}._C": _module(f"{name}._C", ssim if VARIANTS[variant].fused_ssim else {}),
+    found = {}
+    for each in (variant, *VARIANTS[variant].beside):
+        name = VARIANTS[each].module
+        for parent in _parents(name):
+            found[parent] = _module(parent, {}, package=True)
+        found[name] = _module(name, rasterizer_module(each), package=True)
+        found[f"{name}._C"] = _module(f"{name}._C", ssim if VARIANTS[each].fused_ssim else {})
+    found |= {
         "simple_knn": _module("simple_knn", {}, package=True),
         "simple_knn._C": _module("simple_knn._C", {"distCUDA2": simple_knn.distCUDA2}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
@@ -46,6 +51,12 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
         if parent:
             setattr(found[parent], child, module)
     return found
+
+
+def _parents(name: str) -> list[str]:
+    """Return the packages that a module is in, outermost first."""
+    parts = name.split(".")
+    return [".".join(parts[:i]) for i in range(1, len(parts))]
 
 
 @contextmanager

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import namedtuple
 from functools import lru_cache
+from importlib import import_module
+from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
@@ -14,7 +16,7 @@ from lapgs_plugin.reference_raster.standins.engine import Inputs, Settings, mark
 from lapgs_plugin.reference_raster.standins.variants import VARIANTS, Variant
 
 
-class _Rasterizer(nn.Module):
+class Rasterizer(nn.Module):
     """Render Gaussians with the settings of one view; see `engine.Inputs` for shapes and `Variant.outputs`."""
 
     variant: ClassVar[Variant]
@@ -32,7 +34,7 @@ class _Rasterizer(nn.Module):
         return self.variant.outputs(settings, rasterize(settings, inputs, self.variant.options(settings)))
 
 
-class _WholeSh(_Rasterizer):
+class WholeSh(Rasterizer):
     """Take all SH coefficients in one argument."""
 
     def forward(
@@ -51,7 +53,7 @@ class _WholeSh(_Rasterizer):
         )
 
 
-class _DcApart(_Rasterizer):
+class DcApart(Rasterizer):
     """Take the first SH coefficient apart from the others."""
 
     def forward(
@@ -75,18 +77,34 @@ class _DcApart(_Rasterizer):
 def rasterizer_module(name: str) -> dict[str, Any]:
     """Return the public names of the stand-in for a variant's module; always the same classes."""
     variant = VARIANTS[name]
-    found: dict[str, Any] = {
-        "__doc__": variant.description,
+    found: dict[str, Any] = {"__doc__": variant.description}
+    found |= {function: vars(_forks())[function] for function in variant.functions}
+    if not variant.settings:
+        return found
+    found |= {
         "GaussianRasterizationSettings": namedtuple("GaussianRasterizationSettings", variant.settings),
         "GaussianRasterizer": type(
             "GaussianRasterizer",
-            (_DcApart if variant.dc_apart else _WholeSh,),
-            {"variant": variant, "__doc__": _Rasterizer.__doc__},
+            (_binding(variant),),
+            {"variant": variant, "__doc__": Rasterizer.__doc__},
         ),
     }
     if variant.sparse_adam:
         found["SparseGaussianAdam"] = SparseGaussianAdam
     return found
+
+
+def _forks() -> ModuleType:
+    """Return the module of forks' own bindings, which imports this one."""
+    return import_module("lapgs_plugin.reference_raster.standins.forks")
+
+
+def _binding(variant: Variant) -> type[Rasterizer]:
+    """Return the class that takes the arguments of a variant's `forward`."""
+    if variant.binding:
+        found: type[Rasterizer] = vars(_forks())[variant.binding]
+        return found
+    return DcApart if variant.dc_apart else WholeSh
 
 
 def gather(

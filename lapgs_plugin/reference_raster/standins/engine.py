@@ -18,6 +18,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION, SIGNED_COLOR_BIT
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
+from lapgs_plugin.reference_raster.standins.blending import Blending
 from lapgs_plugin.reference_raster.standins.contributions import Contributions, contributions
 from lapgs_plugin.reference_raster.standins.covariance import (
     antialiasing_factors,
@@ -94,12 +95,14 @@ class Options:
         antialiasing: dim Gaussians that are smaller than a pixel.
         inverse_depth: also blend 1 / depth.
         pixel_weights: (height * width,) float32 to sum up for each Gaussian, or None.
+        blending: return how each pixel is blended.
     """
 
     mult: float | None = None
     antialiasing: bool = False
     inverse_depth: bool = False
     pixel_weights: Tensor | None = None
+    blending: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,7 @@ class Output:
         centres: (n, 2) pixels, 0 where culled.
         depths: (n,) camera-space z, 0 where culled.
         contributions: None without pixel weights.
+        blending: None if not asked for.
     """
 
     image: Tensor
@@ -121,6 +125,7 @@ class Output:
     centres: Tensor
     depths: Tensor
     contributions: Contributions | None
+    blending: Blending | None = None
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
@@ -147,8 +152,9 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     assert call.centres is not None
     assert call.depths is not None
     return Output(
-        image, radii, inverse_depths if options.inverse_depth else None, call.centres, call.depths, call.contributions
-    )
+        image, radii, inverse_depths if options.inverse_depth else None, call.centres, call.depths, call.contributions,
+        call.blending,
+    )  # fmt: skip
 
 
 def view_of(settings: Settings) -> View:
@@ -188,6 +194,7 @@ class _Call:
         self.centres: Tensor | None = None
         self.depths: Tensor | None = None
         self.contributions: Contributions | None = None
+        self.blending: Blending | None = None
 
     def gaussians(self, tensors: tuple[Tensor | None, ...]) -> Gaussians:
         """Return the tensors as the kernels take them."""
@@ -233,7 +240,8 @@ class _Rasterize(torch.autograd.Function):
         gaussians = call.gaussians(tensors)
         weights = call.options.pixel_weights
         n = len(gaussians.means)
-        rendering = call.render(gaussians, call.background, call.keep or weights is not None)
+        keep = call.keep or weights is not None or call.options.blending
+        rendering = call.render(gaussians, call.background, keep)
         image, radii, call.centres = (
             torch.from_numpy(array) for array in (rendering.image, rendering.radii, rendering.centres)
         )
@@ -245,6 +253,9 @@ class _Rasterize(torch.autograd.Function):
             assert rendering.kept is not None
             flat = weights.detach().to("cpu", torch.float32).contiguous().reshape(-1).numpy()
             call.contributions = contributions(n, call.view, rendering.kept, flat)
+        if call.options.blending:
+            assert rendering.kept is not None
+            call.blending = Blending(n, call.view, rendering.kept, call.background)
         inverse_depths = torch.empty(0)
         if call.options.inverse_depth:
             behind = call.render(call.shaded_by_depth(gaussians), np.zeros(3, np.float32), False)

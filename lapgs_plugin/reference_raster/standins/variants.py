@@ -7,6 +7,10 @@ Matrices are transposed, as in the CUDA bindings. Settings beside those of the v
     metric_map      FastGS: (height * width,) int32, 1 marks a pixel
     antialiasing    graphdeco: dim Gaussians that are smaller than a pixel
     pixel_weights   Taming-3DGS: (height, width) float32 to sum up for each Gaussian, or None
+    kernel_size     Mip-Splatting: variance of the blur, in px^2
+    subpixel_offset Mip-Splatting: (height, width, 2) added to the pixels' positions
+    use_train_speedup, ignored_rate, lambda_dssim, use_hwc
+                    EfficientGS: skip tiles in the backward pass; image as (height, width, 3)
 """
 
 from __future__ import annotations
@@ -39,6 +43,10 @@ class Variant:
         dc_apart: whether `forward` takes the first SH coefficient as an argument of its own.
         sparse_adam: whether the module has `SparseGaussianAdam`.
         fused_ssim: whether its binding `_C` has SSIM.
+        binding: class in `forks` with its `forward`, if that differs from graphdeco's.
+        functions: functions in `forks` that its module has besides the rasterizer.
+        beside: variants of other modules that the same checkouts import.
+        needs_logs: whether these checkouts cannot do without TensorBoard.
     """
 
     description: str
@@ -49,6 +57,10 @@ class Variant:
     dc_apart: bool = False
     sparse_adam: bool = False
     fused_ssim: bool = False
+    binding: str = ""
+    functions: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    needs_logs: bool = False
 
 
 def _image_and_radii(settings: Any, output: Output) -> tuple[Tensor, ...]:
@@ -94,11 +106,35 @@ def _with_sums(settings: Any, output: Output) -> tuple[Tensor, ...]:
     return output.image, output.radii, counts, *lists, output.centres, output.depths, output.radii.clone(), *sums
 
 
+def _with_shares(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return the image, the radii, and of each Gaussian the sum of shares, its pixels, and those it leads."""
+    from lapgs_plugin.reference_raster.standins.forks import with_shares
+
+    return with_shares(settings, output)
+
+
+def _with_total_share(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return the image, the radii, and the sum of each Gaussian's shares (n,)."""
+    assert output.contributions is not None
+    return output.image, output.radii, torch.from_numpy(output.contributions.blending).float()
+
+
+def _with_blended(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return the image, the radii, and whether each Gaussian is blended in some pixel, (n,) int32."""
+    assert output.contributions is not None
+    return output.image, output.radii, (torch.from_numpy(output.contributions.counts) > 0).int()
+
+
+def _summing(settings: Any) -> Options:
+    """Ask for sums over all pixels."""
+    return Options(pixel_weights=torch.ones(settings.image_height * settings.image_width))
+
+
 def _weight_rows(settings: Any) -> int:
     return 0 if settings.pixel_weights is None else len(settings.pixel_weights)
 
 
-VARIANTS = {
+BACKBONES = {
     "graphdeco": Variant(
         "Stand in for graphdeco's rasterizer, branch main.",
         (*_VIEW, "prefiltered", "debug"),
@@ -153,3 +189,84 @@ VARIANTS = {
     ),
 }
 """By name, as `BackboneInfo.stand_in` gives it; most are also names of recipes in patches/."""
+
+FORKS = {
+    "speedy-splat": Variant(
+        "Stand in for the rasterizer of Speedy-Splat: with the scores that it prunes by.",
+        (*_VIEW, "prefiltered", "debug"),
+        lambda settings: Options(),
+        _image_and_radii,
+        binding="SpeedySplat",
+    ),
+    "mini-splatting": Variant(
+        "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
+        (*_VIEW, "prefiltered", "debug"),
+        lambda settings: Options(blending=True),
+        _with_shares,
+        module="diff_gaussian_rasterization_ms",
+        binding="MiniSplatting",
+        beside=("graphdeco",),
+    ),
+    "mini-splatting2": Variant(
+        "Stand in for the rasterizer of Mini-Splatting2: as Mini-Splatting's, with culling.",
+        (*_VIEW, "prefiltered", "debug"),
+        lambda settings: Options(blending=True),
+        _with_shares,
+        module="diff_gaussian_rasterization_ms",
+        dc_apart=True,
+        sparse_adam=True,
+        fused_ssim=True,
+        binding="MiniSplatting2",
+        beside=("graphdeco",),
+    ),
+    "3dgs-mcmc": Variant(
+        "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",
+        (*_VIEW, "prefiltered", "debug"),
+        _summing,
+        _with_blended,
+        functions=("compute_relocation",),
+    ),
+    "absgs": Variant(
+        "Stand in for the rasterizer of AbsGS: with absolute gradients and the sum of shares.",
+        (*_VIEW, "prefiltered", "debug"),
+        _summing,
+        _with_total_share,
+        module="diff_gaussian_rasterization_abs",
+    ),
+    "mip-splatting": Variant(
+        "Stand in for the rasterizer of Mip-Splatting: with antialiasing of 0.3 px^2.",
+        (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
+        lambda settings: Options(antialiasing=True),
+        _image_and_radii,
+        binding="MipSplatting",
+    ),
+    "efficientgs": Variant(
+        "Stand in for the rasterizer of EfficientGS: with the largest shares, and SH degrees of each Gaussian.",
+        (*_VIEW, "prefiltered", "debug", "use_train_speedup", "ignored_rate", "lambda_dssim", "use_hwc"),
+        lambda settings: Options(),
+        _image_and_radii,
+        binding="EfficientGS",
+        needs_logs=True,
+    ),
+    "2dgs": Variant(
+        "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
+        (*_VIEW, "prefiltered", "debug"),
+        lambda settings: Options(),
+        _image_and_radii,
+        module="diff_surfel_rasterization",
+        binding="Surfels",
+    ),
+    "faster-gs": Variant(
+        "Stand in for the rasterizer of Faster-GS: a function of raw parameters, and its Adam.",
+        (),
+        lambda settings: Options(),
+        _image_and_radii,
+        module="FasterGSCudaBackend.torch_bindings",
+        functions=("diff_rasterize", "RasterizerSettings", "FusedAdam"),
+        beside=("graphdeco-aa",),
+    ),
+}
+"""Rasterizers of forks, whose modules or arguments are their own."""
+
+VARIANTS = {**BACKBONES, **FORKS}
+"""All variants by name."""

@@ -1,0 +1,390 @@
+"""Bind forks' rasterizers whose `forward` takes other arguments than graphdeco's, or that have other methods.
+
+Each class is the `GaussianRasterizer` of a variant; see `variants.Variant.binding`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import normalize
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.standins.binding import Rasterizer, WholeSh, gather
+from lapgs_plugin.reference_raster.standins.blending import Blending
+from lapgs_plugin.reference_raster.standins.covariance import covariances_of, matrices
+from lapgs_plugin.reference_raster.standins.engine import Inputs, Options, Output, rasterize
+
+logger = logging.getLogger(__name__)
+
+THIN = 1e-4
+"""Third standard deviation of a surfel, over its larger one."""
+
+
+class SpeedySplat(Rasterizer):
+    """Return image, radii, seconds; the gradient of `scores` (n, 1) is a sum of squared derivatives over pixels."""
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        scores: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        inputs = gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        output = rasterize(self.raster_settings, inputs, Options(blending=scores.requires_grad))
+        image = output.image
+        if output.blending is not None:
+            image = _Scored.apply(image, scores, output.blending)  # type: ignore[no-untyped-call]  # torch's
+        return image, output.radii, torch.zeros(1)
+
+
+class _Scored(torch.autograd.Function):
+    """Pass an image (3, h, w) through; the gradient of the scores (n, 1) is that of `squared_gradients`."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, scores: Tensor, blending: Blending) -> Tensor:
+        ctx.blending = blending
+        return image.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor | None, ...]:
+        found = ctx.blending.squared_gradients(grad_image.reshape(3, -1).numpy())
+        return grad_image, torch.from_numpy(found).float()[:, None], None
+
+
+class MiniSplatting(WholeSh):
+    """Return image, radii, and each Gaussian's shares, pixels, and pixels that it has the largest share of."""
+
+    def render_depth(
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **more: Tensor | None
+    ) -> dict[str, Any]:
+        """Return the points (3, h, w) at which rays come nearest to the Gaussian of the largest share, and their depth.
+
+        `accum_alpha` (1, h, w) is the transmittance behind all Gaussians, as in the CUDA code.
+        """
+        arguments = ("dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
+        inputs = gather(means3D, means2D, opacities, *(more.get(name) for name in arguments))
+        return _depths_of_leaders(self.raster_settings, inputs)
+
+
+class MiniSplatting2(MiniSplatting):
+    """Take the first SH coefficient apart, and leave out the Gaussians marked in `culling` (n,) bool."""
+
+    def forward(  # type: ignore[override]  # as the CUDA binding
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        culling: Tensor,
+        dc: Tensor | None = None,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+        flag_max_count: bool = False,
+    ) -> tuple[Tensor, ...]:
+        opacities = torch.where(culling[:, None], 0.0, opacities)
+        inputs = gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        output = rasterize(self.raster_settings, inputs, Options(blending=flag_max_count))
+        leads = torch.zeros(len(means3D)) if output.blending is None else _pixels_led(output.blending)
+        return output.image, torch.where(culling, 0, output.radii), leads
+
+    def render_simp(
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, culling: Tensor, **more: Tensor | None
+    ) -> tuple[Tensor, ...]:
+        """Return what Mini-Splatting's `forward` returns."""
+        arguments = ("dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
+        opacities = torch.where(culling[:, None], 0.0, opacities)
+        inputs = gather(means3D, means2D, opacities, *(more.get(name) for name in arguments))
+        return with_shares(self.raster_settings, rasterize(self.raster_settings, inputs, Options(blending=True)))
+
+    def render_depth(  # type: ignore[override]  # as the CUDA binding
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, culling: Tensor, **more: Tensor | None
+    ) -> dict[str, Any]:
+        return super().render_depth(means3D, means2D, torch.where(culling[:, None], 0.0, opacities), **more)
+
+
+def with_shares(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return image, radii, and each Gaussian's shares, pixels, and pixels that it has the largest share of."""
+    blending = output.blending
+    assert blending is not None
+    shares, counts = torch.from_numpy(blending.shares()).float(), torch.from_numpy(blending.counts())
+    return output.image, output.radii, shares, counts, _pixels_led(blending)
+
+
+def _pixels_led(blending: Blending) -> Tensor:
+    """Return the number of pixels that each Gaussian has the largest share of, (n,) float32."""
+    (leaders,) = torch.from_numpy(blending.leaders())
+    return torch.bincount(leaders[leaders >= 0], minlength=blending.n).float()
+
+
+@torch.no_grad()
+def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
+    height, width = int(settings.image_height), int(settings.image_width)
+    output = rasterize(settings, inputs, Options(blending=True))
+    assert output.blending is not None
+    assert inputs.scales is not None, "render_depth takes scales and rotations"
+    assert inputs.quats is not None
+    (leaders,) = torch.from_numpy(output.blending.leaders())
+    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    across = ((2 * column + 1) / width - 1) * settings.tanfovx
+    down = ((2 * row + 1) / height - 1) * settings.tanfovy
+    in_camera = torch.stack([across, down, torch.ones_like(across)], -1).reshape(-1, 3)
+    rays = normalize(in_camera @ settings.viewmatrix[:3, :3].T, dim=1)  # (pixels, 3) in world coordinates
+    at = leaders.clamp_min(0)
+    covariances = matrices(covariances_of(inputs.scales * 3, inputs.quats))[at]
+    inverse = torch.linalg.inv(covariances.double()).float()
+    origin = settings.campos - inputs.means[at]
+    along = (inverse @ rays[:, :, None])[:, :, 0]
+    a, b = (rays * along).sum(1), 2 * (origin * along).sum(1)
+    c = (origin * (inverse @ origin[:, :, None])[:, :, 0]).sum(1) - 1
+    distance = torch.where(leaders >= 0, -b / (2 * a), 0.0)
+    points = torch.where(leaders[:, None] >= 0, settings.campos + distance[:, None] * rays, 0.0)
+    # The ray of the CUDA code ends near depth 1, where its length is 1 / cos.
+    depth = distance / in_camera.norm(dim=1)
+    shape = (1, height, width)
+    return {
+        "render": output.image,
+        "out_pts": points.T.reshape(3, height, width),
+        "rendered_depth": depth.reshape(shape),
+        "discriminants": torch.where(leaders >= 0, b * b - 4 * a * c, 0.0).reshape(shape),
+        "gidx": at.int().reshape(shape),
+        "accum_alpha": torch.from_numpy(output.blending.remaining()).float().reshape(shape),
+    }
+
+
+class MipSplatting(WholeSh):
+    """Render with antialiasing; the third column of the gradient by `means2D` sums absolute values.
+
+    DEPARTURE: the image is blurred by 0.3 px^2 instead of `kernel_size`.
+    """
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        settings = self.raster_settings
+        if bool((settings.subpixel_offset != 0).any()):
+            raise UserInputError(
+                "the CPU stand-in of Mip-Splatting's rasterizer has no subpixel_offset, expected all zeros; leave out "
+                "--ray_jitter, or train on a GPU"
+            )
+        if settings.kernel_size != PIXEL_VARIANCE:
+            _say_once(
+                f"the CPU stand-in of Mip-Splatting's rasterizer takes kernel_size {PIXEL_VARIANCE}, "
+                f"not {settings.kernel_size}"
+            )
+        four = _Padded.apply(inputs.means2d)  # type: ignore[no-untyped-call]  # torch's
+        return super()._render(replace(inputs, means2d=four))
+
+
+class _Padded(torch.autograd.Function):
+    """Map (n, 3) to (n, 4); the gradient's last two columns are added up."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor) -> Tensor:
+        return points.new_zeros(len(points), 4)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return torch.cat([gradient[:, :2], gradient[:, 2:].sum(1, keepdim=True)], 1)
+
+
+_SAID: set[str] = set()
+
+
+def _say_once(line: str) -> None:
+    if line not in _SAID:
+        _SAID.add(line)
+        logger.warning("%s", line)
+
+
+class EfficientGS(Rasterizer):
+    """Return image, radii and six tensors, of which those that the options ask for here are filled.
+
+    They are: whether a Gaussian is among the `top_k` largest shares of a pixel (n,) int32, three that are empty,
+    sums of pixel losses times shares (n,), and two that are empty.
+    """
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        gt_image: Tensor | None,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+        top_k: int = 1,
+        pix_loss: Tensor | None = None,
+        sparse_shs_degree: Tensor | None = None,
+        extract_gs_info: bool = False,
+        reg_loss_k: int = -1,
+        in_gs_info: Tensor | None = None,
+        extract_gs_rays_num: bool = False,
+        max_gs_num: int = -1,
+        gs_radius: float = 3.0,
+    ) -> tuple[Tensor, ...]:
+        if extract_gs_info or reg_loss_k >= 0 or extract_gs_rays_num or max_gs_num > 0 or gs_radius != 3:
+            raise UserInputError(
+                "the CPU stand-in of EfficientGS's rasterizer has no regularisation, rays or other radius; leave these "
+                "options out, or train on a GPU"
+            )
+        settings = self.raster_settings
+        if settings.use_train_speedup:
+            raise UserInputError(
+                "the CPU stand-in of EfficientGS's rasterizer has no --use_train_speedup; leave it out"
+            )
+        if shs is not None and sparse_shs_degree is not None and len(sparse_shs_degree):
+            degrees = torch.arange(shs.shape[1]).sqrt().floor()  # of each coefficient
+            shs = shs * (degrees <= sparse_shs_degree[:, None])[:, :, None]
+        inputs = gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        output = rasterize(settings, inputs, Options(blending=top_k > 0 or pix_loss is not None))
+        n, empty = len(means3D), torch.empty(0)
+        largest, losses = torch.zeros(n, dtype=torch.int32), empty
+        if output.blending is not None and top_k > 0:
+            found = torch.from_numpy(output.blending.leaders(top_k))
+            largest[found[found >= 0]] = 1
+        if output.blending is not None and pix_loss is not None:
+            total = pix_loss.detach().sum(0).reshape(-1).numpy()
+            losses = torch.from_numpy(output.blending.weighted_shares(total)).float()
+        image = output.image.permute(1, 2, 0) if settings.use_hwc else output.image
+        return image, output.radii, largest, empty, empty, losses, empty, empty
+
+
+class Surfels(WholeSh):
+    """Render 2DGS's surfels as very flat Gaussians; return image, radii, and seven maps (7, h, w).
+
+    The maps are depth times alpha, alpha, normals times alpha, depth, distortion.
+
+    DEPARTURE: rays are not intersected with surfels, the second depth is the first over alpha, distortion is zero.
+    """
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        settings = self.raster_settings
+        assert inputs.scales is not None, "2DGS without precomputed transformations"
+        assert inputs.quats is not None
+        w, x, y, z = inputs.quats.unbind(1)
+        third = inputs.scales.detach().max(1, keepdim=True).values * THIN
+        inputs = replace(inputs, scales=torch.cat([inputs.scales, third], 1))
+        output = rasterize(settings, inputs, Options())
+        depths = inputs.means @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
+        normals = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+        normals = normals @ settings.viewmatrix[:3, :3]
+        centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
+        normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
+        black = settings._replace(bg=torch.zeros(3))
+        unshaded = replace(inputs, sh=None, means2d=torch.zeros_like(inputs.means2d))
+        blended = [
+            rasterize(black, replace(unshaded, colors=colors), Options())
+            for colors in (torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1), normals)
+        ]
+        depth, alpha = blended[0].image[:1], blended[0].image[1:2]
+        middle = (depth / alpha.clamp_min(1e-6)).detach()
+        maps = torch.cat([depth, alpha, blended[1].image, middle, torch.zeros_like(depth)])
+        return output.image, output.radii, maps
+
+
+def compute_relocation(
+    opacity: Tensor, scale: Tensor, copies: Tensor, binoms: Tensor, n_max: int
+) -> tuple[Tensor, Tensor]:
+    """Return opacity (n,) and scale (n, 3) of copies that together look like one Gaussian.
+
+    See equation 9 of "3D Gaussian Splatting as Markov Chain Monte Carlo". `binoms` (n_max, n_max) are the binomial
+    coefficients.
+    """
+    new = 1 - (1 - opacity) ** (1 / copies)
+    powers = torch.arange(n_max)
+    signs = (-1.0) ** powers / (powers + 1.0).sqrt()
+    terms = signs * new.reshape(-1, 1) ** (powers + 1)  # (n, n_max) by k
+    sums = terms @ binoms.cpu().T  # (n, n_max) by i - 1; binoms[i, k] is 0 for k > i
+    total = (sums * (powers < copies.reshape(-1, 1))).sum(1).reshape(opacity.shape)
+    return new, (opacity / total).reshape(-1, 1) * scale
+
+
+class RasterizerSettings(NamedTuple):
+    """Declare the settings of Faster-GS: matrices by rows, the number of SH coefficients instead of the degree."""
+
+    w2c: Tensor
+    cam_position: Tensor
+    bg_color: Tensor
+    active_sh_bases: int
+    width: int
+    height: int
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
+    near_plane: float
+    far_plane: float
+    proper_antialiasing: bool
+
+
+def diff_rasterize(
+    means: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    opacities: Tensor,
+    sh_coefficients_0: Tensor,
+    sh_coefficients_rest: Tensor,
+    densification_info: Tensor,
+    rasterizer_settings: RasterizerSettings,
+) -> Tensor:
+    """Return the image (3, h, w) of raw parameters, and add visits and screen gradients to `densification_info`.
+
+    Args:
+        scales: (n, 3) logarithms.
+        opacities: (n, 1) logits.
+        densification_info: (2, n), changed by the backward pass.
+    """
+    given = rasterizer_settings
+    tan_x, tan_y = given.width / (2 * given.focal_x), given.height / (2 * given.focal_y)
+    projection = torch.zeros(4, 4)
+    projection[0, 0], projection[1, 1], projection[3, 2] = 1 / tan_x, 1 / tan_y, 1
+    projection[0, 2] = 2 * given.center_x / given.width - 1
+    projection[1, 2] = 2 * given.center_y / given.height - 1
+    projection[2, 2], projection[2, 3] = 1, -given.near_plane
+    pose = given.w2c if len(given.w2c) == 4 else torch.cat([given.w2c, torch.tensor([[0.0, 0, 0, 1]])])
+    settings: Any = SimpleNamespace(
+        image_height=given.height, image_width=given.width, tanfovx=tan_x, tanfovy=tan_y, bg=given.bg_color,
+        scale_modifier=1.0, viewmatrix=pose.T, projmatrix=(projection @ pose).T,
+        sh_degree=math.isqrt(given.active_sh_bases) - 1, campos=given.cam_position,
+    )  # fmt: skip
+    points = torch.zeros_like(means, requires_grad=True)
+    inputs = Inputs(
+        means, points, opacities.sigmoid(), torch.cat([sh_coefficients_0, sh_coefficients_rest], 1), None,
+        scales.exp(), normalize(rotations), None,
+    )  # fmt: skip
+    output = rasterize(settings, inputs, Options(antialiasing=given.proper_antialiasing))
+
+    def note(gradient: Tensor) -> None:
+        if len(densification_info):
+            densification_info[0] += output.radii > 0
+            densification_info[1] += gradient[:, :2].norm(dim=1)
+
+    if points.requires_grad and output.image.requires_grad:
+        points.register_hook(note)  # type: ignore[no-untyped-call]  # torch's
+    return output.image
+
+
+class FusedAdam(torch.optim.Adam):
+    """Step as torch.optim.Adam does, with the arguments of Faster-GS."""
+
+    def __init__(self, params: Any, lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)

@@ -1,0 +1,273 @@
+"""Stand-ins of forks' rasterizers against autograd in float64, closed forms and graphdeco's stand-in."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.reference_raster.oracle import project
+from lapgs_plugin.reference_raster.standins import FORKS, VARIANTS, stand_ins, variant_for
+from lapgs_plugin.reference_raster.standins.forks import compute_relocation
+from tests.raster.scenes import Case
+from tests.raster.test_standins import activated, call, case_of, module_of, relative, settings_of
+
+BOUND = 2e-5
+"""Relative; sums in float32 and in float64. Worst seen: 3e-7."""
+
+
+def blended(case: Case) -> tuple[Tensor, Tensor]:
+    """Return shares (n, h, w) of the Gaussians in the pixels, and a leaf (n, h, w) that their values are scaled by.
+
+    Written from the equations in float64, with three-sigma squares in whole tiles.
+    """
+    case = case.to(torch.float64)
+    seen = project(case.field, case.camera)
+    height, width = case.camera.height, case.camera.width
+    n = len(case.field)
+    values = torch.zeros(n, height, width, dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    order = torch.argsort(seen.depths, stable=True).tolist()
+    for k in order:
+        dx, dy = x - seen.means2d[k][0], y - seen.means2d[k][1]
+        a, b, c = seen.conics[k]
+        first, last = (seen.means2d[k] - seen.radii[k]) // 16, (seen.means2d[k] + seen.radii[k] + 15) // 16
+        inside = (x // 16 >= first[0]) & (x // 16 < last[0]) & (y // 16 >= first[1]) & (y // 16 < last[1])
+        values[int(seen.ids[k])] = torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2) * inside
+    values.requires_grad_()
+    shares: list[Tensor] = [torch.zeros(height, width, dtype=torch.float64)] * n
+    through = torch.ones(height, width, dtype=torch.float64)
+    done = torch.zeros(height, width, dtype=torch.bool)
+    opacities = case.field.opacity_logits.sigmoid()
+    for k in order:
+        i = int(seen.ids[k])
+        alpha = (opacities[i] * values[i]).clamp(max=0.99)
+        here = ~done & (alpha >= 1 / 255)
+        done = done | (here & (through * (1 - alpha) < 1e-4))
+        alpha = torch.where(here & ~done, alpha, 0.0)
+        shares[i] = alpha * through
+        through = through * (1 - alpha)
+    return torch.stack(shares), values
+
+
+def small_case() -> Case:
+    return case_of(n=40, pixels=(1.0, 6.0))
+
+
+def test_speedy_splat_scores_are_sums_of_squared_derivatives() -> None:
+    case = small_case()
+    scores = torch.zeros(40, 1, requires_grad=True)
+    image, radii, seconds, _ = call(
+        module_of("speedy-splat"), "speedy-splat", case, activated(case) | {"scores": scores}
+    )
+    image.sum().backward()
+    shares, values = blended(case)
+    wide = case.to(torch.float64)
+    colors = sh_to_color(
+        wide.field.sh, normalize(wide.field.means - wide.camera.position, dim=1), wide.field.sh_degree, signed=False
+    )
+    background = wide.background_tensor
+    total = torch.einsum("nhw,nc->chw", shares, colors) + (1 - shares.sum(0)) * background[:, None, None]
+    assert relative(image, total.float()) < BOUND
+    (derivatives,) = torch.autograd.grad(total.sum(), values)
+    assert scores.grad is not None
+    assert (
+        relative(scores.grad[:, 0], (derivatives**2).sum((1, 2)).float()) < 1e-3
+    )  # worst seen: 2e-7; a pixel at 1/255 may turn on another processor
+    assert radii.shape == (40,)
+    assert seconds.shape == (1,)
+
+
+def test_scores_without_gradients_cost_nothing_and_change_nothing() -> None:
+    case = small_case()
+    plain = call(module_of("graphdeco"), "graphdeco", case, activated(case))[0]
+    scored = call(module_of("speedy-splat"), "speedy-splat", case, activated(case) | {"scores": torch.zeros(40, 1)})[0]
+    assert torch.equal(plain, scored)
+
+
+def test_mini_splatting_sums_shares_and_counts_pixels() -> None:
+    case = small_case()
+    with torch.no_grad():
+        _, _, sums, counts, leads, _ = call(module_of("mini-splatting"), "mini-splatting", case, activated(case))
+    shares, _ = blended(case)
+    shares = shares.detach()
+    assert relative(sums, shares.sum((1, 2)).float()) < BOUND
+    assert (counts - (shares > 0).sum((1, 2))).abs().max() <= 1  # alpha of a pixel may be at 1/255
+    leaders = shares.flatten(1).argmax(0)[shares.flatten(1).max(0).values > 0]
+    assert (leads - torch.bincount(leaders, minlength=40)).abs().max() <= 1
+
+
+def test_mini_splatting_finds_points_where_rays_come_nearest() -> None:
+    """One round Gaussian on each ray: the nearest point is the foot of the perpendicular from its centre."""
+    case = small_case()
+    arguments = activated(case)
+    scale = arguments["scales"].mean(1, keepdim=True).expand(-1, 3)
+    module = module_of("mini-splatting")
+    settings = settings_of(module, case.camera, (0.0, 0.0, 0.0), 3)
+    with torch.no_grad():
+        found = module.GaussianRasterizer(settings).render_depth(
+            means2D=torch.zeros(40, 3), **(arguments | {"scales": scale})
+        )
+    points, at = found["out_pts"].flatten(1).T, found["gidx"].flatten().long()
+    seen = points.abs().sum(1) > 0
+    ray = normalize(points - settings.campos, dim=1)
+    to_centre = arguments["means3D"][at] - points
+    assert int(seen.sum()) > 200
+    assert ((ray * to_centre).sum(1).abs() / to_centre.norm(dim=1))[seen].max() < 1e-3  # 1e-5 seen
+    assert found["accum_alpha"].min() >= 0
+    assert found["accum_alpha"].max() <= 1
+
+
+def test_absgs_returns_shares_and_absolute_gradients() -> None:
+    case = small_case()
+    module = module_of("absgs")
+    settings = settings_of(module, case.camera, case.background, 3)
+    points = torch.zeros(40, 4, requires_grad=True)
+    image, _, sums = module.GaussianRasterizer(settings)(means2D=points, **activated(case))
+    image.sum().backward()
+    shares, _ = blended(case)
+    assert relative(sums, shares.detach().sum((1, 2)).float()) < BOUND
+    assert points.grad is not None
+    assert bool((points.grad[:, 2:] >= points.grad[:, :2].abs() * (1 - 1e-4)).all())
+
+
+def test_mip_splatting_is_graphdecos_antialiasing_with_absolute_gradients() -> None:
+    case = small_case()
+    more: dict[str, Any] = {"kernel_size": 0.3, "subpixel_offset": torch.zeros(41, 53, 2)}
+    expected = call(module_of("graphdeco-aa"), "graphdeco-aa", case, activated(case), antialiasing=True)
+    found = call(module_of("mip-splatting"), "mip-splatting", case, activated(case), **more)
+    assert torch.equal(found[0], expected[0])
+    for image, points in ((expected[0], expected[-1]), (found[0], found[-1])):
+        image.sum().backward(inputs=[points])
+        assert points.grad is not None
+    assert torch.equal(found[-1].grad[:, :2], expected[-1].grad[:, :2])
+    assert bool((found[-1].grad[:, 2] >= found[-1].grad[:, :2].norm(dim=1) * (1 - 1e-4)).all())
+    with pytest.raises(UserInputError, match="ray_jitter"):
+        call(
+            module_of("mip-splatting"),
+            "mip-splatting",
+            case,
+            activated(case),
+            **(more | {"subpixel_offset": torch.ones(1)}),
+        )
+
+
+def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
+    case = small_case()
+    module = module_of("efficientgs")
+    more: dict[str, Any] = {"use_train_speedup": False, "ignored_rate": 0.0, "lambda_dssim": 0.2, "use_hwc": True}
+    degrees = torch.arange(40, dtype=torch.int32) % 4
+    loss = torch.rand(3, 41, 53, generator=torch.Generator().manual_seed(0))
+    given = {"gt_image": None, "sparse_shs_degree": degrees, "pix_loss": loss, "top_k": 1}
+    with torch.no_grad():
+        image, _, largest, _, _, losses, *_ = call(module, "efficientgs", case, activated(case) | given, **more)
+        kept = activated(case)
+        for i, degree in enumerate(degrees.tolist()):
+            kept["shs"][i, (degree + 1) ** 2 :] = 0
+        expected = call(module_of("graphdeco"), "graphdeco", case, kept)[0]
+    assert torch.equal(image.permute(2, 0, 1), expected)
+    shares = blended(case)[0].detach()
+    leaders = shares.flatten(1).argmax(0)[shares.flatten(1).max(0).values > 0]
+    assert (largest - (torch.bincount(leaders, minlength=40) > 0).int()).abs().sum() <= 1
+    assert 0 < float(losses.sum()) < float((shares * loss.sum(0)).sum())
+
+
+def test_surfels_are_flat_gaussians_with_depths_and_normals() -> None:
+    case = small_case()
+    given = activated(case)
+    module = module_of("2dgs")
+    settings = settings_of(module, case.camera, case.background, 3)
+    image, radii, maps = module.GaussianRasterizer(settings)(
+        means2D=torch.zeros(40, 3), **(given | {"scales": given["scales"][:, :2].contiguous()})
+    )
+    flat = torch.cat([given["scales"][:, :2], given["scales"][:, :2].max(1, keepdim=True).values * 1e-4], 1)
+    expected = call(module_of("graphdeco"), "graphdeco", case, given | {"scales": flat})[0]
+    assert torch.equal(image, expected)
+    assert maps.shape == (7, 41, 53)
+    seen = maps[1] > 0.5
+    assert bool((maps[5][seen] > 0).all())
+    assert float(maps[2:5].norm(dim=0).max()) <= 1 + 1e-4
+    assert radii.shape == (40,)
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5])
+def test_relocated_copies_have_the_opacity_and_the_light_of_one(copies: int) -> None:
+    """Equation 9: n copies of opacity 1 - (1 - o)^(1/n) cover what one covered; one copy stays as it is."""
+    opacity, scale = torch.tensor([[0.3], [0.9]]), torch.tensor([[1.0, 2, 3], [0.1, 0.1, 0.2]])
+    binoms = torch.tensor([[float(math.comb(n, k)) for k in range(51)] for n in range(51)])
+    found, scales = compute_relocation(opacity, scale, torch.full((2, 1), copies), binoms, 51)
+    torch.testing.assert_close(1 - (1 - found) ** copies, opacity)
+    # Along a ray the light of n copies, integrated over a line, is that of the one.
+    x = torch.linspace(-20, 20, 40001, dtype=torch.float64)
+    for i in range(2):
+        ratio = float(scales[i, 0] / scale[i, 0])
+        light = (1 - (1 - found[i].double() * torch.exp(-((x / ratio) ** 2) / 2)) ** copies).sum()
+        torch.testing.assert_close(light, (opacity[i].double() * torch.exp(-(x**2) / 2)).sum(), rtol=1e-5, atol=0)
+
+
+def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
+    case = small_case()
+    module, field, camera = stand_ins("faster-gs")["FasterGSCudaBackend.torch_bindings"], case.field, case.camera
+    info = torch.zeros(2, 40)
+    settings = module.RasterizerSettings(
+        w2c=camera.world_to_camera, cam_position=camera.position, bg_color=torch.tensor(case.background),
+        active_sh_bases=16, width=53, height=41, focal_x=camera.fx, focal_y=camera.fy, center_x=camera.cx,
+        center_y=camera.cy, near_plane=0.2, far_plane=1e4, proper_antialiasing=False,
+    )  # fmt: skip
+    leaves = [
+        field.means,
+        field.log_scales,
+        field.quaternions,
+        field.opacity_logits[:, None],
+        field.sh[:, :1],
+        field.sh[:, 1:],
+    ]
+    leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+    image = module.diff_rasterize(*leaves, info, settings)
+    image.sum().backward()
+    expected, radii, points = call(module_of("graphdeco"), "graphdeco", case, activated(case))
+    expected.sum().backward(inputs=[points])
+    assert relative(image, expected) < BOUND
+    assert torch.equal(info[0], (radii > 0).float())
+    assert points.grad is not None
+    assert relative(info[1], points.grad[:, :2].norm(dim=1)) < 1e-3  # worst seen: 5e-7
+    assert all(leaf.grad is not None for leaf in leaves)
+
+
+SOURCES = {
+    "speedy-splat": ("diff_gaussian_rasterization", "", "scores=None, "),
+    "mip-splatting": ("diff_gaussian_rasterization", "kernel_size=0, subpixel_offset=0, ", ""),
+    "absgs": ("diff_gaussian_rasterization_abs", "", ""),
+    "graphdeco": ("diff_gaussian_rasterization", "", ""),
+    "graphdeco-aa": ("diff_gaussian_rasterization", "antialiasing=0, ", ""),
+    None: ("diff_gaussian_rasterization", "glow=0, ", ""),
+}
+
+
+@pytest.mark.parametrize("variant", SOURCES)
+def test_the_stand_in_is_chosen_by_the_checkouts_calls(variant: str | None, tmp_path: Path) -> None:
+    module, settings, more = SOURCES[variant]
+    view = ", ".join(f"{name}=0" for name in VARIANTS["graphdeco"].settings)
+    (tmp_path / "gaussian_renderer").mkdir()
+    (tmp_path / "gaussian_renderer" / "__init__.py").write_text(
+        f"from {module} import GaussianRasterizationSettings, GaussianRasterizer\n"
+        f"def render():\n    rasterizer = GaussianRasterizer(GaussianRasterizationSettings({settings}{view}))\n"
+        f"    return rasterizer(means3D=0, means2D=0, opacities=0, {more}shs=0)\n"
+    )
+    assert variant_for(tmp_path) == variant
+
+
+def test_optional_imports_do_not_decide(tmp_path: Path) -> None:
+    (tmp_path / "train.py").write_text(
+        "from diff_gaussian_rasterization import GaussianRasterizer, compute_relocation\n"
+        "try:\n    from diff_gaussian_rasterization import SparseGaussianAdam\nexcept ImportError:\n    pass\n"
+    )
+    assert variant_for(tmp_path) == "3dgs-mcmc"
+    assert {"3dgs-mcmc", "faster-gs"} <= set(FORKS)
