@@ -62,6 +62,17 @@ class ExposureState(TypedDict):
     moments: dict[str, Tensor]
 
 
+class BestState(TypedDict):
+    """The best state of a stage so far, with --keep best."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    psnr: float
+    iteration: PositiveInt
+    model: ModelState
+    joint: dict[int, ModelState] | None
+    exposure: ExposureState | None
+
+
 class StageState(TypedDict):
     """Result of `stage.StageRun.state`, and the overhead so far."""
 
@@ -73,6 +84,7 @@ class StageState(TypedDict):
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
     exposure: NotRequired[ExposureState | None]
+    best: NotRequired[BestState]
     random: Tensor
     random_gpu: NotRequired[Tensor]
     overhead: dict[str, NonNegativeFloat]
@@ -177,6 +189,12 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
     if iteration > stage.iterations:
         raise ValueError(f"progress.iteration is {iteration}, expected at most {stage.iterations}")
     _check_model(state["model"], "model", stage.signed, settings.sh_degree)
+    if (best := state.get("best")) is not None:
+        if best["iteration"] > iteration:
+            raise ValueError(f"best.iteration is {best['iteration']}, expected at most {iteration}")
+        _check_model(best["model"], "best.model", stage.signed, settings.sh_degree)
+        for level, model in (best["joint"] or {}).items():
+            _check_model(model, f"best.joint.{level}", model["signed"], settings.sh_degree)
     joint = state.get("joint") or {}
     wanted = set(finished) if joint_from is not None and iteration >= joint_from else set()
     if joint.keys() != wanted:

@@ -1,16 +1,24 @@
-"""Notice that held-out views get worse while the training loss falls, and say what helps."""
+"""Measure views during stages: notice that held-out ones get worse, and set training views aside to keep the best."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
 
 SAMPLES_OF_A_STAGE = 5
 """How often a stage measures some held-out views."""
 SAMPLED_VIEWS = 8
 """Most views of such a measurement."""
+SAMPLES_TO_KEEP_BEST = 10
+"""How often a stage measures the views that were set aside, to keep the best state."""
+LEAST_VIEWS = 12
+"""Fewest training views of which some can be set aside."""
 FALL = 0.5
 """Decibels below the best measurement that count as getting worse."""
 
@@ -25,6 +33,27 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
     """
     count = min(most, len(views))
     return [views[int((index + 0.5) * len(views) / count)] for index in range(count)]
+
+
+def set_aside(views: Sequence[View]) -> list[View]:
+    """Return the training views that choose the best state: one of 16, but two at least and eight at most."""
+    return spread_views(views, min(SAMPLED_VIEWS, max(2, len(views) // 16)))
+
+
+def require_views_to_set_aside(count: int) -> None:
+    """Raise a UserInputError if there are too few training views to set some aside."""
+    if count < LEAST_VIEWS:
+        raise UserInputError(
+            f"--keep best: sets training views aside, and the scene has {count}, expected at least {LEAST_VIEWS}; "
+            "leave it out"
+        )
+
+
+def copied(state: Any) -> Any:
+    """Return a state of tensors and containers of them with every tensor copied to the CPU."""
+    if isinstance(state, Tensor):
+        return state.detach().to("cpu", copy=True)
+    return {key: copied(value) for key, value in state.items()} if isinstance(state, dict) else state
 
 
 @dataclass

@@ -31,6 +31,8 @@ views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
 
+LAST, BEST = "last", "best"
+"""Choices of --keep."""
 ON, OFF = "on", "off"
 EXPOSURES = (AUTO, ON, OFF)
 """Choices of --exposure."""
@@ -178,6 +180,11 @@ class TrainSettings(HierarchySettings):
         "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
         panel=SCHEDULE,
     )
+    keep: str = option(
+        LAST,
+        "State that each level archives: last, or best by a few training views, which are then not trained on.",
+        panel=SCHEDULE,
+    )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -228,9 +235,11 @@ class TrainSettings(HierarchySettings):
             )
 
     def _check_exposure(self) -> None:
-        """Refuse an unknown choice, and transforms of an image that is not compared with the photo."""
+        """Refuse unknown choices, and transforms of an image that is not compared with the photo."""
         if self.exposure not in EXPOSURES:
             raise UserInputError(f"--exposure {self.exposure}: expected {', '.join(EXPOSURES)}")
+        if self.keep not in (LAST, BEST):
+            raise UserInputError(f"--keep {self.keep}: expected {LAST} or {BEST}")
         if self.exposure == ON and not SUPERVISIONS[self.supervision].composes:
             raise UserInputError(
                 f"--exposure on with --supervision {self.supervision}: that compares residuals, which have no "
@@ -387,7 +396,7 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
     **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
-    **{"protocol": "default", "exposure": "off"},
+    **{"protocol": "default", "exposure": OFF, "keep": LAST},
 }
 """Settings that older manifests do not name, with the values they had."""
 

@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any
 
@@ -47,9 +47,18 @@ from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains,
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.quality import SAMPLED_VIEWS, SAMPLES_OF_A_STAGE, QualityWatch, spread_views
+from lapgs_plugin.training.quality import (
+    SAMPLED_VIEWS,
+    SAMPLES_OF_A_STAGE,
+    SAMPLES_TO_KEEP_BEST,
+    QualityWatch,
+    copied,
+    require_views_to_set_aside,
+    set_aside,
+    spread_views,
+)
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
-from lapgs_plugin.training.settings import OFF, TrainSettings
+from lapgs_plugin.training.settings import BEST, OFF, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import level_views
 
@@ -70,12 +79,15 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         views: number of training views; None if unknown.
 
     Raises:
-        UserInputError: levels, split and image size do not go together, or a step takes more views than there are.
+        UserInputError: levels, split and image size do not go together, or there are too few views for a step or for
+            --keep best.
     """
     if views is not None and (asked := settings.asked_views or 1) > views:
         raise UserInputError(
             f"--views-per-step {asked}: the scene has {views} training views; give at most as many, or auto"
         )
+    if views is not None and settings.keep == BEST:
+        require_views_to_set_aside(views)
     return StagePlan.create(size, settings.iterations, settings.levels, settings.shares, settings.kind)
 
 
@@ -155,15 +167,19 @@ class Trainer:
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
-        self.plan = make_plan(self.scene.smallest_size, self.settings, len(self.scene.train))
+        views = len(self.scene.train)
+        self._aside = set_aside(self.scene.train) if self.settings.keep == BEST else []
+        aside = {view.name for view in self._aside}
+        self.scene = replace(self.scene, train=tuple(view for view in self.scene.train if view.name not in aside))
+        self.plan = make_plan(self.scene.smallest_size, self.settings, views)
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)
         if self.gpu_busy:
             require_cuda(self.device)
         self._overhead = Overhead()
-        self._first_exposures: Tensor | None = None
         self._quality = QualityWatch()
+        self._best: dict[str, Any] | None = None  # the stage's best state so far, see `checkpoint.BestState`
         self._samples: frozenset[int] = frozenset()  # iterations of the stage after which some views are measured
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
@@ -184,7 +200,6 @@ class Trainer:
             DeviceMemoryError: the GPU is full; the same is kept.
         """
         checkpoint = self._checkpoint() if resume else None
-        self._first_exposures = self._compensated(checkpoint)
         with stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in self.plan)
@@ -212,14 +227,25 @@ class Trainer:
             check_checkpoint(state, path, stage, self.settings, self.archive.available_levels)
         return state
 
-    def _compensated(self, checkpoint: dict[str, Any] | None) -> Tensor | None:
-        """Return the colour transforms (v, 3, 4) that the run starts with; None if it does not compensate exposure."""
-        names, (*_, last) = [view.name for view in self.scene.train], (None, *self.archive.available_levels)
-        if last is not None:
-            archived = self.archive.exposure(last)
-            return None if archived is None else start_from(archived, names)
-        if checkpoint is not None:
-            return None if checkpoint.get("exposure") is None else identities(len(names))  # `restore` has the others
+    def _exposures(self, stage: Stage, checkpoint: dict[str, Any] | None) -> ViewExposures | None:
+        """Return the colour transforms that a stage starts with; None if the run does not compensate exposure."""
+        names, levels = [view.name for view in self.scene.train], self.archive.available_levels
+        start: Tensor | None
+        if levels:
+            archived = self.archive.exposure(levels[-1])
+            start = None if archived is None else start_from(archived, names)
+        elif checkpoint is not None:  # `restore` has the values
+            start = None if checkpoint.get("exposure") is None else identities(len(names))
+        else:
+            with self._overhead.timed("exposure"):
+                start = self._first_exposures()
+        if start is None:
+            return None
+        done = sum(each.iterations for each in self.plan if each.level > stage.level)
+        return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
+
+    def _first_exposures(self) -> Tensor | None:
+        """Return the colour transforms (v, 3, 4) that the run starts with, as --exposure says and the photos differ."""
         choice = self.settings.exposure
         if choice == OFF or not self._supervision.composes:
             return None
@@ -232,17 +258,7 @@ class Trainer:
             if differ
             else f"exposure differs by {found}, hardly at all; each photo gets a colour transform all the same"
         )
-        return from_gains(measured.gains) if differ else identities(len(names))
-
-    def _exposures(self, stage: Stage) -> ViewExposures | None:
-        """Return the colour transforms of a stage, as the stage before left them."""
-        if self._first_exposures is None:
-            return None
-        names, levels = [view.name for view in self.scene.train], self.archive.available_levels
-        before = self.archive.exposure(levels[-1]) if levels else None
-        start = self._first_exposures if before is None else start_from(before, names)
-        done = sum(each.iterations for each in self.plan if each.level > stage.level)
-        return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
+        return from_gains(measured.gains) if differ else identities(len(self.scene.train))
 
     def _moments(self, level: int, field: GaussianField) -> dict[str, Any]:
         """Return Adam's state that the next level inherits from a finished one with its field."""
@@ -254,8 +270,9 @@ class Trainer:
         """Train and archive one stage."""
         self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
         self._memory = PeakMemory(self.device)
-        run = self._prepare(stage, self._first_model(stage, checkpoint))
-        self._samples = run.schedule.sampled(SAMPLES_OF_A_STAGE)
+        run = self._prepare(stage, self._first_model(stage, checkpoint), checkpoint)
+        self._samples = run.schedule.sampled(SAMPLES_OF_A_STAGE if not self._aside else SAMPLES_TO_KEEP_BEST)
+        self._best = None if checkpoint is None else checkpoint.get("best")
         if checkpoint is not None:
             path = self.archive.path(CHECKPOINT)
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
@@ -310,8 +327,8 @@ class Trainer:
         """Return whether the next stage inherits Adam's state from this one."""
         return stage.level > 0 and self.settings.inherit_mode == "full"
 
-    def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
-        """Return a stage that is ready to train a model."""
+    def _prepare(self, stage: Stage, model: TrainableField, checkpoint: dict[str, Any] | None) -> StageRun:
+        """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
         batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         schedule = StageSchedule.create(
@@ -347,7 +364,7 @@ class Trainer:
             densifier=self.settings.strategy_of(stage).density_control(schedule, self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
-            exposures=self._exposures(stage),
+            exposures=self._exposures(stage, checkpoint),
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
@@ -369,7 +386,7 @@ class Trainer:
 
         return JointFields(
             models={level: model(level) for level in self.archive.available_levels},
-            cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test)},
+            cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test, *self._aside)},
             rasterizer=self.rasterizer,
             background=torch.tensor(self.scene.background).to(self.device),
             pyramid=self._pyramid,
@@ -383,7 +400,7 @@ class Trainer:
         with self._overhead.timed("cache"):
             self._train_cache = self._predictions(stage, self.scene.train, TRAIN)
         with self._overhead.timed("evaluation"):
-            self._test_cache = self._predictions(stage, self.scene.test, TEST)
+            self._test_cache = self._predictions(stage, [*self.scene.test, *self._aside], TEST)
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
         """Return Up(I_hat^(l+1)) of each view, for the stage of level l."""
@@ -438,11 +455,13 @@ class Trainer:
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
-        due_sample = self.test_every is None and run.reached(self._samples)
+        due_sample = run.reached(self._samples)
         due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
-        measured = self._held_out(run, due_test, due_sample)
+        measured = self._held_out(run, due_test, due_sample and self.test_every is None)
+        if due_sample and self._aside:
+            self._note_best(run)
         if measured or due_tick:
             self._tick(run, measured)
         self._watch_quality(run, measured)
@@ -505,6 +524,35 @@ class Trainer:
         photo = view.image.to(self.device)
         return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
 
+    def _note_best(self, run: StageRun) -> None:
+        """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
+        with self._overhead.timed("evaluation"):
+            fitted = run.exposures is not None
+            found = fmean(self._psnr(run, view)[fitted] for view in self._aside)
+            if self._best is None or found > self._best["psnr"]:
+                state = run.state()
+                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure")}
+                self._best = {"psnr": found, "iteration": run.progress.iteration, **parts}
+            if run.progress.iteration == run.stage.iterations and self._best["iteration"] < run.stage.iterations:
+                self.monitor.say(
+                    f"level {run.stage.level}: archives the state after iteration {self._best['iteration']} of "
+                    f"{run.stage.iterations}, {self._best['psnr'] - found:.2f} dB better than the last one on "
+                    f"{len(self._aside)} training views that were set aside"
+                )
+
+    def _take_best(self, run: StageRun) -> None:
+        """Return to the best state of a finished stage."""
+        best = self._best
+        if best is None or best["iteration"] == run.stage.iterations:
+            return
+        settings = self.settings
+        run.model = TrainableField.from_state(
+            best["model"], settings.rates, self.scene.extent, device=self.device, sparse=settings.sparse_adam
+        )
+        run.joint = None if best["joint"] is None else self._unfreeze(best["joint"])
+        if run.exposures is not None:
+            run.exposures.restore(best["exposure"])
+
     def _watch_quality(self, run: StageRun, measured: Mapping[str, float]) -> None:
         """Say it if held-out views got worse while the training loss fell."""
         key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
@@ -521,11 +569,13 @@ class Trainer:
 
     def _save_checkpoint(self, run: StageRun) -> None:
         with self._overhead.timed("checkpoints"):
-            self.archive.save_checkpoint({**run.state(), "overhead": dict(self._overhead)})
+            kept = {} if self._best is None else {"best": self._best}
+            self.archive.save_checkpoint({**run.state(), **kept, "overhead": dict(self._overhead)})
         self._last_checkpoint = time.monotonic()
 
     def _finish(self, run: StageRun) -> None:
         """Archive a finished stage."""
+        self._take_best(run)
         field = run.model.field.detach()
         record = LevelRecord(
             level=run.stage.level,
