@@ -6,6 +6,7 @@ import copy
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, SupportsIndex
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runs.image_store import eight_bit_levels
+from lapgs_plugin.scenes.masks import ALPHA, NONE, find_masks, read_mask, resolve_masks
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,15 @@ class SceneImages:
     """Take a scene's images out of its cameras when these are made, and look them up by key.
 
     Keys are unique even if names are not: Blender scenes have an r_0 for training and another for testing.
+
+    Attributes:
+        masks: (1, h, w) bool by key, False where the image is ignored; empty without masks.
     """
 
     def __init__(self) -> None:
         self._images: dict[str, FullSizeImage] = {}
         self._keys: dict[int, str] = {}
+        self.masks: dict[str, Tensor] = {}
         self._cameras: list[Any] = []  # objects that live keep their ids, which `_keys` has
 
     def adopting(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -75,6 +81,23 @@ class SceneImages:
             return camera
 
         return make_camera
+
+    def read_masks(self, scene: Path, setting: str) -> None:
+        """Read the mask of every image; `setting` is a value of --masks.
+
+        Raises:
+            SceneError, UserInputError: as `scenes.masks`; or the value is "alpha".
+        """
+        resolved = resolve_masks(scene, setting)
+        if resolved == ALPHA:
+            raise UserInputError(
+                "--masks alpha: the checkout decides what alpha channels mean to it; give a folder of masks"
+            )
+        if resolved == NONE:
+            return
+        files = find_masks(scene / resolved, [view_name(key) for key in self._images])
+        for key, image in self._images.items():
+            self.masks[key] = read_mask(files[view_name(key)], image.size, image.size)
 
     @property
     def exact(self) -> bool:

@@ -116,6 +116,7 @@ class HierarchyDriver:
         path = self._color_path()
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(self._replacements.scene_class, call, self._adapter, Path(scratch))
+            self._context.images.read_masks(Path(call.dataset.source_path), self._options.masks)
             self._adapter.first_points(len(scene.points.points))
             plan = StagePlan.create(
                 self._context.images.smallest_size(),

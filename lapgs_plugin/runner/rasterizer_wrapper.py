@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
 from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.level_images import HeldImages
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
@@ -44,6 +46,8 @@ class StageRendering:
         targets: I^l by key; None if images are compared with nothing.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
+        weights: share of each pixel inside of the view's mask by key; None without masks.
+        masked: keys of the training views, whose masks the loop's losses and scores have to honour.
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
@@ -56,6 +60,8 @@ class StageRendering:
     targets: ImageStore | None = None
     accumulated: Predictions | None = None
     coarse: Predictions | None = None
+    weights: ImageStore | HeldImages | None = None
+    masked: frozenset[str] = frozenset()
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
@@ -72,6 +78,8 @@ class StageRendering:
         below = self.accumulated if key in self.composed else self._below_target
         if below is not None:
             below.prefetch(key)
+        if self.weights is not None:
+            self.weights.prefetch(key)
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
@@ -91,6 +99,9 @@ class StageRendering:
             image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
+        if self.weights is not None and key in self.masked and not self.capture:
+            # Whatever the loop's loss is, it compares the target with itself outside of the mask.
+            image = fill_outside(image, self.target(key), self.weights.get(key))
         return image
 
     def render(self, rasterizer: Any, inputs: dict[str, Any], settings: Any) -> tuple[Any, ...]:

@@ -55,6 +55,8 @@ class StageViews:
             targets=self.images.targets,
             accumulated=self.images.accumulated,
             coarse=self.images.coarse,
+            weights=self.images.weights,
+            masked=frozenset(self.images.key(camera) for camera in self.images.train),
             composed=self.images.composed_keys,
             on_image=context.hooks.on_image if context.hooks else None,
         )
@@ -88,10 +90,12 @@ class StageViews:
 
     @torch.no_grad()
     def held_out_quality(self, gaussians: Any) -> dict[str, float]:
-        """Return means of PSNR in dB and SSIM over the held-out views, upsampled to full resolution."""
+        """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
+        images = self._context.images
+        masks = {key: mask.to(self._device) for key, mask in images.masks.items()}
         return mean_quality(
-            (self._full_size(gaussians, camera), self._context.images[self.images.key(camera)].load(self._device))
-            for camera in self.images.test
+            (self._full_size(gaussians, camera), images[key].load(self._device), masks.get(key))
+            for camera, key in ((camera, self.images.key(camera)) for camera in self.images.test)
         )
 
     def render_train_view(self, rendering: StageRendering, gaussians: Any, camera: Any) -> Tensor:

@@ -289,7 +289,7 @@ def _make_masks(job: _Job, given: Path | None) -> None:
     def make(name: str) -> bool:
         photo = job.photos / name
         size = image_size(photo)
-        mask = read_mask(files[name], photo, size) if files else alpha_mask(photo, size)
+        mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
         if mask is not None:
             write_image(partial / f"{name}.png", mask.float().expand(3, -1, -1))
         return mask is not None

@@ -71,7 +71,8 @@ def by_our_kernel(blending: Blending, by_images: Tensor, absolute: bool) -> Grad
     """Compute them by our kernel, a warp for each region of a tile."""
     from lapgs_plugin.rasterizers.gsplat import blend_kernels
 
-    given = (*blending[:4], blending.offsets, blending.flat, blending.last, blending.images, by_images.contiguous())
+    images = blending.images.contiguous(), by_images.contiguous()
+    given = (*blending[:4], blending.offsets, blending.flat, blending.last, *images)
     return blend_kernels.blend_backward(*given, absolute)
 
 

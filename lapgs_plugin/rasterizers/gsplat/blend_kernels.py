@@ -206,6 +206,7 @@ def _backward_kernel(  # noqa: PLR0915  # its steps share too many tensors to be
         a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
         c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
         y = tl.load(means2d + 2 * gaussian + 1) - (first_y + down)  # (lanes, splat_lanes, splats, rows)
+        tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
         # The exponent of 2; most of it is the same in all rows.
         power = (a * (-0.5 * LOG2_E)) * x * x + y * (b * (-LOG2_E) * x + c * (-0.5 * LOG2_E) * y)
         alpha = tl.minimum(opacity * _exp2(power), OPAQUEST)

@@ -118,7 +118,7 @@ def _channels_first(images: Tensor) -> Tensor:
 
 
 class _Render(torch.autograd.Function):
-    """(field, cameras) -> contiguous image (3, h, w), or images (c, 3, h, w) of several."""
+    """(field, cameras) -> image (3, h, w), or images (c, 3, h, w) of several, with interleaved colours in memory."""
 
     @staticmethod
     def forward(
@@ -129,7 +129,7 @@ class _Render(torch.autograd.Function):
         images, found = _forward(
             means, quaternions, log_scales, logits, sh, cameras, background, degree, signed, describes
         )
-        images = _channels_first(images).contiguous()
+        images = _channels_first(images)
         ctx.save_for_backward(means, quaternions, sh, background, *cameras[:3], images, *found)
         ctx.size, ctx.degree, ctx.signed, ctx.absgrad = cameras[3:], degree, signed, absgrad
         ctx.targets = targets
