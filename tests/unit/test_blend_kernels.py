@@ -80,7 +80,7 @@ def check(shapes, cameras, count, height, width, absolute, limit):
             assert whole is found[0]
 
 check([Shape(8, 8, 4, 1)], 2, 7, 5, 21, True, 1e-5)  # worst seen 1.6e-6
-check([Shape()], 1, 60, 5, 21, False, 1e-5)  # worst seen 2.1e-6
+check([Shape()], 1, 60, 5, 21, False, 2e-5)  # worst seen 4.7e-6
 if DEVICE == "cuda":
     shapes = [Shape(*each) for each in ((8, 8, 4, 2), (8, 4, 4, 4), (8, 4, 4, 2), (16, 4, 2, 4), (16, 16, 4, 1, 2))]
     # An alpha that is FAINTEST up to rounding may count in one of both; an H200 has 1.9e-6.
