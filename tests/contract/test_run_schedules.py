@@ -63,7 +63,7 @@ def test_schedules_are_scaled_to_the_stage(name: str, scene: Path, tmp_path: Pat
         name for name in vars(call.opt) if name.endswith(("grad_threshold", "grad_thresh", "grad_abs_thresh"))
     ]
     assert thresholds
-    for threshold in adapter.densify_thresholds(before.opt):
+    for threshold in adapter.densify_thresholds(call.opt):
         assert threshold in thresholds
         whole = getattr(call.opt, threshold)
         assert getattr(base.opt, threshold) == pytest.approx(1.5 * whole), "its images are halved once"
