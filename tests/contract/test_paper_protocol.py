@@ -161,6 +161,21 @@ def test_a_densification_that_knows_no_size_has_none_to_leave_out(scene: Path, t
             drive(adapter, hierarchy="laplacian", prune_by_size=False, **THIRDS)
 
 
+def test_a_rate_of_sh_needs_the_familys_parameter_group(scene: Path, tmp_path: Path) -> None:
+    with loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
+        model = adapter.train.GaussianModel
+        setup = model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            setup(self, training_args)
+            for group in self.optimizer.param_groups:
+                group["name"] = group["name"].replace("f_rest", "sh")
+
+        model.training_setup = training_setup
+        with pytest.raises(UserInputError, match="--sh-rate 2: the checkout's optimizers have no parameter gr"):
+            drive(adapter, hierarchy="laplacian", sh_rate=2.0, **THIRDS)
+
+
 def test_a_rate_of_sh_is_a_positive_factor() -> None:
     with pytest.raises(UserInputError, match=r"--sh-rate 0.0: expected a positive factor"):
         RunSettings(sh_rate=0.0)
