@@ -45,6 +45,7 @@ class Adapter(BackboneAdapter):
         color_rates=("feature_lr", "shfeature_lr"),
         densify_thresholds=("densify_grad_threshold",),
         own_files=("utils/taming_utils.py",),
+        unscaled=("ho_iteration",),
     )
 
     @staticmethod

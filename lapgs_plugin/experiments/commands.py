@@ -22,7 +22,7 @@ SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
-NEGATIONS = {"fused-adam": ["--no-fused-adam"]}
+NEGATIONS = {"fused-adam": ["--no-fused-adam"], "prune-by-size": ["--no-prune-by-size"]}
 """Words that switch off options which are on by default."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""
@@ -152,7 +152,8 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         *(*LAPGS, "train", str(scene), "--out", str(folder), "--overwrite", "--eval"),
         *("--iterations", str(spec.iterations), "--resolution", spec.resolution, "--images", spec.images),
         *("--seed", str(spec.seed), "--rasterizer", spec.rasterizer),
-        *_as_options({**spec.options, **levels}),
+        # Backbones compensate no exposure, and tables compare views as they are.
+        *_as_options({"exposure": "off", **spec.options, **levels}),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable
 from types import ModuleType
@@ -16,6 +17,8 @@ from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
 
 OPACITY_RESET = "reset_opacity"
 """Method of the family's GaussianModel that is density control and can be skipped by itself."""
+SIZE_LIMIT = "max_screen_size"
+"""Parameter of the family's density control: with None it removes no Gaussian for its size."""
 
 
 class StageReplacements:
@@ -101,6 +104,15 @@ class StageReplacements:
         start, after_densifying = "training() at the start of every iteration", self._then(ActiveStage.densified)
         prepare = self._then(ActiveStage.optimizers_made)
         control = dict.fromkeys(self._context.adapter.info.density_control, after_densifying)
+        if not self._context.options.prune_by_size:
+            limited = [name for name in control if SIZE_LIMIT in inspect.signature(getattr(model, name)).parameters]
+            if not limited:
+                raise UserInputError(
+                    f"--no-prune-by-size: densification of {self._context.adapter.info.title} has no {SIZE_LIMIT} to "
+                    "leave out; leave the option out"
+                )
+            for name in limited:
+                control[name] = lambda original: after_densifying(_without_size_limit(original))
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
         return [
@@ -167,3 +179,15 @@ class StageReplacements:
             return None
 
         return reset_opacity
+
+
+def _without_size_limit(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a density control method that removes no Gaussian for its size."""
+    signature = inspect.signature(original)
+
+    def method(*args: Any, **kwargs: Any) -> Any:
+        bound = signature.bind(*args, **kwargs)
+        bound.arguments[SIZE_LIMIT] = None
+        return original(*bound.args, **bound.kwargs)
+
+    return method

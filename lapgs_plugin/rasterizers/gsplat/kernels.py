@@ -270,7 +270,8 @@ def _gradient_kernel(
     of_opacity = tl.zeros((block, 1), tl.float32)
     of_x, of_y, of_z = tl.zeros_like(of_opacity), tl.zeros_like(of_opacity), tl.zeros_like(of_opacity)
     mean = tl.load(means + 3 * rows + channel, in_channel, 0.0)
-    for camera in range(cameras):
+    camera = 0
+    while camera < cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
         visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
         away = mean - tl.load(centre + 3 * camera + channel, channel < 3, 0.0)
@@ -293,6 +294,7 @@ def _gradient_kernel(
             of_y += (in_y - radial * y) * inverse
             of_z += (in_z - radial * z) * inverse
         of_opacity += tl.load(by_opacity + seen, here, 0.0)
+        camera += 1
     tl.store(by_sh + in_sh, tl.where(k < active, sums, 0.0), given)
     tl.debug_barrier()  # all threads have read what is written now
     there = 3 * rows + channel
