@@ -174,11 +174,11 @@ def test_no_rasterizer_at_all(absent: str, purpose: str, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, absent, None)  # which makes importing it fail
     with pytest.raises(ImportError) as caught:
         importlib.import_module(absent)
-    line = explain_import_error(caught.value, "train.py")
+    line = explain_import_error(caught.value, Path("train.py"), on_cpu=False)
     assert line is not None
     for part in (f"train.py needs {absent.partition('.')[0]}", purpose, "--device cpu"):
         assert part in one_line(line)
-    assert explain_import_error(ModuleNotFoundError("no", name="numpy"), "train.py") is None
+    assert explain_import_error(ModuleNotFoundError("no", name="numpy"), Path("train.py"), on_cpu=False) is None
 
 
 @pytest.mark.parametrize("stub", [Stub("graphdeco", "graphdeco-aa", ("--disable_viewer",)), STUBS["fastgs"]])
