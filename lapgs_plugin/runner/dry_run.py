@@ -130,7 +130,6 @@ class DryRun:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""
         values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
         values["dataset"].model_path = str(folder)
-        folder.mkdir()
         lists: dict[str, Any] = {
             n: [] for n, v in self._call.values.items() if n.endswith("iterations") and isinstance(v, (list, tuple))
         }
