@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.adapters.fastgs import late_pruning_due
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import PRESETS
 from lapgs_plugin.hierarchy.plan import StagePlan
@@ -59,8 +59,8 @@ LATE_PRUNING = ([6_000, 7_000, 8_000, 9_000], [12_000, 14_000, 16_000, 18_000])
 SH_EVERY = 1_000  # iterations of a stage between two degrees
 
 
-def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> list[TrainingCall]:
-    """Return the calls of `training` of both stages, with the published options for bonsai."""
+def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> tuple[list[TrainingCall], list[list[str]]]:
+    """Return the calls of `training` of both stages, with the published options for bonsai, and what else changes."""
     settings = RunSettings(protocol="paper", **PRESETS[preset].options)
     with loaded(STUBS[name], scene, folder) as adapter:
         call = published_call(name, adapter)
@@ -69,31 +69,43 @@ def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> list[Train
             kind = type(getattr(call.opt, option.removeprefix("--")))
             setattr(call.opt, option.removeprefix("--"), kind(value))
         plan = StagePlan.create((1600, 1066), TOTAL, settings.levels, settings.shares, settings.kind)
-        calls, start = [], 0
+        tree = adapter.script.function("training")
+        assert tree is not None
+        calls, notes, start = [], [], 0
         for stage in plan:
             factors = settings.color_factor, settings.threshold_factor(stage)
-            calls.append(adapter.stage_call(call, StageWindow(stage, start, TOTAL, plan.levels, *factors), "run"))
+            window = StageWindow(stage, start, TOTAL, plan.levels, *factors)
+            calls.append(adapter.stage_call(call, window, "run"))
+            changed = Schedule(tree).for_stage(call.values, calls[-1].values, window, adapter.info.unscaled)
+            notes.append(changed.notes)
             start += stage.iterations
-    return calls
+    return calls, notes
 
 
 @pytest.mark.parametrize(("name", "own"), [("fastgs", FASTGS), ("graphdeco", TAMING)])
 def test_each_stage_of_a_checkout_gets_what_the_release_gives_it(
     name: str, own: Mapping[str, tuple[float, float]], scene: Path, tmp_path: Path
 ) -> None:
-    calls = stage_calls(name, f"{name}.ours", scene, tmp_path)
+    calls, _ = stage_calls(name, f"{name}.ours", scene, tmp_path)
     expected = SCHEDULE | own
     assert {option: tuple(getattr(call.opt, option) for call in calls) for option in expected} == {
         option: pytest.approx(values) for option, values in expected.items()
     }
 
 
-def test_every_stage_resets_prunes_late_and_starts_as_in_the_release() -> None:
+def test_fastgs_prunes_late_where_the_release_does(scene: Path, tmp_path: Path) -> None:
+    """The numbers of FastGS's training function: every 3,000 iterations after 15,000 and before 30,000."""
+    calls, notes = stage_calls("fastgs", "fastgs.ours", scene, tmp_path)
+    for call, noted, due in zip(calls, notes, LATE_PRUNING, strict=True):
+        numbers = dict(note.split(" -> ") for note in noted)
+        every, after, before = (int(numbers[number]) for number in ("3000", "15000", "30000"))
+        assert [i for i in range(1, call.opt.iterations + 1) if i % every == 0 and after < i < before] == due
+
+
+def test_a_stage_starts_as_in_the_release() -> None:
     paper = RunSettings(protocol="paper")
     assert (paper.residual_resets, paper.joint_share, paper.prune) == (True, 0.0, 0.0)
     assert (paper.inherit_mode, paper.inherit_ratio) == ("xyz", 1.0)  # --inherit_state only_xyz --inherit_ratio 1.0
-    for iterations, due in zip(SCHEDULE["iterations"], LATE_PRUNING, strict=True):
-        assert [i for i in range(1, int(iterations) + 1) if late_pruning_due(i, int(iterations))] == due
 
 
 def test_each_stage_of_our_own_trainer_gets_what_the_release_gives_it() -> None:
