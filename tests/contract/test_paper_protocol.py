@@ -59,8 +59,8 @@ LATE_PRUNING = ([6_000, 7_000, 8_000, 9_000], [12_000, 14_000, 16_000, 18_000])
 SH_EVERY = 1_000  # iterations of a stage between two degrees
 
 
-def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> tuple[list[TrainingCall], list[list[str]]]:
-    """Return the calls of `training` of both stages, with the published options for bonsai, and what else changes."""
+def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> list[TrainingCall]:
+    """Return the calls of `training` of both stages, with the published options for bonsai."""
     settings = RunSettings(protocol="paper", **PRESETS[preset].options)
     with loaded(STUBS[name], scene, folder) as adapter:
         call = published_call(name, adapter)
@@ -69,43 +69,43 @@ def stage_calls(name: str, preset: str, scene: Path, folder: Path) -> tuple[list
             kind = type(getattr(call.opt, option.removeprefix("--")))
             setattr(call.opt, option.removeprefix("--"), kind(value))
         plan = StagePlan.create((1600, 1066), TOTAL, settings.levels, settings.shares, settings.kind)
-        tree = adapter.script.function("training")
-        assert tree is not None
-        calls, notes, start = [], [], 0
+        calls, start = [], 0
         for stage in plan:
             factors = settings.color_factor, settings.threshold_factor(stage)
-            window = StageWindow(stage, start, TOTAL, plan.levels, *factors)
-            calls.append(adapter.stage_call(call, window, "run"))
-            changed = Schedule(tree).for_stage(call.values, calls[-1].values, window, adapter.info.unscaled)
-            notes.append(changed.notes)
+            calls.append(adapter.stage_call(call, StageWindow(stage, start, TOTAL, plan.levels, *factors), "run"))
             start += stage.iterations
-    return calls, notes
+    return calls
 
 
 @pytest.mark.parametrize(("name", "own"), [("fastgs", FASTGS), ("graphdeco", TAMING)])
 def test_each_stage_of_a_checkout_gets_what_the_release_gives_it(
     name: str, own: Mapping[str, tuple[float, float]], scene: Path, tmp_path: Path
 ) -> None:
-    calls, _ = stage_calls(name, f"{name}.ours", scene, tmp_path)
+    calls = stage_calls(name, f"{name}.ours", scene, tmp_path)
     expected = SCHEDULE | own
     assert {option: tuple(getattr(call.opt, option) for call in calls) for option in expected} == {
         option: pytest.approx(values) for option, values in expected.items()
     }
 
 
-def test_fastgs_prunes_late_where_the_release_does(scene: Path, tmp_path: Path) -> None:
-    """The numbers of FastGS's training function: every 3,000 iterations after 15,000 and before 30,000."""
-    calls, notes = stage_calls("fastgs", "fastgs.ours", scene, tmp_path)
-    for call, noted, due in zip(calls, notes, LATE_PRUNING, strict=True):
-        numbers = dict(note.split(" -> ") for note in noted)
-        every, after, before = (int(numbers[number]) for number in ("3000", "15000", "30000"))
-        assert [i for i in range(1, call.opt.iterations + 1) if i % every == 0 and after < i < before] == due
-
-
-def test_a_stage_starts_as_in_the_release() -> None:
+def test_every_stage_resets_prunes_late_and_starts_as_in_the_release(scene: Path, tmp_path: Path) -> None:
     paper = RunSettings(protocol="paper")
     assert (paper.residual_resets, paper.joint_share, paper.prune) == (True, 0.0, 0.0)
     assert (paper.inherit_mode, paper.inherit_ratio) == ("xyz", 1.0)  # --inherit_state only_xyz --inherit_ratio 1.0
+    with loaded(STUBS["fastgs"], scene, tmp_path) as adapter:
+        tree = adapter.script.function("training")
+        assert tree is not None
+        schedule, call = Schedule(tree), published_call("fastgs", adapter)
+    for stage, due in zip(
+        StagePlan.create((1600, 1066), TOTAL, 2, paper.shares, paper.kind), LATE_PRUNING, strict=True
+    ):
+        notes = schedule.for_stage(call.values, call.values, StageWindow(stage, 0, TOTAL, 2, 1.0, 1.0)).notes
+        numbers = {int(before): int(after) for before, after in (note.split(" -> ") for note in notes)}
+        assert [
+            i
+            for i in range(1, stage.iterations + 1)
+            if i % numbers[3_000] == 0 and numbers[15_000] < i < numbers[30_000]
+        ] == due
 
 
 def test_each_stage_of_our_own_trainer_gets_what_the_release_gives_it() -> None:
