@@ -84,9 +84,8 @@ def kernel_seconds(events: Iterable[Any]) -> float:
         event.time_range.elapsed_us()
         for event in events
         if event.device_type.name == "CUDA"
-        and not getattr(
-            event, "is_user_annotation", False
-        )  # older PyTorch has none and not event.name.startswith(HOST_COPIES)
+        and not getattr(event, "is_user_annotation", False)  # PyTorch 2.4 has none
+        and not event.name.startswith(HOST_COPIES)
     )
 
 
