@@ -10,12 +10,11 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Replacement
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from lapgs_plugin.fields.rasterizer import Semantics
 
 LATE_PRUNING_FROM, LATE_PRUNING_EVERY = 1 / 2, 1 / 10
@@ -25,7 +24,7 @@ LATE_MIN_OPACITY = 0.1
 """Opacity below which late pruning removes Gaussians."""
 
 
-class Adapter(BackboneAdapter):
+class Adapter(generic.Adapter):
     """Drive a FastGS checkout; only its late pruning needs adapting.
 
     Its score functions get composed images and the level's ground truth, because both are replaced below them.
@@ -36,10 +35,7 @@ class Adapter(BackboneAdapter):
         title="FastGS",
         rasterizer="diff_gaussian_rasterization_fastgs",
         stand_in="fastgs",
-        density_control=("densify_and_prune_fastgs", "reset_opacity", "final_prune_fastgs"),
         density_scores=("compute_gaussian_score_fastgs",),
-        color_rates=("lowfeature_lr", "highfeature_lr"),
-        densify_thresholds=("grad_thresh", "grad_abs_thresh"),
         own_files=("utils/fast_utils.py",),
         fork_of=("taming",),
         raster_defaults={"mult": 0.5},
@@ -56,17 +52,8 @@ class Adapter(BackboneAdapter):
             "a few hundredths",
         )
 
-    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
-        self.train.render_fastgs(view, gaussians, call.pipe, background, call.opt.mult)
-
-    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        return {"mult": call.opt.mult}
-
-    def passes_dc_apart(self, call: TrainingCall) -> bool:
-        return True
-
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
-        model = self.train.GaussianModel
+        model = self.profile.model
         return [
             Replacement(
                 model,

@@ -113,7 +113,7 @@ class HierarchyDriver:
             RunArchive.require_room(folder, self._overwrite)
         path = self._color_path()
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
-            scene = CheckoutScene.load(self._replacements.scene_class, call, self._adapter, Path(scratch))
+            scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._adapter.first_points(len(scene.points.points))
             plan = StagePlan.create(
                 self._context.images.smallest_size(),
@@ -164,10 +164,10 @@ class HierarchyDriver:
 
     def _color_path(self) -> ColorPath:
         """Return how the installed rasterizer evaluates signed colour, which is found out by rendering."""
-        extension = CudaExtension(self._adapter.info.rasterizer, self._context.device)
+        extension = CudaExtension(self._adapter.rasterizer, self._context.device)
         if self._options.levels == 1 or self._options.nested:
             return ColorPath.NATIVE  # no field is signed
-        return SignedColorRasterizer(extension, checkout=self._adapter.script.checkout).path
+        return SignedColorRasterizer(extension, checkout=self._adapter.root).path
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.
