@@ -328,6 +328,18 @@ class BackboneAdapter(ABC):
                 f"--optimizer_type sparse_adam: {model.__name__} found no {SPARSE_ADAM} to import; install a "
                 "rasterizer that has it, as the checkout's README says, or leave the option out"
             )
+        if getattr(call.pipe, "convert_SHs_python", False) and self._passes_dc_apart(call):
+            raise UserInputError(
+                "--convert_SHs_python: this checkout's render passes on SH that it has not read with that option, and "
+                "fails without lapgs too; leave it out"
+            )
+
+    def _passes_dc_apart(self, call: TrainingCall) -> bool:
+        """Return whether the checkout's render passes the first SH coefficient (DC) as an input of its own."""
+        if not any("dc" in rasterizer.use.inputs for rasterizer in self.profile.rasterizers[:1]):
+            return False
+        asked = self.profile.loop_argument("separate_sh", call.values)
+        return bool(getattr(call.pipe, "separate_sh", True) if asked is None else asked)
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""

@@ -39,8 +39,8 @@ class Adapter(BackboneAdapter):
         """
         from lapgs_plugin.reference_raster.standins import variant_for
 
-        found = variant_for(checkout)
-        if found is not None:
+        found = cls.info.stand_in or variant_for(checkout)
+        if found:
             return found
         source = readable_source(checkout)
         assert source is not None, "recognised by it"

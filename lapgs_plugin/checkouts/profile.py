@@ -153,6 +153,19 @@ class Profile:
         function = vars(sys.modules[renderer.__module__])[renderer.__name__]
         return self._call(function, self._loop_call, values, named)
 
+    def loop_argument(self, name: str, values: Mapping[str, Any]) -> Any:
+        """Return the value of a keyword in the loop's call that renders; None if there is none, or it is unknown here.
+
+        Args:
+            name: the keyword.
+            values: arguments of the training function by parameter name.
+        """
+        words = [] if self._loop_call is None else self._loop_call.keywords
+        try:
+            return next((self._evaluated(word.value, values) for word in words if word.arg == name), None)
+        except Exception:  # it depends on the state of the loop
+            return None
+
     @property
     def _training_place(self) -> str:
         return f"{self.source.place(self.source.training)}: {self.source.training.name}"
