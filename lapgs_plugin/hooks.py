@@ -26,7 +26,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hierarchy.supervision import Supervision
+from lapgs_plugin.hierarchy.supervision import Reconstructed, Supervision
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
@@ -121,6 +121,11 @@ class SupervisionLoss(StageHook):
         self._supervision = supervision
         self._ssim_weight = ssim_weight
 
+    @property
+    def compares_images(self) -> bool:
+        """Whether the composed image is compared with the target."""
+        return type(self._supervision) is Reconstructed
+
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
         prediction, target = image, context.target
         if context.accumulated is not None:  # the base is always compared with its target
@@ -157,6 +162,13 @@ class HookDispatcher:
         """
         stock = (Composition(), SupervisionLoss(supervision, ssim_weight))
         return cls((*stock, *entry_point_hooks(), *user_hooks))
+
+    def is_plain(self, stage: Stage) -> bool:
+        """Whether the loss of a stage is the photometric loss of the composed image, and no user's hook takes part."""
+        supervised = [hook for hook in self._hooks if type(hook) is SupervisionLoss]
+        others = [hook for hook in self._hooks if type(hook) not in (SupervisionLoss, Composition)]
+        compares_images = all(hook.compares_images for hook in supervised) or not stage.signed
+        return len(supervised) == 1 and not others and compares_images
 
     @property
     def takes_batches(self) -> bool:

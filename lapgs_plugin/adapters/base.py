@@ -25,7 +25,7 @@ from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, continues_field, nested_densify_until
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage
 
 if TYPE_CHECKING:
     import torch
@@ -225,11 +225,6 @@ class StageWindow:
     residual_color_rate: float
     threshold_factor: float
 
-    @property
-    def continues_field(self) -> bool:
-        """Whether this stage continues training the previous level's field."""
-        return continues_field(self.stage, self.levels)
-
     def scaled(self, iterations: int) -> int:
         """Return a number of iterations of the whole run's schedule as the same share of this stage."""
         return round(iterations * self.stage.iterations / self.total)
@@ -341,6 +336,10 @@ class BackboneAdapter(ABC):
         asked = self.profile.loop_argument("separate_sh", call.values)
         return bool(getattr(call.pipe, "separate_sh", True) if asked is None else asked)
 
+    def densify_thresholds(self, opt: Any) -> list[str]:
+        """Return the names of options that are thresholds on screen-space gradients for densification."""
+        return list(self.info.densify_thresholds or _options(opt, "grad", "thresh"))
+
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
         copies = {role: copy.copy(call.values[name]) for role, name in call.roles.items()}
@@ -348,11 +347,10 @@ class BackboneAdapter(ABC):
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
         if hasattr(opt, "densify_until_iter"):
-            until = window.scaled(opt.densify_until_iter)
-            opt.densify_until_iter = nested_densify_until(until) if window.continues_field else until
+            opt.densify_until_iter = window.scaled(opt.densify_until_iter)
         if hasattr(opt, "position_lr_max_steps"):
             opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
-        for name in self.info.densify_thresholds or _options(opt, "grad", "thresh"):
+        for name in self.densify_thresholds(opt):
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
@@ -398,6 +396,18 @@ class BackboneAdapter(ABC):
 
     def stage_scene(self, scene: Any) -> None:  # noqa: B027 - few need it
         """Receive the scene that a stage trains on, before its first iteration."""
+
+    def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:  # noqa: B027 - few need it
+        """Bring a model to the state that its class has after an iteration of the whole run, besides its parameters.
+
+        Args:
+            call: the call of the script's `training` that continues after `iteration`.
+            gaussians: the checkout's model, with parameters, optimizer state and SH degree of that iteration.
+            iteration: the last finished one.
+
+        Raises:
+            UserInputError: the checkout cannot continue there.
+        """
 
     def new_model(self, call: TrainingCall) -> Any:
         """Return a GaussianModel without Gaussians, made as the script makes it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,13 @@ class Adapter(generic.Adapter):
         model = self.profile.model
         return [
             Replacement(
+                sys.modules["utils.taming_utils"],
+                "get_loss_map",
+                _with_edges_of_the_level,
+                None,
+                "compute_gaussian_score()",
+            ),
+            Replacement(
                 model, "densify_with_score", _unless_none_qualifies, ("self", "scores"), "training() when it densifies"
             ),
             *(
@@ -69,7 +77,7 @@ class Adapter(generic.Adapter):
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         super().refuse(call, levels, hierarchy)
         self._try_lpips(call)
-        if levels > 1 and call.values["args"].benchmark_dir:
+        if levels > 1 and hierarchy is Hierarchy.LAPLACIAN and call.values["args"].benchmark_dir:
             raise UserInputError(
                 f"--benchmark_dir {call.values['args'].benchmark_dir}: the checkout would write every stage's timings "
                 "over the last one's; leave it out, the manifest holds the time of each stage"
@@ -121,8 +129,35 @@ class Adapter(generic.Adapter):
         progress = 1 - window.stage.level / (window.levels - 1)  # 0 for the base, 1 for the finest
         return int(whole * (BASE_SHARE + (FINEST_SHARE - BASE_SHARE) * progress))
 
+    def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:
+        if iteration < call.opt.densify_until_iter:
+            raise UserInputError(
+                f"--resume: the budget of {self.info.title} counts from the first Gaussians of a call of its training, "
+                f"which would start again at iteration {iteration + 1}, before --densify_until_iter "
+                f"{call.opt.densify_until_iter}; start again with --overwrite"
+            )
+        if 0 < call.values["args"].ho_iteration <= iteration:
+            import torch
+
+            with torch.no_grad():  # as its training does
+                gaussians.modify_functions()
+
     def first_points(self, count: int) -> None:
         self._points = count
+
+
+def _with_edges_of_the_level(original: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Find the edges of a photo again if they are of another size: training() finds those of all views at its start."""
+
+    def get_loss_map(
+        reconstructed_image: Tensor, original_image: Tensor, config: Any, edges_loss_norm: Tensor
+    ) -> Tensor:
+        if edges_loss_norm.shape != original_image.shape[-2:]:
+            edges = sys.modules["utils.taming_utils"].get_edges(original_image).squeeze().to(original_image.device)
+            edges_loss_norm = (edges - edges.min()) / (edges.max() - edges.min())
+        return original(reconstructed_image, original_image, config, edges_loss_norm)
+
+    return get_loss_map
 
 
 def _unless_nothing(original: Callable[..., None]) -> Callable[..., None]:

@@ -8,6 +8,7 @@ import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
+from pathlib import Path
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runs.image_store import eight_bit_levels
+from lapgs_plugin.scenes.masks import ALPHA, NONE, find_masks, read_mask, resolve_masks
 
 KEY = "lapgs_key"
 """Attribute of cameras, and of all copies of them, with the key of the image."""
@@ -66,11 +68,15 @@ class SceneImages:
     """Take a scene's images out of its cameras when these are made, and look them up by key.
 
     Keys are unique even if names are not: Blender scenes have an r_0 for training and another for testing.
+
+    Attributes:
+        masks: (1, h, w) bool by key, False where the image is ignored; empty without masks.
     """
 
     def __init__(self) -> None:
         self._images: dict[str, FullSizeImage] = {}
         self._making = False
+        self.masks: dict[str, Tensor] = {}
 
     def adopting(self, original: Callable[..., None]) -> Callable[..., None]:
         """Return a replacement of a camera class's `__init__` that takes the image out of every camera it makes."""
@@ -104,6 +110,23 @@ class SceneImages:
         self._images[key] = FullSizeImage.of(image)
         del camera.original_image
         setattr(camera, KEY, key)
+
+    def read_masks(self, scene: Path, setting: str) -> None:
+        """Read the mask of every image; `setting` is a value of --masks.
+
+        Raises:
+            SceneError, UserInputError: as `scenes.masks`; or the value is "alpha".
+        """
+        resolved = resolve_masks(scene, setting)
+        if resolved == ALPHA:
+            raise UserInputError(
+                "--masks alpha: the checkout decides what alpha channels mean to it; give a folder of masks"
+            )
+        if resolved == NONE:
+            return
+        files = find_masks(scene / resolved, [view_name(key) for key in self._images])
+        for key, image in self._images.items():
+            self.masks[key] = read_mask(files[view_name(key)], image.size, image.size)
 
     @property
     def exact(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from lapgs_plugin.cli.bench_blend import blend
 from lapgs_plugin.cli.bench_experiment import bench_experiment
 from lapgs_plugin.cli.bench_raster import raster
 
@@ -74,3 +75,4 @@ bench_app = typer.Typer(
 bench_app.command(EXPERIMENT)(bench_experiment)
 bench_app.command("raster")(raster)
 bench_app.command("ops")(ops)
+bench_app.command("blend")(blend)

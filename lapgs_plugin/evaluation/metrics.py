@@ -47,12 +47,12 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return float(in_torch.ssim(image, target))
 
 
-def mean_quality(pairs: Iterable[tuple[Tensor, Tensor]]) -> dict[str, float]:
+def mean_quality(pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
     """Return the means of "psnr" (in dB) and "ssim" over images; empty without an image.
 
     Args:
-        pairs: image and target, as `psnr` and `ssim` take them.
+        pairs: image, target and perhaps a mask, as `psnr` and `ssim` take them.
     """
-    measured = [{"psnr": psnr(image, target), "ssim": ssim(image, target)} for image, target in pairs]
+    measured = [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs]
     names = measured[0] if measured else {}
     return {name: fmean(each[name] for each in measured) for name in names}

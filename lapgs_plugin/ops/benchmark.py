@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from statistics import median
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from lapgs_plugin.ops import adam, densification_statistics, photometric_loss, u
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
-from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
@@ -67,6 +68,7 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
     operations = {
         "upsample": _upsample_versions(ours, coarse, images[0]),
         "photometric loss": _loss_versions(ours, images[0], images[1]),
+        "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
         "Adam": _adam_versions(ours, gaussians, device),
         "densification statistics": _statistics_versions(ours, gaussians, device),
     }
@@ -113,18 +115,39 @@ def _upsample_versions(ours: str, coarse: Tensor, fine: Tensor) -> Versions:
     return versions
 
 
-def _loss_versions(ours: str, prediction: Tensor, target: Tensor) -> Versions:
-    leaf = prediction.clone().requires_grad_()
+def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | None = None) -> Versions:
+    """Return versions of the loss and its gradient, of a render or of Up(coarse) + render, with images as in training.
 
-    def gradient_of(loss: Callable[[Tensor, Tensor], Tensor]) -> Version:
-        # Times the number of pixels and channels, so that values are about 1.
-        return Version(lambda: torch.autograd.grad(loss(leaf, target), leaf)[0] * leaf.numel())
+    A GPU renders interleaved colours, and stores the target as uint8 and the coarse image as float16.
+    """
+    pyramid, size = Pyramid(), (render.shape[-2], render.shape[-1])
+    leaf = (render if ours == NUMBA else render.permute(1, 2, 0).contiguous().permute(2, 0, 1)).clone()
+    leaf.requires_grad_()
+    if ours != NUMBA:
+        target, coarse = (255 * target).to(torch.uint8), None if coarse is None else coarse.half()
 
-    versions = {TORCH: gradient_of(photometric_loss_torch)}
-    fused = photometric_loss.fused_ssim() if ours != NUMBA else None
-    if ours == NUMBA or (fused is not None and photometric_loss.triton_works()):
-        versions[ours if fused is None else f"{ours} and fused_ssim"] = gradient_of(photometric_loss.photometric_loss)
-    return versions
+    def in_parts(loss: Callable[[Tensor, Tensor, float], Tensor]) -> Callable[[], Tensor]:
+        def composed_loss() -> Tensor:
+            image = leaf if coarse is None else leaf + upsample.upsample(pyramid, coarse.float(), size)
+            return loss(image, photometric_loss.decoded(target), DEFAULT_SSIM_WEIGHT)
+
+        return composed_loss
+
+    def whole() -> Tensor:
+        image = leaf if coarse is None else upsample.upsample_add(pyramid, coarse, leaf)
+        return photometric_loss.photometric_loss(image, target)
+
+    losses = {TORCH: in_parts(photometric_loss_torch)}
+    if ours != NUMBA and photometric_loss.fused_ssim() is not None:
+        losses["fused_ssim"] = in_parts(photometric_loss.photometric_loss_fused_ssim)
+    if ours == NUMBA or photometric_loss.triton_works():
+        losses[ours] = whole
+    return {name: Version(partial(_gradient, loss, leaf)) for name, loss in losses.items()}
+
+
+def _gradient(loss: Callable[[], Tensor], leaf: Tensor) -> Tensor:
+    """Return the gradient, times the number of pixels and channels, so that values are about 1."""
+    return torch.autograd.grad(loss(), leaf)[0] * leaf.numel()
 
 
 def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import StageWindow
+from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
@@ -28,6 +28,7 @@ class ActiveStage:
 
     Args:
         context, run, window: the stage, its run, and its place there.
+        call: the script's call of `training` that trains the stage.
         finished: the stages before, coarsest first.
         before: result of the last of them; None for the base.
     """
@@ -37,13 +38,14 @@ class ActiveStage:
         context: RunContext,
         run: TrainingRun,
         window: StageWindow,
+        call: TrainingCall,
         finished: Sequence[FinishedStage],
         before: StageResult | None,
     ) -> None:
         self._context, self._run, self.window, self._finished = context, run, window, finished
         self._options, self._adapter, self._archive = context.options, context.adapter, run.archive
         self.stage = window.stage
-        self._call = self._adapter.stage_call(run.call, window, str(self._folder))
+        self._call = call
         self._views = StageViews(context, run, self.stage, self._call, None if before is None else before.predictions)
         self._model = StageModel(context, run.scene, self.stage, before)
         self.record = StageRecord(context, run.archive, window)
@@ -52,6 +54,11 @@ class ActiveStage:
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         self._gaussians: Any = None
+
+    @property
+    def keeps_schedule(self) -> bool:
+        """Whether the schedule is the checkout's own, for the whole run."""
+        return False
 
     def load_images(self) -> None:
         """Make the level's images; from now on the checkout renders for this stage."""
@@ -67,9 +74,7 @@ class ActiveStage:
     @property
     def resets_opacities(self) -> bool:
         """Whether the checkout may reset opacities: against floaters near cameras, the base's resets are enough."""
-        if self.stage.signed:
-            return self._options.residual_resets
-        return not self.window.continues_field
+        return self._options.residual_resets or not self.stage.signed
 
     def scene_for(self, gaussians: Any) -> Any:
         """Return the scene of this stage, and initialise `gaussians` from it."""
@@ -86,8 +91,9 @@ class ActiveStage:
         """Give the optimizers that the checkout has just set up inherited state."""
         self._model.prepare_optimizers(gaussians)
 
-    def iteration_begins(self, gaussians: Any, iteration: int) -> None:
-        """Do everything that comes before an iteration, counted from 1."""
+    def iteration_begins(self, gaussians: Any) -> None:
+        """Do everything that comes before the next iteration, and count it: the stage's first is 1."""
+        iteration = self.record.iteration + 1
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
         self._context.parts.breakdown.mark("other")
@@ -127,20 +133,34 @@ class ActiveStage:
         Raises:
             LapgsError: training left nothing to archive.
         """
+        self.begin()
+        self._call.run()
+        return self.finish()
+
+    def begin(self) -> None:
+        """Announce the stage and start its measurements."""
         self._log_start()
         self.record.start()
         self._context.hooks.stage_begins(self.stage, self._views.rendering)
         self._context.watcher.stage_started(self.stage)
-        self._call.run()
+
+    def finish(self) -> StageResult:
+        """Archive the field after the stage's last iteration.
+
+        Raises:
+            LapgsError: training left nothing to archive.
+        """
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
-        if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
-            with self.record.overhead.timed("evaluation"):
-                self._measure_held_out(gaussians, self.stage.iterations)
-        result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
-        self.record.archive(result, None if self._joint is None else self._joint.export_fields())
+        try:
+            if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
+                with self.record.overhead.timed("evaluation"):
+                    self._measure_held_out(gaussians, self.stage.iterations)
+        finally:  # an evaluation that fails must not cost the stage
+            result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
+            self.record.archive(result, None if self._joint is None else self._joint.export_fields())
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
@@ -159,11 +179,12 @@ class ActiveStage:
             torch.cuda.empty_cache()
 
     def copy_scene_files(self, source: Path) -> None:
-        """Copy the files that the checkout's Scene writes beside a model to the level's folder, for its viewers."""
-        self._folder.mkdir(exist_ok=True)
+        """Copy the files that the checkout's Scene writes beside a model to the call's folder, for its viewers."""
+        folder = Path(self._call.dataset.model_path)
+        folder.mkdir(exist_ok=True)
         for path in source.iterdir():
             if path.is_file():
-                shutil.copy(path, self._folder)
+                shutil.copy(path, folder)
 
     def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
@@ -175,10 +196,6 @@ class ActiveStage:
             f"finished levels ({self._archived_levels()}) are kept, --resume continues after them "
             f"[{str(error).splitlines()[0]}]"
         )
-
-    @property
-    def _folder(self) -> Path:
-        return self._archive.path(f"level_{self.stage.level}")
 
     def _log_start(self) -> None:
         width, height = self.stage.image_size

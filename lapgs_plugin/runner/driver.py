@@ -1,12 +1,13 @@
-"""Run a checkout's script as a hierarchy: its own `training`, called once a stage, archived level by level.
+"""Run a checkout's script as a hierarchy: its own `training`, archived level by level.
 
 A call of `training(dataset, opt, pipe, ...)` becomes:
 
     load     the checkout's Scene, once; its images are kept at full size on the CPU
-    stage    views at the level's size, targets and predictions in image stores, the adapter's arguments, `training`
+    stage    views at the level's size, targets and predictions in image stores
     archive  the field and its measurements; predictions of all views for the next stage
 
-The order is that of `lapgs_plugin.training.trainer`. Everything between render and optimizer is the checkout's.
+Each residual is a field of its own, trained by its own call of `training` with the adapter's arguments. Nested levels
+are one field: a single call trains them (`single_call`). Everything between render and optimizer is the checkout's.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import tempfile
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -26,17 +28,17 @@ from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.rasterizers.extensions import CudaExtension
-from lapgs_plugin.rasterizers.signed_color import ColorPath, SignedColorRasterizer
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.dry_run import DryRun
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.watcher import Watcher
@@ -111,9 +113,9 @@ class HierarchyDriver:
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite)
-        path = self._color_path()
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
+            self._context.images.read_masks(Path(call.dataset.source_path), self._options.masks)
             self._adapter.first_points(len(scene.points.points))
             plan = StagePlan.create(
                 self._context.images.smallest_size(),
@@ -122,10 +124,16 @@ class HierarchyDriver:
                 self._options.shares,
                 self._options.kind,
             )
+            dry_run = DryRun(self._context, call, scene, plan, self._activate)
+            path = dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:
-                    self._run_stages(TrainingRun(call, scene, archive, path), plan, Path(scratch))
+                    run = TrainingRun(call, scene, archive, path)
+                    if self._signs_nothing:
+                        SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
+                    else:
+                        self._run_stages(run, plan, Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
@@ -137,7 +145,7 @@ class HierarchyDriver:
         logger.info("run folder: %s", folder)
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
-        """Train or restore all stages; `scene_files` holds the files that the Scene wrote."""
+        """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
         start = 0
         finished: list[FinishedStage] = []
         before: StageResult | None = None
@@ -146,7 +154,8 @@ class HierarchyDriver:
             window = StageWindow(
                 stage, start, plan.iterations, plan.levels, options.color_factor, options.threshold_factor(stage)
             )
-            active = self._active = ActiveStage(self._context, run, window, tuple(finished), before)
+            call = self._adapter.stage_call(run.call, window, str(run.archive.path(f"level_{stage.level}")))
+            active = self._active = ActiveStage(self._context, run, window, call, tuple(finished), before)
             try:
                 active.load_images()
                 if stage.level in run.archive.available_levels:
@@ -162,12 +171,13 @@ class HierarchyDriver:
             finished.append(active.as_finished)
             start += stage.iterations
 
-    def _color_path(self) -> ColorPath:
-        """Return how the installed rasterizer evaluates signed colour, which is found out by rendering."""
-        extension = CudaExtension(self._adapter.rasterizer, self._context.device)
-        if self._options.levels == 1 or self._options.nested:
-            return ColorPath.NATIVE  # no field is signed
-        return SignedColorRasterizer(extension, checkout=self._adapter.root).path
+    @property
+    def _signs_nothing(self) -> bool:
+        """Whether no field is a residual, so that one call of the script's `training` trains all levels."""
+        return self._options.levels == 1 or self._options.nested
+
+    def _activate(self, stage: Any) -> None:
+        self._active = stage
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.

@@ -94,6 +94,7 @@ class HookCaller:
             target=targets.get(key),
             accumulated=below,
             coarse_target=None if coarse is None else coarse.get(key),
+            weight=None if (weights := self._rendering.weights) is None else weights.get(key),
         )
 
     def densified(self) -> None:

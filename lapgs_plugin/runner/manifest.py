@@ -13,6 +13,7 @@ from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.masks import resolve_masks
 
 
 def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan) -> Manifest:
@@ -26,6 +27,7 @@ def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: Trainin
             background=(1.0, 1.0, 1.0) if call.white_background else (0.0, 0.0, 0.0),
             kind="colmap" if (Path(dataset.source_path) / "sparse").exists() else "transforms",
             images=dataset.images or "images",
+            masks=resolve_masks(Path(dataset.source_path), settings.masks),
         ),
         levels=plan.levels,
         grid=settings.grid,

@@ -22,9 +22,11 @@ from torch import Tensor
 from lapgs_plugin.checkouts.level_views import view_key, view_name
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
 from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.level_images import HeldImages
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
@@ -54,6 +56,8 @@ class StageRendering:
         targets: I^l by key; None if images are compared with nothing.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
+        weights: share of each pixel inside of the view's mask by key; None without masks.
+        masked: keys of the training views, whose masks the loop's losses and scores have to honour.
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
@@ -66,6 +70,8 @@ class StageRendering:
     targets: ImageStore | None = None
     accumulated: Predictions | None = None
     coarse: Predictions | None = None
+    weights: ImageStore | HeldImages | None = None
+    masked: frozenset[str] = frozenset()
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
@@ -81,7 +87,7 @@ class StageRendering:
         """
         if noted is not None and noted in self.views:
             return noted
-        if noted is not None or not self.views or not (self.signed or self.on_image is not None):
+        if noted is not None or not self.views or not (self._needs_views or self.on_image is not None):
             return None
         if not self._by_matrix:
             for key, camera in self.views.items():
@@ -97,6 +103,8 @@ class StageRendering:
         below = self.accumulated if key in self.composed else self._below_target
         if below is not None:
             below.prefetch(key)
+        if self.weights is not None:
+            self.weights.prefetch(key)
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
@@ -113,9 +121,9 @@ class StageRendering:
             UserInputError: the image has another size than its level; in the backward pass: no view was recognised.
         """
         if key is None:
-            if not self.signed:
+            if not self._needs_views:
                 return image
-            image = image + GREY
+            image = image + (GREY if self.signed else 0)
             if image.requires_grad:
                 image.register_hook(_refuse_unrecognised)  # type: ignore[no-untyped-call]  # torch's
             return image
@@ -131,6 +139,9 @@ class StageRendering:
             image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
+        if self.weights is not None and key in self.masked and not self.capture:
+            # Whatever the loop's loss is, it compares the target with itself outside of the mask.
+            image = fill_outside(image, self.target(key), self.weights.get(key))
         return image
 
     def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
@@ -145,6 +156,11 @@ class StageRendering:
             self.captured = image
         image = _as_stored(image, stored)
         return image if place is None else _with_item(outputs, place, image)
+
+    @property
+    def _needs_views(self) -> bool:
+        """Whether training on an image of no known view would train something else."""
+        return self.signed or self.weights is not None
 
     @property
     def _below_target(self) -> Predictions | None:
@@ -294,9 +310,9 @@ def _with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]
 
 def _refuse_unrecognised(_: Tensor) -> None:
     raise UserInputError(
-        "the checkout trains a residual on a camera that is no view of its scene: no renderer was called with one, and "
-        "the rasterizer's matrices are none of the scene's; the image could not be composed with the coarser levels: "
-        "train with --hierarchy nested"
+        "the checkout trains on a camera that is no view of its scene: no renderer was called with one, and the "
+        "rasterizer's matrices are none of the scene's; so no residual can be composed with coarser levels, nor a "
+        "mask be applied: train with --hierarchy nested and without --masks"
     )
 
 

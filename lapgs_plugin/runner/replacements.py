@@ -57,8 +57,9 @@ class StageReplacements:
         ]
 
     def _window(self) -> StageWindow | None:
+        """Return the running stage if its schedule is not the checkout's own."""
         stage = self._running()
-        return None if stage is None else stage.window
+        return None if stage is None or stage.keeps_schedule else stage.window
 
     def _in_training(self, profile: Profile) -> list[Replacement]:
         scenes = [name for owner, name in profile.holders(profile.scene) if owner is profile.script.module]
@@ -125,7 +126,7 @@ class StageReplacements:
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             if (stage := self._running()) is not None:
-                stage.iteration_begins(gaussians, stage.record.iteration + 1)
+                stage.iteration_begins(gaussians)
             return original(gaussians, *args, **kwargs)
 
         return update_learning_rate

@@ -8,7 +8,7 @@ from typing import Any
 from lapgs_plugin.hierarchy.settings import STORAGE, HierarchySettings
 from lapgs_plugin.options import option
 
-IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed")
+IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
 """Settings that the manifest has fields of its own for."""
 
 
@@ -21,6 +21,12 @@ class RunSettings(HierarchySettings):
         "Step the backbone's plain Adam optimizers in one kernel a tensor.",
         panel=STORAGE,
         names=("--fused-adam/--no-fused-adam",),
+    )
+
+    masks: str = option(
+        "auto",
+        "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
+        "folder masks/ if there is one).",
     )
 
     def for_manifest(self) -> dict[str, Any]:

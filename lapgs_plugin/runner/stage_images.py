@@ -34,6 +34,7 @@ class StageImages:
         train, test: the scene's training and held-out cameras.
         targets: I^l.
         coarse: Up(I^(l+1)) of training views; None unless the supervision needs it.
+        weights: share of each pixel inside of the mask; None without masks.
     """
 
     def __init__(
@@ -54,9 +55,11 @@ class StageImages:
         sizes = [full_size[key].size for key in map(self.key, self.cameras)]
         self._stores = ImageStores(sizes, device, full_size.exact, options.images_on, folder)
         with_coarse = stage.signed and self._supervision.needs_coarse
-        self._images = LevelImages(self._stores, stage.level, self._pyramid, with_coarse=with_coarse)
+        masked = bool(full_size.masks)
+        self._images = LevelImages(self._stores, stage.level, self._pyramid, with_coarse=with_coarse, masked=masked)
         assert isinstance(self._images.targets, ImageStore), "as `exact` is not given"
         self.targets, self.coarse = self._images.targets, self._images.coarse
+        self.weights = self._images.weights
 
     @property
     def cameras(self) -> list[Any]:
@@ -87,7 +90,8 @@ class StageImages:
         training = {self.key(camera) for camera in self.train}
         for camera in self.cameras:
             key = self.key(camera)
-            self._images.put(key, self._full_size[key].load(self._device), with_coarse=key in training)
+            image, mask = self._full_size[key].load(self._device), self._full_size.masks.get(key)
+            self._images.put(key, image, mask, with_coarse=key in training)
 
     def new_predictions(self) -> UpsampledImages:
         """Return an empty store for I_hat^l of every view, which returns Up(I_hat^l)."""
@@ -105,12 +109,6 @@ class StageImages:
         """Bytes of this stage's images on the GPU."""
         return sum(store.bytes_on_device for store in self._all_stores)
 
-    @property
-    def wait_elsewhere(self) -> bool:
-        """Whether some images must be copied to the device before use."""
-        from_memory = self._device.type == "cuda"
-        return any(store.bytes_on_disk or (from_memory and store.bytes_in_memory) for store in self._all_stores)
-
     def close(self) -> None:
         """Drop all images."""
         for store in self._all_stores:
@@ -119,4 +117,4 @@ class StageImages:
     @property
     def _all_stores(self) -> tuple[ImageStore, ...]:
         upsampled = (images.store for images in (self.coarse, self.accumulated) if images is not None)
-        return (self.targets, *upsampled)
+        return (self.targets, *upsampled, *([self.weights] if isinstance(self.weights, ImageStore) else []))

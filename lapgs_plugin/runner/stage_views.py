@@ -44,6 +44,7 @@ class StageViews:
         self._context, self._call, self._stage = context, call, stage
         self._pyramid = Pyramid(context.options.grid)
         self._views: dict[str, Any] = {}
+        self._changed: dict[str, set[str]] = {}  # attributes of each view that depend on the level
         self.images = StageImages(
             context.images, run.scene, stage, context.options, context.device, run.archive.path(CACHE), predictions
         )
@@ -54,6 +55,8 @@ class StageViews:
             targets=self.images.targets,
             accumulated=self.images.accumulated,
             coarse=self.images.coarse,
+            weights=self.images.weights,
+            masked=frozenset(self.images.key(camera) for camera in self.images.train),
             composed=self.images.composed_keys,
             on_image=context.hooks.on_image if context.hooks else None,
         )
@@ -61,10 +64,15 @@ class StageViews:
     def train_views(self) -> list[Any]:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
         views = [self._view(camera) for camera in self.images.train]
-        if not self.images.wait_elsewhere:
-            return views
         keys = {id(view): key for key, view in self._views.items()}
-        return PrefetchingViews(views, lambda view: self.rendering.prefetch(keys[id(view)]))
+
+        def prefetch(view: Any) -> None:
+            if (
+                rendering := self._context.wrapper.stage
+            ) is not None:  # of the running stage: views may outlive this one
+                rendering.prefetch(keys[id(view)])
+
+        return PrefetchingViews(views, prefetch)
 
     def test_views(self) -> list[Any]:
         """Return the held-out views."""
@@ -82,16 +90,27 @@ class StageViews:
 
     @torch.no_grad()
     def held_out_quality(self, gaussians: Any) -> dict[str, float]:
-        """Return means of PSNR in dB and SSIM over the held-out views, upsampled to full resolution."""
+        """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
+        images = self._context.images
+        masks = {key: mask.to(self._device) for key, mask in images.masks.items()}
         return mean_quality(
-            (self._full_size(gaussians, camera), self._context.images[self.images.key(camera)].load(self._device))
-            for camera in self.images.test
+            (self._full_size(gaussians, camera), images[key].load(self._device), masks.get(key))
+            for camera, key in ((camera, self.images.key(camera)) for camera in self.images.test)
         )
 
     def render_train_view(self, rendering: StageRendering, gaussians: Any, camera: Any) -> Tensor:
         """Return the image (3, h, w) of a training camera over black; `rendering` replaces the stage's meanwhile."""
         background = torch.zeros(3, device=self._device)
         return self._context.render(rendering, self._call, self._view(camera), gaussians, background)
+
+    def take_over(self, before: StageViews) -> None:
+        """Bring the views of another stage to this one's level: the checkout's training holds the objects."""
+        self._views, before._views = before._views, {}
+        for camera in self.images.cameras:
+            if (view := self._views.get(key := self.images.key(camera))) is not None:
+                fresh = vars(self._make_view(camera))
+                names = before._changed[key] | self._changed[key]
+                vars(view).update({name: value for name, value in fresh.items() if name in names})
 
     def close(self) -> None:
         """Drop the stage's images, except the predictions for the next stage."""
@@ -107,11 +126,17 @@ class StageViews:
         """Return the camera at this stage's level, the same object on every call."""
         key = self.images.key(camera)
         if key not in self._views:
-            size = self.images.size(camera, self._stage.level)
-            self._views[key] = self._context.adapter.view_at(
-                camera, size, self._stage.signed, lambda: self.rendering.target(key)
-            )
+            self._views[key] = self._make_view(camera)
         return self._views[key]
+
+    def _make_view(self, camera: Any) -> Any:
+        """Return a copy of the camera at this stage's level, and note which of its attributes are other ones."""
+        key = self.images.key(camera)
+        size = self.images.size(camera, self._stage.level)
+        view = self._context.adapter.view_at(camera, size, self._stage.signed, lambda: self.rendering.target(key))
+        before = vars(camera)
+        self._changed[key] = {name for name, value in vars(view).items() if value is not before.get(name, self)}
+        return view
 
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""

@@ -211,6 +211,21 @@ class ImageStore:
             return torch.stack([self.get(name) for name in names])
         return _decode(torch.stack([self._arrived(name) for name in names]), first)
 
+    def get_stored(self, names: Sequence[str]) -> Tensor:
+        """Return images of one size as they are stored where that is float16, or levels k of k / 255 as uint8.
+
+        Their bytes are a half or a quarter of those that `get` returns. All others are decoded.
+
+        Args:
+            names: of the views; for one the result is (c, h, w), for several (b, c, h, w).
+        """
+        images = [self._images[name] for name in names]
+        as_stored = all(image.divisor is None or image.divisor is self._255 for image in images)
+        if not as_stored:
+            return self.get(names[0]) if len(names) == 1 else self.get_batch(names)
+        stored = [self._arrived(name) for name in names]
+        return stored[0] if len(names) == 1 else torch.stack(stored)
+
     @property
     def where(self) -> str:
         """One of `PLACES`."""

@@ -81,6 +81,9 @@ class HeldImages:
     def get_batch(self, names: Sequence[str]) -> Tensor:
         return torch.stack([self._images[name] for name in names])
 
+    def get_stored(self, names: Sequence[str]) -> Tensor:
+        return self._images[names[0]] if len(names) == 1 else self.get_batch(names)
+
     def close(self) -> None:
         self._images.clear()
 

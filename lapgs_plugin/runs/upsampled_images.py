@@ -5,13 +5,14 @@ A residual stage needs Up of an image that has a quarter of its pixels; only tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
-from lapgs_plugin.ops.upsample import upsample
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.runs.image_store import ImageStore
 
 
@@ -50,6 +51,16 @@ class UpsampledImages:
     def get(self, name: str) -> Tensor:
         """Return Up of an image (c, h, w) on the device, float32, a new tensor in every call; see `ImageStore.get`."""
         return upsample(self.pyramid, self.store.get(name), self._sizes[name])
+
+    def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Return what adds Up of the images of some views, of one size, to (c, h, w) or for several (b, c, h, w).
+
+        Until then they are as small as they are stored.
+        """
+        stored = self.store.get_stored(names)
+        if stored.dtype == torch.uint8:
+            stored = stored.div(255)
+        return partial(upsample_add, self.pyramid, stored)
 
     def close(self) -> None:
         """Drop all images and remove the files."""

@@ -43,7 +43,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """
     found = {name: _mask_of(folder, name) for name in names}
     if missing := [name for name, path in found.items() if path is None]:
-        stem = PurePosixPath(missing[0]).with_suffix("")
+        stem = _stem(missing[0])
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
             f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
@@ -53,8 +53,10 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _mask_of(folder: Path, name: str) -> Path | None:
-    stem = PurePosixPath(name).with_suffix("").as_posix()
-    spellings = [f"{name}.png", *(f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES)]
+    stem = _stem(name)
+    whole = [name] if stem != name else [f"{name}{suffix}" for suffix in SUFFIXES]  # a checkout's name without suffix
+    spellings = [f"{each}.png" for each in whole]
+    spellings += [f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES]
     files = [folder / each for each in spellings if is_file(folder / each)]
     if len(files) > 1:
         raise SceneError(
@@ -64,14 +66,19 @@ def _mask_of(folder: Path, name: str) -> Path | None:
     return files[0] if files else None
 
 
-def read_mask(path: Path, photo: Path, size: tuple[int, int]) -> Tensor:
+def _stem(name: str) -> str:
+    path = PurePosixPath(name)
+    return path.with_suffix("").as_posix() if path.suffix.lower() in SUFFIXES else name
+
+
+def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:
     """Read the mask of a photo, at the size of its view.
 
     Values above half of the mask's largest are inside. So masks of 0 and 1 are read like those of 0 and 255.
 
     Args:
         path: the mask.
-        photo: its photo, whose shape the mask must have.
+        photo: (width, height) of its photo, whose shape the mask must have.
         size: (width, height) of the result.
 
     Returns:
@@ -81,11 +88,11 @@ def read_mask(path: Path, photo: Path, size: tuple[int, int]) -> Tensor:
         SceneError: it cannot be read, has another shape, or is black everywhere.
     """
     width, height = image_size(path)
-    expected = image_size(photo)
     # Masks may be smaller or larger copies, whose sides were rounded.
-    if abs(width / expected[0] - height / expected[1]) > 1.0 / expected[0] + 1.0 / expected[1]:
+    if abs(width / photo[0] - height / photo[1]) > 1.0 / photo[0] + 1.0 / photo[1]:
+        turned = " (EXIF turns photos for display; masks belong to stored pixels)" if width == photo[1] else ""
         raise SceneError(
-            f"{path}: the mask is {width}x{height} pixels, its photo {expected[0]}x{expected[1]}; expected the same "
+            f"{path}: the mask is {width}x{height} pixels, its photo {photo[0]}x{photo[1]}{turned}; expected the same "
             "size, make it again from this photo"
         )
     return _inside(read_image(path, size=size).mean(0, keepdim=True), path)

@@ -13,7 +13,7 @@ import pycolmap
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.scenes.colmap_binary import check_whole
 
-SCENE_ENTRIES = frozenset({"images", "sparse"})
+SCENE_ENTRIES = frozenset({"images", "masks", "sparse"})
 """Entries of a scene folder. A folder with any other entry is never overwritten."""
 
 

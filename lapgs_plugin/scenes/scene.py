@@ -251,7 +251,7 @@ def _read_mask(masks: str, files: dict[str, Path], frame: Frame, size: tuple[int
     """Read the mask of a view (1, h, w); None without one. `masks` is a result of `resolve_masks`."""
     if masks == ALPHA:
         return alpha_mask(frame.path, size)
-    return read_mask(files[frame.name], frame.path, size) if files else None
+    return read_mask(files[frame.name], image_size(frame.path), size) if files else None
 
 
 def _load_views(

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
@@ -131,7 +132,7 @@ class StageRun:
     say: Callable[[str], None] = print
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
-    _context: StageContext | None = None  # of the last rendered view
+    _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
         """Train to the end of the stage, from the iteration in `progress`. An iteration is a view, a step one or more.
@@ -232,8 +233,8 @@ class StageRun:
             self.progress.gaussian_steps += launch.gaussians * launch.views
         self.breakdown.mark("other")
         context, self._context = self._context, None
-        assert context is not None
-        self.hooks.after_backward(context)
+        if context is not None:
+            self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
         means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
@@ -287,21 +288,19 @@ class StageRun:
             assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
             self.joint = self.unfreeze(None)
         views = [self._view(iteration) for iteration in iterations]
-        contexts = self._contexts(iterations, [view.name for view in views])
+        names = [view.name for view in views]
+        losses_of = self._plain_losses(names) if self._is_plain else self._hooked_losses(iterations, names)
         self._prefetch(then)
-        for context in contexts:
-            self.hooks.before_render(context)
         self.breakdown.mark("forward")
         gaussians = self.model.field
         rendered, result = self._render(gaussians, [view.camera for view in views], last)
         self.breakdown.mark("loss")
-        images = [rendered] if len(contexts) == 1 else rendered.unbind()
-        losses = [
-            self.hooks.loss(context, self.hooks.compose(context, image))
-            for context, image in zip(contexts, images, strict=True)
-        ]
+        losses = losses_of(rendered)
+        del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         kept = loss.detach()
+        if result is not None:
+            result = replace(result, image=kept, transmittance=None)
         if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
             self._note_loss(kept.item(), last, len(views))
         regularization = self.densifier.regularization(gaussians)
@@ -310,10 +309,36 @@ class StageRun:
         # The gradient of the sum of the views' losses; for one view, the default of `backward`.
         total.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
-        self._context = contexts[-1]
-        if result is not None:  # the images of all views of a step would fill a GPU
-            result = replace(result, image=kept, transmittance=None)
         return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
+        return self.images.weights is None and self.hooks.is_plain(self.stage)
+
+    def _plain_losses(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
+        """Return what computes the mean loss of some views, in a list, from their renders."""
+        target = self.images.targets.get_stored(names)
+        compose: Callable[[Tensor], Tensor]
+        if self.joint is None and self.accumulated is not None:
+            compose = self.accumulated.adder(names)
+        else:
+            compose = partial(add_prediction, accumulated=self._prediction(names))
+        return lambda rendered: [photometric_loss(compose(rendered), target, self.settings.ssim_weight)]
+
+    def _hooked_losses(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
+        """Return what computes the losses of some views by all hooks, from their renders."""
+        contexts = self._contexts(iterations, names)
+        for context in contexts:
+            self.hooks.before_render(context)
+        self._context = contexts[-1]
+
+        def losses(rendered: Tensor) -> list[Tensor]:
+            images = [rendered] if len(contexts) == 1 else rendered.unbind()
+            pairs = zip(contexts, images, strict=True)
+            return [self.hooks.loss(context, self.hooks.compose(context, image)) for context, image in pairs]
+
+        return losses
 
     def _contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
@@ -388,14 +413,14 @@ class StageRun:
             if self.accumulated is not None and self.joint is None:
                 self.accumulated.prefetch(name)
 
-    def _densify(self, context: StageContext, iteration: int, launch: _Launch) -> None:
+    def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
         threshold = self.densifier.score_threshold(iteration)
         scores = None if threshold is None else self._scores(iteration, threshold)
         changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
         if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
             self._prune(share)
             changed = True
-        if changed:
+        if changed and context is not None:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 

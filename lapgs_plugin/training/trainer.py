@@ -28,7 +28,7 @@ from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.ops.upsample import upsample
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -98,18 +98,23 @@ def warm_up(
     model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
     camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
     result = rasterizer(model.field, camera, background=black)
-    image = result.image + render_image(rasterizer, model.field, camera, black)
-    photometric_loss(image, torch.zeros_like(image)).backward()  # type: ignore[no-untyped-call]  # torch's
+    # Kernels of the loss are compiled for the types that targets and predictions are stored in.
+    on_gpu = torch.device(device).type == "cuda"
+    target_types = (torch.uint8, torch.float16) if on_gpu else (result.image.dtype,)
+    coarse = torch.zeros(3, 8, 8, device=device)
+    rendered = [result.image, render_image(rasterizer, model.field, camera, black)]
+    if residuals:
+        rendered.append(upsample_add(Pyramid(), coarse.to(target_types[-1]), rendered[1]))
+    targets = [torch.zeros(3, 16, 16, dtype=each, device=device) for each in target_types]
+    losses = [photometric_loss(image, target) for image in rendered for target in targets]
+    torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
     if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch:
         images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
         photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))
-    if torch.device(device).type == "cuda":
+    if on_gpu:
         densification_statistics.triton_works()
-    coarse = torch.zeros(3, 8, 8, device=device)
-    if residuals:
-        upsample(Pyramid(), coarse, (16, 16))
     if joint:
         below = upsample(Pyramid(), coarse.requires_grad_(), (16, 16))
         below.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's

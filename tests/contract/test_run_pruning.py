@@ -44,7 +44,9 @@ def test_what_is_least_seen_goes(
     monkeypatch.setattr(ActiveStage, "_prune", watched)
     archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, hierarchy=hierarchy, **THIRDS)
     assert archive.manifest.complete
-    assert list(fields) == [1, 0]
+    # Residuals each densify for themselves; one nested field densifies until iteration 60 of the run.
+    expected_at = {1: 20, 0: 40} if hierarchy == "laplacian" else {0: 30}
+    assert list(fields) == list(expected_at)
     rasterizer = rasterizer_for(archive.manifest, "cpu", archive.manifest.rasterizer).rasterizer
     views = run_scene(archive).train
     for (level, (before, after)), pixels in zip(fields.items(), measured, strict=True):
@@ -67,7 +69,7 @@ def test_what_is_least_seen_goes(
         assert (pixels - expected).abs().sum() < 1e-3 * expected.sum()
     entries = [entry for entry in archive.history() if "num_gaussians" in entry]
     counts = {(entry["level"], entry["iteration"]): entry["num_gaussians"] for entry in entries}
-    for level, first in ((1, 20), (0, 40)):
+    for level, first in expected_at.items():
         assert counts[level, first - 1] == len(fields[level][0])
         assert counts[level, first] == len(fields[level][1])
 

@@ -184,11 +184,10 @@ def test_depths_supervise_every_nested_level(deep: Path, tmp_path: Path) -> None
     assert min(shown) > 0
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-def test_exposures_go_on_from_stage_to_stage(hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    """The next level saves at its first iteration, before it steps, what the base saves at its last one."""
+def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> None:
+    """The residual saves at its first iteration, before it steps, what the base saves at its last one."""
     more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30, hierarchy=hierarchy, **THIRDS)
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30)
     base = json.loads(archive.path("level_1", "exposure.json").read_text())
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "again", *more, 31) as adapter:
         at_first: dict[str, Any] = {}
@@ -200,29 +199,35 @@ def test_exposures_go_on_from_stage_to_stage(hierarchy: str, scene: Path, tmp_pa
                 at_first.update(json.loads(Path(self.model_path, "exposure.json").read_text()))
 
         adapter.train.Scene.save = spy
-        drive(adapter, hierarchy=hierarchy, **THIRDS)
+        drive_residuals(adapter)
     assert at_first == base
     assert np.abs(np.array(list(base.values())) - np.eye(3, 4)).max() > 0.01, "they were trained"
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)
 def test_exposures_survive_a_stop(hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations", 30)
-    folder = tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        run_hierarchy(STUBS["graphdeco"], scene, folder, *more, hooks=(StopAt(0),), hierarchy=hierarchy, **THIRDS)
-    base = json.loads((folder / "level_1" / "exposure.json").read_text())
+    """A stopped run continues with the exposures that the base ended with."""
+    more = ("--train_test_exp", "--exposure_lr_init", 0.1)
+    trained: list[Tensor] = []
     started: list[Tensor] = []
-    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, folder, *more) as adapter:
-        setup = adapter.train.GaussianModel.training_setup
 
-        def spy(self: Any, training_args: Any) -> None:
-            started.append(self._exposure.detach().clone())
-            setup(self, training_args)
+    def run(resume: bool) -> None:
+        with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *more) as adapter:
+            setup = adapter.train.GaussianModel.training_setup
 
-        adapter.train.GaussianModel.training_setup = spy
-        drive(adapter, resume=True, hierarchy=hierarchy, **THIRDS)
-    assert torch.equal(started[0], torch.tensor(list(base.values())))
+            def spy(self: Any, training_args: Any) -> None:
+                trained.append(self._exposure)
+                started.append(self._exposure.detach().clone())
+                setup(self, training_args)
+
+            adapter.train.GaussianModel.training_setup = spy
+            drive(adapter, hooks=() if resume else (StopAt(0),), resume=resume, hierarchy=hierarchy, **THIRDS)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(resume=False)
+    run(resume=True)
+    assert torch.equal(started[1], trained[0].detach())
+    assert (started[1] - torch.eye(3, 4)).abs().max() > 0.01, "they were trained"
 
 
 @pytest.mark.parametrize("name", ["taming", "graphdeco"])

@@ -11,9 +11,8 @@ import pytest
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan
-from lapgs_plugin.runner.settings import RunSettings
-from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy
+from lapgs_plugin.hierarchy.plan import Stage
+from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_residuals
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
@@ -123,11 +122,14 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
 def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
     """In a bare run, a start between two intervals makes the last densification read past the table's end."""
     schedule = ("--densify_from_iter", 7, "--densification_interval", 5, "--densify_until_iter", 60)
-    archive, _ = run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *schedule)
+    archive, _ = run_residuals(STUBS["taming"], scene, tmp_path / "run", *schedule)
     assert archive.manifest.complete
 
 
-def test_taming_releases_opacities_at_the_iteration_of_each_stage(scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("hierarchy", "expected"), [("laplacian", [25, 25]), ("nested", [25])])
+def test_taming_releases_opacities_at_the_iteration_of_each_call(
+    hierarchy: str, expected: list[int], scene: Path, tmp_path: Path
+) -> None:
     released: list[int] = []
     now = [0]
     with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", "--ho_iteration", 25) as adapter:
@@ -143,8 +145,8 @@ def test_taming_releases_opacities_at_the_iteration_of_each_stage(scene: Path, t
             modify(self)
 
         model.update_learning_rate, model.modify_functions = spy_update, spy_modify
-        drive(adapter)
-    assert released == [25, 25]
+        drive(adapter, hierarchy=hierarchy)
+    assert released == expected
 
 
 def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict[str, list[tuple[int, int]]]:
@@ -181,48 +183,58 @@ def test_fastgs_prunes_late_by_the_share_and_steps_by_the_iterations_of_each_sta
     """The published schedule for 30,000 iterations prunes at 18,000, 21,000, 24,000 and 27,000. All iterations until
     15,000 step, higher SH every 16th. A stage's last iteration does not step."""
     more = ("--iterations", 600, "--densify_until_iter", 0, "--sh_degree", 0)
-    found = record_fastgs(scene, tmp_path / "run", *more, **THIRDS)
+    found = record_fastgs(scene, tmp_path / "run", *more, hierarchy="laplacian", joint=0.0, **THIRDS)
     assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
     assert found["step"] == [(n, i) for n in (200, 400) for i in range(1, n)]
     assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_nested_level_densifies_for_a_third_of_its_stage(name: str, scene: Path, tmp_path: Path) -> None:
-    base, finest = StagePlan.create(
-        (800, 533), TOTAL, split=RunSettings(hierarchy="nested").shares, hierarchy=Hierarchy.NESTED
-    )
-    with loaded(STUBS[name], scene, tmp_path) as adapter:
-        adapter.first_points(1_000)
-        call = published_call(name, adapter)
-        windows = (StageWindow(base, 0, TOTAL, 2, 4.0, 2.0), StageWindow(finest, base.iterations, TOTAL, 2, 4.0, 2.0))
-        stages = [adapter.stage_call(call, window, "run").opt for window in windows]
-    assert [opt.iterations for opt in stages] == [15_000, 15_000]
-    assert [opt.densify_until_iter for opt in stages] == [7_500, 5_000]
+def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Path, tmp_path: Path) -> None:
+    """Coarse levels densify by twice the threshold, as `--coarse-threshold` says; the script's own options stay."""
+    seen: dict[int, dict[str, Any]] = {}
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+        model = adapter.train.GaussianModel
+        setup, update = model.training_setup, model.update_learning_rate
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            self.options_given = training_args
+            setup(self, training_args)
+
+        def update_learning_rate(self: Any, iteration: int) -> Any:
+            seen[iteration] = dict(vars(self.options_given))
+            return update(self, iteration)
+
+        model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
+        drive(adapter, **THIRDS)
+        thresholds = adapter.info.densify_thresholds
+    given = {name: value for name, value in seen[31].items() if name not in thresholds}
+    assert {name: value for name, value in seen[30].items() if name not in thresholds} == given
+    assert given["iterations"] == 90
+    for threshold in thresholds:
+        assert seen[30][threshold] == 2 * seen[31][threshold]
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_stages_after_the_first_reset_no_opacities(name: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
-    """Resets are skipped at the interval and, over white, where densification begins."""
+def test_residuals_reset_no_opacities(name: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
+    """Resets are skipped at the interval and, over white, where densification begins. Nested levels are reset when the
+    checkout does it: every 8 iterations until 60, and at iteration 5."""
     more = ("--opacity_reset_interval", 8, "--white_background")
-    asked: dict[int, int] = {}
+    asked: list[int] = []
     with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *more) as adapter:
         model = adapter.train.GaussianModel
-        setup = model.training_setup
+        update, now = model.update_learning_rate, [0]
 
-        def training_setup(self: Any, training_args: Any) -> None:
-            self.stage_iterations = training_args.iterations
-            asked[training_args.iterations] = 0
-            setup(self, training_args)
+        def update_learning_rate(self: Any, iteration: int) -> Any:
+            now[0] += 1
+            return update(self, iteration)
 
-        def reset_opacity(self: Any) -> None:
-            asked[self.stage_iterations] += 1
-
-        model.training_setup, model.reset_opacity = training_setup, reset_opacity
+        model.update_learning_rate = update_learning_rate
+        model.reset_opacity = lambda self: asked.append(now[0])
         drive(adapter, hierarchy=hierarchy, **THIRDS)
-    assert asked[30] > 1
-    assert asked[60] == 0
+    until = 20 if hierarchy == "laplacian" else 60
+    assert asked == sorted([5, *range(8, until, 8)])
 
 
 def test_residuals_reset_opacities_where_that_is_asked_for(scene: Path, tmp_path: Path) -> None:
@@ -246,5 +258,5 @@ def test_residuals_reset_opacities_where_that_is_asked_for(scene: Path, tmp_path
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:
     more = ("--densify_from_iter", 50, "--densification_interval", 5)
-    with pytest.raises(UserInputError, match="level 1 would stop densifying at iteration 30 and start after 50"):
-        run_hierarchy(STUBS["taming"], scene, tmp_path / "run", *more)
+    with pytest.raises(UserInputError, match="level 1 would stop densifying at iteration 20 and start after 50"):
+        run_residuals(STUBS["taming"], scene, tmp_path / "run", *more)

@@ -373,6 +373,15 @@ def test_predictions_read_ahead_from_the_disk_change_no_bit(scene: Scene, tmp_pa
     assert plys(runs[0]) == plys(runs[1])
 
 
+def test_a_hook_that_does_nothing_changes_nothing(scene: Scene, tmp_path: Path) -> None:
+    """Without hooks the loss takes images as they are stored; a hook gets composed ones."""
+    settings = replace(SETTINGS, iterations=8, joint=0.0, prune=0.0, densification=Densification(start=99, until=100))
+    runs = [train(tmp_path / str(len(hooks)), scene, settings, user_hooks=hooks) for hooks in ([], [StageHook()])]
+    losses = [[entry["loss"] for entry in run.history()] for run in runs]
+    assert losses[0] == losses[1]
+    assert plys(runs[0]) == plys(runs[1])
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -272,7 +272,8 @@ def test_few_features_are_mapped_by_one_thread(
     used = []
     monkeypatch.setattr(pycolmap.Database, "open", lambda path: nullcontext(database))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **callbacks: used.append(args[3].num_threads))
-    colmap_worker._map({"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed")})
+    job = {"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed"), "mapper": "incremental"}
+    colmap_worker._map(job)
     assert used == [threads]
 
 
@@ -321,14 +322,18 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     refused(SceneError, "0 photos, expected at least 2", empty)
-    (empty / "a.heic").write_bytes(b"")
-    refused(SceneError, r"0 photos \(and files of type \.heic\)", empty)
+    (empty / "a.dng").write_bytes(b"")
+    refused(SceneError, r"0 photos \(and files of type \.dng\)", empty)
     shutil.copy(noise / "00.png", empty)
     refused(SceneError, "1 photos", empty)
     shutil.copy(noise / "00.png", empty / "00.tif")
     refused(SceneError, r"00\.png and 00\.tif would both become 00\.png", empty)
-    refused(UserInputError, "--matcher 'vocabulary': expected exhaustive or sequential", matcher="vocabulary")
-    refused(UserInputError, "--camera-model 'LENS': expected one of SIMPLE_PINHOLE", camera_model="LENS")
+    refused(
+        UserInputError,
+        "--matcher 'vocabulary': expected auto, exhaustive, sequential or retrieval",
+        matcher="vocabulary",
+    )
+    refused(UserInputError, "--camera-model 'LENS': expected auto or one of SIMPLE_PINHOLE", camera_model="LENS")
     refused(UserInputError, "--max-size 10: expected at least 64", max_size=10)
     _save(noise / "larger.png", np.zeros((90, 90, 3), np.float32))
     refused(UserInputError, r"--single-camera: .*80x64 pixels and .*90x90", single_camera=True)
@@ -397,6 +402,7 @@ def test_a_failure_of_colmap_is_one_line(
 
 def test_the_worker_ends_with_the_process_that_started_it(photos: Path, tmp_path: Path) -> None:
     job = {"step": "features", "database": str(tmp_path / "database.db"), "photos": str(photos), "max_size": None}
+    job |= {"masks": None}
     job |= {"names": [file.name for file in photos.iterdir()], "camera_model": "OPENCV", "single_camera": True}
     command = [sys.executable, str(prepare_module.WORKER)]
     worker = subprocess.run(command, input=json.dumps(job).encode() + b"\n", capture_output=True, check=False)

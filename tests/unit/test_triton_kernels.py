@@ -14,7 +14,10 @@ CHECKS = """
 import torch
 from lapgs_plugin.rasterizers.gsplat.kernels import activate, finish_gradients, visible_colors, write_to_stack
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
+from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics_triton
 
 def close(found, expected, absolute=1e-5, relative=1e-4):
@@ -71,13 +74,26 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
         close(counts, expected[1])
 pixels, shown = pixels[0].contiguous(), shown[0]
 
-prediction, target = torch.randn(3, 31, 45, requires_grad=True), torch.randn(3, 31, 45)
-losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
-close(*losses)
-close(*(torch.autograd.grad(3 * loss, prediction)[0] for loss in losses))
+for shape, kind, interleaved in (
+    ((3, 18, 5), torch.float32, False),
+    ((2, 3, 5, 47), torch.uint8, True),
+    ((3, 1, 1), torch.float16, True),
+):
+    prediction, target = torch.rand(shape), torch.rand(shape)
+    prediction[..., 0] = target[..., 0] = 1.0  # L1 has no slope where both are equal
+    if interleaved:
+        prediction = prediction.movedim(-3, -1).contiguous().movedim(-1, -3)
+    prediction.requires_grad_()
+    stored = target.to(kind) if kind != torch.uint8 else (255 * target).round().to(kind)
+    exact = stored.double() / (255 if kind == torch.uint8 else 1)
+    losses = photometric_loss_triton(prediction, stored, 0.2), photometric_loss_torch(prediction.double(), exact, 0.2)
+    close(losses[0].double(), losses[1])
+    found, expected = (torch.autograd.grad(3 * loss, prediction)[0] for loss in losses)
+    assert found.stride() == prediction.stride()
+    close(found * found.numel(), expected * found.numel(), 1e-4)  # values to 7; worst seen 3e-6
 broken = prediction.detach().clone()
-broken[1, 2, 3] = torch.nan
-assert weighted_l1(broken, target, 0.8, 0.2).isnan()
+broken[1, 0, 0] = torch.nan
+assert photometric_loss_triton(broken, stored, 0.2).isnan()
 
 norms, counts = torch.rand(n), torch.rand(n)
 expected = norms + torch.where(shown, (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1), 0.0), counts + shown
@@ -89,7 +105,7 @@ from lapgs_plugin.ops import adam, densification_statistics, photometric_loss
 torch.set_default_device(None)
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
-assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-4
+assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 1e-5
 """
 
 

@@ -34,6 +34,12 @@ def test_images_are_up_of_the_stored_ones(grid: str, device: str, where: str, pr
         assert (got.dtype, got.device.type, got.requires_grad) == (torch.float32, device, False)
         expected = Pyramid(grid).up(coarse[name].detach(), size)
         torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=WORST[precision])
+        fine = torch.rand(3, *size, device=device, requires_grad=True)
+        added = images.adder([name])(fine)
+        torch.testing.assert_close(added.cpu(), expected + fine.cpu(), rtol=0, atol=WORST[precision])
+        weights = torch.rand_like(fine)
+        (gradient,) = torch.autograd.grad((added * weights).sum(), fine)
+        torch.testing.assert_close(gradient, weights, rtol=0, atol=0)
     images.close()
     assert not list(tmp_path.iterdir())
 

@@ -16,16 +16,22 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
     """Return the loss of 3DGS, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable by the prediction.
 
-    On the CPU a fused kernel computes it together with its gradient. On a GPU SSIM comes from the package `fused_ssim`
-    where that is installed, else from kornia.
+    On the CPU a fused kernel computes it together with its gradient. On a GPU two Triton kernels do, where they work;
+    else SSIM comes from the package `fused_ssim` or from kornia.
 
     Args:
-        prediction, target: (3, h, w), or (b, 3, h, w) of several views; the target without gradient.
+        prediction: (3, h, w), or (b, 3, h, w) of several views.
+        target: of that shape, without gradient; any float type, or uint8 levels k of k / 255.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
         The loss, a scalar; the mean over several views.
     """
+    if triton_works(prediction):
+        from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
+
+        return photometric_loss_triton(prediction, target, ssim_weight)
+    target = decoded(target).to(prediction.dtype)
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
@@ -36,27 +42,37 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     fused = fused_ssim()
     if fused is None or prediction.dtype != torch.float32:
         return photometric_loss_torch(prediction, target, ssim_weight)
-    ssim = fused(as_batch(prediction), as_batch(target))
-    if triton_works(prediction):
-        from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+    return photometric_loss_fused_ssim(prediction, target, ssim_weight)
 
-        # The kernel also adds the constant: each scalar operation would cost a launch, and another for its gradient.
-        rest = weighted_l1(prediction.contiguous(), target.contiguous(), 1.0 - ssim_weight, ssim_weight)
-        return torch.sub(rest, ssim, alpha=ssim_weight)
+
+def photometric_loss_fused_ssim(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """Do `photometric_loss` with the package `fused_ssim`, which has to be installed."""
+    fused = fused_ssim()
+    assert fused is not None
     l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim)
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(as_batch(prediction), as_batch(target)))
 
 
-@matches_reference("L1 in several operations instead of one kernel", 1e-4)
+def decoded(target: Tensor) -> Tensor:
+    """Return a target in a float type: levels k of uint8 as k / 255."""
+    # Divided by a tensor: GPUs multiply by the reciprocal of a number, which differs from how photographs are read.
+    return target / torch.tensor(255.0, device=target.device) if target.dtype == torch.uint8 else target
+
+
+@matches_reference("the photometric loss in many operations instead of two kernels", 1e-3)
 def triton_works(device: torch.device) -> float:
-    """Compare the loss and its gradient."""
-    from lapgs_plugin.ops.photometric_loss.in_triton import weighted_l1
+    """Compare the loss and its gradient, times the number of values; the gradient is then about 1."""
+    from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 
-    target = torch.linspace(0, 1, 3000, device=device)
-    prediction = (2 * target.square()).requires_grad_()
-    losses = weighted_l1(prediction, target, 0.8, 0.2), 0.2 + 0.8 * (prediction - target).abs().mean()
-    gradients = [torch.autograd.grad(3.0 * loss, prediction)[0] * len(target) for loss in losses]
-    return largest((one - other).abs() for one, other in (losses, gradients))
+    # As gsplat returns images: the kernels that are compiled here are then those of training.
+    target = torch.linspace(0, 1, 3 * 19 * 47, device=device).view(19, 47, 3).permute(2, 0, 1)
+    prediction = (target + 0.1 * (40 * target).sin()).requires_grad_()
+    levels = (255 * target).round().to(torch.uint8).contiguous()
+    exact = prediction.double(), decoded(levels).double()  # GPUs convolve float32 with fewer bits
+    found = []
+    for loss in (photometric_loss_triton(prediction, levels, 0.2), photometric_loss_torch(*exact, 0.2)):
+        found.append((loss, torch.autograd.grad(3.0 * loss, prediction)[0] * target.numel()))
+    return largest((one - other).abs() for one, other in zip(*found, strict=True))
 
 
 @lru_cache(maxsize=1)

@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blending, blend_backward
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
@@ -117,7 +118,7 @@ def _channels_first(images: Tensor) -> Tensor:
 
 
 class _Render(torch.autograd.Function):
-    """(field, cameras) -> contiguous image (3, h, w), or images (c, 3, h, w) of several."""
+    """(field, cameras) -> image (3, h, w), or images (c, 3, h, w) of several, with interleaved colours in memory."""
 
     @staticmethod
     def forward(
@@ -128,29 +129,30 @@ class _Render(torch.autograd.Function):
         images, found = _forward(
             means, quaternions, log_scales, logits, sh, cameras, background, degree, signed, describes
         )
-        ctx.save_for_backward(means, quaternions, sh, background, *cameras[:3], *found)
+        images = _channels_first(images)
+        ctx.save_for_backward(means, quaternions, sh, background, *cameras[:3], images, *found)
         ctx.size, ctx.degree, ctx.signed, ctx.absgrad = cameras[3:], degree, signed, absgrad
         ctx.targets = targets
         box.append(found)
-        return _channels_first(images).contiguous()
+        return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_image: Tensor) -> tuple[Tensor | None, ...]:
         from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
 
-        means, quaternions, sh, background, poses, intrinsics, centres, *rest = ctx.saved_tensors
+        means, quaternions, sh, background, poses, intrinsics, centres, images, *rest = ctx.saved_tensors
         found, (width, height), compiled = Intermediates(*rest), ctx.size, compiled_functions()
-        by_images = by_image.movedim(-3, -1).contiguous().view(*found.alphas.shape[:-1], 3)
-        by_absolute, by_means2d, by_conics, by_colors, by_opacities = compiled.rasterize_to_pixels_3dgs_bwd(
-            found.means2d, found.conics, found.colors, found.opacities, background, None,
-            width, height, TILE, found.offsets, found.flat, found.alphas, found.last,
-            by_images, _zeros(found.alphas.shape, means.device), ctx.absgrad,
+        blending = Blending(
+            found.means2d, found.conics, found.colors, found.opacities, background,
+            found.offsets, found.flat, found.alphas, found.last, images,
         )  # fmt: skip
+        by_absolute: Tensor | None
+        by_absolute, by_means2d, by_conics, by_colors, by_opacities = blend_backward(blending, by_image, ctx.absgrad)
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
             compiled.CameraModelType.PINHOLE, found.radii, found.conics, None,
-            by_means2d, _zeros(found.depths.shape, means.device), by_conics, None, False,
+            by_means2d, zeros(found.depths.shape, means.device), by_conics, None, False,
         )  # fmt: skip
         by_sh = finish_gradients(
             means, centres, sh, ctx.degree, ctx.signed, found.radii, found.colors, found.scales, found.opacities,
@@ -250,7 +252,7 @@ def _write_gradients(targets: GradientTargets, by_centre: Tensor, by_absolute: T
 
 @lru_cache(maxsize=8)
 @torch.inference_mode(False)  # cached for later calls, which may need gradients
-def _zeros(shape: torch.Size, device: torch.device) -> Tensor:
+def zeros(shape: torch.Size, device: torch.device) -> Tensor:
     """Return cached zeros, the gradients by unused outputs; they must not be written to."""
     return torch.zeros(shape, device=device)
 

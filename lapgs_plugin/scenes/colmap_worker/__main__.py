@@ -14,9 +14,17 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 SEED = 0
+
+LOOP_FROM = 40
+"""Photos from which on sequential matching also looks for places that the camera came back to."""
+MOST_DESCRIPTORS, DESCRIPTORS_A_WORD = 500_000, 50
+FEWEST_WORDS, MOST_WORDS = 64, 8192
+EMBEDDING = 64
+"""Features that a vocabulary is made of, and its size; the embedding is the only one that COLMAP has for SIFT."""
 
 PAIR_BLOCK = 10
 """Photos whose features are in memory at a time in exhaustive matching."""
@@ -35,9 +43,11 @@ def _end_with_parent() -> None:
 
 
 def _find_features(job: dict[str, Any]) -> None:
-    """Extract features. Keys: database, photos, names, camera_model, single_camera, max_size (or None)."""
+    """Extract features. Keys: database, photos, names, camera_model, single_camera, max_size and masks (or None)."""
     mode = pycolmap.CameraMode.SINGLE if job["single_camera"] else pycolmap.CameraMode.AUTO
     reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
+    if job["masks"] is not None:
+        reader.mask_path = job["masks"]
     options = pycolmap.FeatureExtractionOptions(use_gpu=pycolmap.has_cuda)
     if job["max_size"] is not None:
         options.max_image_size = job["max_size"]
@@ -54,19 +64,57 @@ def _find_features(job: dict[str, Any]) -> None:
 
 
 def _match_pairs(job: dict[str, Any]) -> None:
-    """Match features. Keys: database, matcher."""
+    """Match features. Keys: database, matcher, similar (photos for each by retrieval), tree (a file to write)."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     if job["matcher"] == "exhaustive":
         blocks = pycolmap.ExhaustivePairingOptions(block_size=PAIR_BLOCK)
         pycolmap.match_exhaustive(job["database"], matching, blocks, verification)
+    elif job["matcher"] == "retrieval":
+        _make_tree(job["database"], job["tree"])
+        alike = pycolmap.VocabTreePairingOptions(vocab_tree_path=job["tree"], num_images=job["similar"])
+        pycolmap.match_vocabtree(job["database"], matching, alike, verification)
     else:
-        pycolmap.match_sequential(job["database"], matching, pycolmap.SequentialPairingOptions(), verification)
+        neighbours = pycolmap.SequentialPairingOptions()
+        with pycolmap.Database.open(job["database"]) as database:
+            returns = database.num_images() >= LOOP_FROM and hasattr(pycolmap.VisualIndex, "build")
+        if returns:
+            _make_tree(job["database"], job["tree"])
+            neighbours.loop_detection, neighbours.vocab_tree_path = True, job["tree"]
+        pycolmap.match_sequential(job["database"], matching, neighbours, verification)
+
+
+def _make_tree(database: str, tree: str) -> None:
+    """Write a vocabulary of the photos' own features, which finds photos that look alike. Nothing is downloaded."""
+    with pycolmap.Database.open(database) as opened:
+        kinds = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
+    used = [each for each in kinds if len(each.data)]
+    share = min(1.0, MOST_DESCRIPTORS / max(sum(len(each.data) for each in used), 1))
+    random = np.random.default_rng(SEED)
+    chosen = [each.data[random.random(len(each.data)) < share] for each in used]
+    descriptors = np.concatenate(chosen).astype(np.float32)
+    words = int(np.clip(len(descriptors) // DESCRIPTORS_A_WORD, FEWEST_WORDS, MOST_WORDS))
+    index = pycolmap.VisualIndex.create(descriptors.shape[1], EMBEDDING)
+    index.build(
+        pycolmap.VisualIndex.BuildOptions(num_visual_words=words, num_iterations=11, num_rounds=1),
+        pycolmap.FeatureDescriptorsFloat(used[0].type, descriptors),
+    )
+    index.write(tree)
 
 
 def _map(job: dict[str, Any]) -> None:
-    """Recover models. Keys: database, photos, models (an empty folder), placed (a file that grows a byte per photo)."""
+    """Recover models.
+
+    Keys: database, photos, models (an empty folder), placed (a file that grows a byte per photo), mapper ("incremental"
+    or "global"), camera_model (to fit instead of the database's; may be missing).
+    """
+    if "camera_model" in job:
+        _replace_cameras(job["database"], job["camera_model"])
+    if job["mapper"] == "global":
+        whole = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+        pycolmap.global_mapping(job["database"], job["photos"], job["models"], whole)
+        return
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.mapper.random_seed = options.triangulation.random_seed = SEED
     with pycolmap.Database.open(job["database"]) as database:
@@ -86,6 +134,16 @@ def _map(job: dict[str, Any]) -> None:
             initial_image_pair_callback=lambda: place(2),
             next_image_callback=lambda: place(1),
         )
+
+
+def _replace_cameras(path: str, model: str) -> None:
+    """Give the cameras of a database another model without distortion, and the same focal length."""
+    with pycolmap.Database.open(path) as database:
+        for camera in database.read_all_cameras():
+            focal = camera.mean_focal_length()
+            other = pycolmap.Camera.create_from_model_name(camera.camera_id, model, focal, camera.width, camera.height)
+            other.has_prior_focal_length = camera.has_prior_focal_length
+            database.update_camera(other)
 
 
 if __name__ == "__main__":

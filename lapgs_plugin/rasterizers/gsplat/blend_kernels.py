@@ -1,0 +1,278 @@
+"""Compute the gradients of blending in Triton, one program for each region of a tile.
+
+gsplat's backward pass gives each pixel a thread. For each Gaussian the threads of a warp add up their gradients by
+shuffles, which takes most of the time. Here a warp holds a bucket of Gaussians by all pixels of its region: it adds up
+pixels in registers first, and it skips Gaussians that do not reach the region.
+
+Gaussians are taken front to back, as in the forward pass. Let g be a pixel's gradient, c_i the colours, a_i the
+alphas, T_i the transmittances before each Gaussian. The colour that reaches the eye from behind Gaussian i, with the
+background, is the image less the colours up to i. So only its product with g has to be carried along:
+
+    R_i = image g - sum over j <= i of T_j a_j (c_j g),    gradient by a_i = T_i (c_i g) - R_i / (1 - a_i).
+
+This idea of a pass by Gaussians with the image as its start is from Taming 3DGS (Mallick et al. 2024).
+"""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+TILE = 16
+BATCH = 32
+"""Pairs that a program tests at once for whether they reach its region."""
+QUEUE = tl.constexpr(64)
+"""Pairs that wait for a bucket: at most a batch and a bucket of 32, and a power of 2."""
+LOG2_E = tl.constexpr(1.4426950408889634)
+FAINTEST = tl.constexpr(1 / 255)
+OPAQUEST = tl.constexpr(0.999)
+INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
+
+# Kernels are not compiled anew for other sizes.
+NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
+
+
+class Shape(NamedTuple):
+    """How a program's region and its bucket of Gaussians lie in the threads of its warps; all are powers of 2.
+
+    Attributes:
+        lanes: threads side by side, one for each column of the region.
+        rows: of the region, in the registers of a thread.
+        splat_lanes: threads that hold different Gaussians; `lanes * splat_lanes` is 32 times `warps`.
+        splats: Gaussians in the registers of a thread.
+        warps: of a program.
+    """
+
+    lanes: int = 8
+    rows: int = 8
+    splat_lanes: int = 4
+    splats: int = 2
+    warps: int = 1
+
+
+SHAPE = Shape()
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _multiply(a: tl.tensor, b: tl.tensor) -> tl.tensor:
+    return a * b
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _exp2(x: tl.tensor) -> tl.tensor:
+    """Return 2 ** x; where compiled, in one instruction instead of four, with 0 for denormal results."""
+    if INTERPRETED:
+        return tl.exp2(x)
+    return tl.inline_asm_elementwise("ex2.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _inverse(x: tl.tensor) -> tl.tensor:
+    """Return 1 / x of numbers that are neither denormal nor huge, to one unit in the last place."""
+    if INTERPRETED:
+        return 1.0 / x
+    return tl.inline_asm_elementwise("rcp.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _reaches(
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
+    width: tl.constexpr, height: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return whether alpha may reach `FAINTEST` at a pixel; x and y are centres relative to the first pixel's.
+
+    The exponent is convex, so that it is least on a side of the region that faces the centre, or is 0 at the centre.
+    """
+    near_x = tl.minimum(tl.maximum(x - (width - 1), 0.0), x)  # difference to the nearest column
+    near_y = tl.minimum(tl.maximum(y - (height - 1), 0.0), y)
+    on_column = tl.minimum(tl.maximum(-b * near_x / c, y - (height - 1)), y)
+    on_row = tl.minimum(tl.maximum(-b * near_y / a, x - (width - 1)), x)
+    limit = tl.log(opacity / FAINTEST) + 0.01  # with room for rounding, which grows with the terms of the exponent
+    square = 0.5 * (a * near_x * near_x + c * on_column * on_column)
+    found = square * 0.99999 + b * near_x * on_column <= limit
+    square = 0.5 * (a * on_row * on_row + c * near_y * near_y)
+    return found | (square * 0.99999 + b * on_row * near_y <= limit)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _add_gradients(
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor,
+    by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
+    of_sums: tl.tensor, there_of_sums: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
+    by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
+    absolute: tl.constexpr,
+) -> None:  # fmt: skip
+    """Add a bucket's gradients, summed over pixels, to those of all tiles.
+
+    `x` and `y` are a Gaussian's centre less a pixel's, `by_sigma` the gradient by half its squared distance.
+    """
+    if absolute:
+        along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3), 0)
+        along_y = tl.sum(tl.sum(tl.abs(by_sigma * (b * x + c * y)), 3), 0)
+        tl.atomic_add(by_absolute + 2 * of_sums, along_x, there_of_sums, sem="relaxed")
+        tl.atomic_add(by_absolute + 2 * of_sums + 1, along_y, there_of_sums, sem="relaxed")
+    # Sums over rows, with axes (lanes, splat_lanes, splats); x is the same in all rows.
+    x = tl.sum(x, 3)
+    plain, by_y = tl.sum(by_sigma, 3), tl.sum(by_sigma * y, 3)
+    sum_x, sum_y, sum_xy = tl.sum(plain * x, 0), tl.sum(by_y, 0), tl.sum(by_y * x, 0)
+    sum_xx, sum_yy = tl.sum(plain * x * x, 0), tl.sum(tl.sum(by_sigma * y * y, 3), 0)
+    a, b, c = tl.load(conics + 3 * of_sums), tl.load(conics + 3 * of_sums + 1), tl.load(conics + 3 * of_sums + 2)
+    tl.atomic_add(by_means2d + 2 * of_sums, a * sum_x + b * sum_y, there_of_sums, sem="relaxed")
+    tl.atomic_add(by_means2d + 2 * of_sums + 1, b * sum_x + c * sum_y, there_of_sums, sem="relaxed")
+    tl.atomic_add(by_conics + 3 * of_sums, 0.5 * sum_xx, there_of_sums, sem="relaxed")
+    tl.atomic_add(by_conics + 3 * of_sums + 1, sum_xy, there_of_sums, sem="relaxed")
+    tl.atomic_add(by_conics + 3 * of_sums + 2, 0.5 * sum_yy, there_of_sums, sem="relaxed")
+    by_opacity = -tl.sum(plain, 0) / tl.load(opacities + of_sums)
+    tl.atomic_add(by_opacities + of_sums, by_opacity, there_of_sums, sem="relaxed")
+    tl.atomic_add(by_colors + 3 * of_sums, tl.sum(tl.sum(by_red, 3), 0), there_of_sums, sem="relaxed")
+    tl.atomic_add(by_colors + 3 * of_sums + 1, tl.sum(tl.sum(by_green, 3), 0), there_of_sums, sem="relaxed")
+    tl.atomic_add(by_colors + 3 * of_sums + 2, tl.sum(tl.sum(by_blue, 3), 0), there_of_sums, sem="relaxed")
+
+
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
+def _backward_kernel(  # noqa: PLR0915  # its steps share too many tensors to be functions
+    means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor,
+    offsets: tl.tensor, flat: tl.tensor, last: tl.tensor, images: tl.tensor, by_images: tl.tensor,
+    by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
+    queues: tl.tensor,
+    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
+    lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
+    tile: tl.constexpr, batch: tl.constexpr, absolute: tl.constexpr,
+) -> None:  # fmt: skip
+    # Tensors have the axes (lanes, splat_lanes, splats, rows). Triton spreads the first axes over threads, because it
+    # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
+    # products over splats need no shuffles.
+    bucket: tl.constexpr = splats * splat_lanes
+    regions: tl.constexpr = (tile // lanes) * (tile // rows)
+    region = tl.program_id(0)
+    index = region // regions
+    image = index // tiles
+    row = (index % tiles) // across * tile + region % regions // (tile // lanes) * rows
+    column = (index % tiles) % across * tile + region % (tile // lanes) * lanes
+
+    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    inside = (column + along < width) & (row + down < height)
+    pixel = (row + down) * width + column + along  # within an image
+    of_pixels = tl.load(last + image.to(tl.int64) * (width * height) + pixel, inside, -1)
+    plane = image.to(tl.int64) * 3 * (width * height) + pixel
+    red = tl.load(by_images + plane, inside, 0.0)
+    green = tl.load(by_images + plane + width * height, inside, 0.0)
+    blue = tl.load(by_images + plane + 2 * (width * height), inside, 0.0)
+    behind = red * tl.load(images + plane, inside, 0.0)
+    behind += green * tl.load(images + plane + width * height, inside, 0.0)
+    behind += blue * tl.load(images + plane + 2 * (width * height), inside, 0.0)
+    transmittance = tl.where(inside, 1.0, 0.0)
+
+    begin = tl.load(offsets + index)
+    end = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    stop = tl.minimum(end, tl.max(tl.max(tl.max(tl.max(of_pixels, 0), 0), 0), 0) + 1)
+    queue = queues + region.to(tl.int64) * (2 * QUEUE)
+    first_x, first_y = column + 0.5, row + 0.5
+    in_batch = tl.arange(0, batch)
+    # Which Gaussian of a bucket an element is; those in one thread are consecutive.
+    order_of_sums = tl.arange(0, splat_lanes)[:, None] * splats + tl.arange(0, splats)[None, :]
+    order = tl.broadcast_to(order_of_sums[None, :, :, None], (lanes, splat_lanes, splats, 1))
+    head, tail = 0, 0  # numbers of pairs that left the queue and that entered it
+    while (begin < stop) | (head < tail):
+        while (begin < stop) & (tail - head < bucket):
+            there = begin + in_batch < stop
+            gaussian = tl.load(flat + begin + in_batch, there, 0)
+            x, y = tl.load(means2d + 2 * gaussian) - first_x, tl.load(means2d + 2 * gaussian + 1) - first_y
+            a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+            c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+            wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
+            slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (QUEUE - 1)
+            tl.debug_barrier()  # all threads have read the bucket before
+            tl.store(queue + slot, begin + in_batch, wanted)
+            tl.store(queue + QUEUE + slot, gaussian, wanted)
+            tl.debug_barrier()  # threads read what others wrote
+            tail += tl.sum(wanted.to(tl.int32), 0)
+            begin += batch
+
+        slot = (head + order) & (QUEUE - 1)
+        there = head + order < tail
+        place = tl.load(queue + slot, there, 2147483647)
+        gaussian = tl.load(queue + QUEUE + slot, there, 0)
+        there_of_sums = head + order_of_sums < tail
+        of_sums = tl.load(queue + QUEUE + ((head + order_of_sums) & (QUEUE - 1)), there_of_sums, 0)
+        head += bucket
+        x = tl.load(means2d + 2 * gaussian) - (first_x + along)  # (lanes, splat_lanes, splats, 1)
+        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+        y = tl.load(means2d + 2 * gaussian + 1) - (first_y + down)  # (lanes, splat_lanes, splats, rows)
+        tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
+        # The exponent of 2; most of it is the same in all rows.
+        power = (a * (-0.5 * LOG2_E)) * x * x + y * (b * (-LOG2_E) * x + c * (-0.5 * LOG2_E) * y)
+        alpha = tl.minimum(opacity * _exp2(power), OPAQUEST)
+        alpha = tl.where((place <= of_pixels) & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
+        left = 1.0 - alpha
+        inverse = _inverse(left)
+        # Products up to each Gaussian: of those before in the same thread, and of threads before.
+        within = tl.cumprod(left, 2)
+        of_lane = tl.reduce(left, 2, _multiply, keep_dims=True)
+        upto = tl.cumprod(of_lane, 1)
+        before = transmittance * (upto * _inverse(of_lane)) * within * inverse
+        transmittance *= tl.reduce(of_lane, 1, _multiply, keep_dims=True)
+
+        weight = alpha * before
+        shine = tl.load(colors + 3 * gaussian, there, 0.0) * red
+        shine += tl.load(colors + 3 * gaussian + 1, there, 0.0) * green
+        shine += tl.load(colors + 3 * gaussian + 2, there, 0.0) * blue
+        added = weight * shine
+        within = tl.cumsum(added, 2)
+        of_lane = tl.sum(added, 2, keep_dims=True)
+        upto = tl.cumsum(of_lane, 1)
+        by_alpha = before * shine - (behind - (upto - of_lane) - within) * inverse
+        behind -= tl.sum(of_lane, 1, keep_dims=True)
+        by_sigma = tl.where(alpha < OPAQUEST, -alpha * by_alpha, 0.0)
+
+        _add_gradients(
+            x, y, a, b, c, by_sigma, weight * red, weight * green, weight * blue, of_sums, there_of_sums, conics,
+            opacities, by_means2d, by_absolute, by_conics, by_colors, by_opacities, absolute,
+        )  # fmt: skip
+
+
+def blend_backward(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, last: Tensor,
+    images: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Return the gradients of blending by centres, conics, colours and opacities.
+
+    All tensors are contiguous; float32, if not said otherwise.
+
+    Args:
+        means2d, conics, colors, opacities: (c, n, 2), (c, n, 3), (c, n, 3) and (c, n) of c cameras.
+        offsets: (c, tiles down, tiles across) int32, the first pair of each tile.
+        flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile.
+        last: (c, h, w) int32, the last pair that a pixel blends.
+        images: c images of (3, h, w) with backgrounds.
+        by_images: gradient by them.
+        absolute: also sum the absolute values of the gradient by centres.
+        shape: of a program's work.
+
+    Returns:
+        Sums of absolute values (c, n, 2), meaningless without `absolute`; gradients by `means2d`, `conics`, `colors`
+        and `opacities`.
+    """
+    by_means2d, by_conics, by_colors, by_opacities = (
+        torch.zeros_like(value) for value in (means2d, conics, colors, opacities)
+    )
+    by_absolute = torch.zeros_like(means2d) if absolute else by_means2d
+    height, width = last.shape[-2:]
+    across, all_tiles = offsets.shape[-1], offsets.numel()
+    programs = all_tiles * (TILE // shape.lanes) * (TILE // shape.rows)
+    queues = torch.empty(programs, 2 * QUEUE.value, dtype=torch.int32, device=flat.device)
+    _backward_kernel[(programs,)](
+        means2d, conics, colors, opacities, offsets, flat, last, images, by_images,
+        by_means2d, by_absolute, by_conics, by_colors, by_opacities, queues,
+        width, height, across, offsets[0].numel(), all_tiles, len(flat),
+        lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
+        tile=TILE, batch=BATCH, absolute=absolute, num_warps=shape.warps,
+    )  # fmt: skip
+    return by_absolute, by_means2d, by_conics, by_colors, by_opacities

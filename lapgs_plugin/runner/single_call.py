@@ -1,0 +1,185 @@
+"""Train nested levels in one call of a checkout's `training`: between two levels only the views change.
+
+The views that the training loop holds get the finer level's size and images when the coarser level's iterations are
+over. Schedules, budgets, SH degrees and optimizers stay the checkout's own, for the whole run, so nothing here depends
+on the backbone. Iterations are counted, because not every checkout says which one begins.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lapgs_plugin.adapters.base import StageWindow
+from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan
+from lapgs_plugin.runner.active_stage import ActiveStage
+from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.stage_model import StageModel
+from lapgs_plugin.runner.stage_pruning import pruning_iteration
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT = "checkpoint"
+"""Parameter of the family's `training` that takes the path of a checkpoint: (state of the model, iteration)."""
+
+
+class NestedStage(ActiveStage):
+    """Run one level of a call that trains all of them.
+
+    Args:
+        advance: called with the model before the first iteration of the next level; returns its stage.
+        others: as of `ActiveStage`.
+    """
+
+    def __init__(self, *others: Any, advance: Callable[[Any], ActiveStage]) -> None:
+        super().__init__(*others)
+        self._advance = advance
+        if self._options.prune and (until := pruning_iteration(self._call)) is not None:
+            self._prune_at = until - self.window.start  # the call counts the iterations of the whole run
+
+    @property
+    def keeps_schedule(self) -> bool:
+        return True
+
+    def iteration_begins(self, gaussians: Any) -> None:
+        if self.record.iteration == self.stage.iterations and self.stage.level > 0:
+            self._advance(gaussians).iteration_begins(gaussians)
+        else:
+            super().iteration_begins(gaussians)
+
+    def take_over(self, before: NestedStage, gaussians: Any) -> None:
+        """Continue training the model, with the views, of the stage before."""
+        self._gaussians = gaussians
+        self._views.take_over(before._views)
+
+
+class SingleCall:
+    """Train all nested levels of a run that are not in its archive.
+
+    Args:
+        context, run, plan: the run.
+        activate: called with the stage that answers the replaced symbols from now on; None after the last one.
+    """
+
+    def __init__(
+        self, context: RunContext, run: TrainingRun, plan: StagePlan, activate: Callable[[ActiveStage | None], None]
+    ) -> None:
+        self._context, self._run, self._activate, self._total = context, run, activate, plan.iterations
+        self._levels = plan.levels
+        finished = len(run.archive.available_levels)
+        self._done, self._left = list(plan)[:finished], list(plan)[finished:]
+        self._start = sum(stage.iterations for stage in self._done)  # iterations before the running stage
+        self._opt = run.call.opt
+        # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
+        dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
+        dataset.model_path = str(run.archive.path("level_0"))
+        self._call = run.call.changed(dataset=dataset, opt=opt)
+        self._stage: NestedStage | None = None
+
+    def train(self, scene_files: Path) -> None:
+        """Call the script's `training`; `scene_files` holds the files that the Scene wrote.
+
+        Raises:
+            LapgsError: it ended before the finest level, or cannot be continued in the middle.
+        """
+        if not self._left:
+            return
+        stage = self._stage = self._next(self._restored(self._done[-1]) if self._done else None)
+        try:
+            stage.copy_scene_files(scene_files)
+            self._begin(stage)
+            if self._done:
+                self._run_from(stage.window.start)
+            else:
+                self._call.run()
+            self._require_trained(self._stage)
+            self._stage.finish()
+        except torch.cuda.OutOfMemoryError as error:
+            raise self._stage.out_of_memory(error) from error
+        finally:
+            self._activate(None)
+            self._stage.close()
+
+    def _next(self, before: StageResult | None = None) -> NestedStage:
+        """Return the next stage; `before` is given if the stage before it was not trained by this call."""
+        stage, options = self._left.pop(0), self._context.options
+        window = StageWindow(
+            stage, self._start, self._total, self._levels, options.color_factor, options.threshold_factor(stage)
+        )
+        self._start += stage.iterations
+        return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
+
+    def _begin(self, stage: NestedStage) -> None:
+        for name in self._context.adapter.densify_thresholds(self._opt):
+            setattr(self._call.opt, name, getattr(self._opt, name) * stage.window.threshold_factor)
+        self._activate(stage)
+        stage.load_images()
+        stage.begin()
+
+    def _advance(self, gaussians: Any) -> NestedStage:
+        """Archive the level whose iterations are over, and bring the checkout's views to the next one."""
+        finished = self._stage
+        assert finished is not None, "an iteration begins inside a stage"
+        finished.finish()
+        stage = self._stage = self._next()
+        stage.take_over(finished, gaussians)
+        finished.close()
+        self._begin(stage)
+        return stage
+
+    def _restored(self, stage: Stage) -> StageResult:
+        """Return the result of a stage that an earlier process archived."""
+        archive = self._run.archive
+        carried, moments = StageModel(self._context, self._run.scene, stage, None).load_inherited(archive)
+        return StageResult(archive.field(stage.level), None, carried, moments)
+
+    def _run_from(self, iteration: int) -> None:
+        """Make the call as if it continued from one of the checkout's own checkpoints, written after `iteration`.
+
+        Only the number is in the file. The model has its parameters, optimizer state and SH degree already, as from
+        the archive; so the checkout's way to restore them, which differs between forks, is left out.
+        """
+        adapter = self._context.adapter
+        model = adapter.profile.model
+        if CHECKPOINT not in self._call.values or "restore" not in vars(model):
+            raise UserInputError(
+                f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues "
+                f"from no {CHECKPOINT}, which nested levels need to start at iteration {iteration + 1}; start again "
+                "with --overwrite"
+            )
+
+        def restore(gaussians: Any, state: Any, training_args: Any, *_: Any) -> None:
+            if gaussians.optimizer is None:  # some scripts leave that to `restore`
+                gaussians.training_setup(training_args)
+            adapter.resume(self._call, gaussians, iteration)
+
+        keeping = Replacement(model, "restore", lambda _: restore, ("self",), "training() after reading a checkpoint")
+        with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment([keeping]):
+            path = Path(folder, "iteration.pth")
+            torch.save(((), iteration), path)
+            self._call.changed(**{CHECKPOINT: str(path)}).run()
+
+    def _require_trained(self, stage: ActiveStage) -> None:
+        """Check that the finest level was trained.
+
+        Raises:
+            LapgsError: no iteration was seen, or the call ended in a coarser level.
+        """
+        trained = stage.window.start + stage.record.iteration
+        name = self._call.function.__name__
+        if stage.stage.level > 0 or stage.record.iteration == 0:
+            raise LapgsError(
+                f"{name}() ended after {trained} of {self._total} iterations, in level {stage.stage.level}; expected "
+                "one call of GaussianModel.update_learning_rate an iteration; train this checkout with `lapgs run "
+                "--off`, or with as many --iterations as it runs"
+            )
+        if trained != self._total:
+            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, trained, self._total)

@@ -1,0 +1,136 @@
+"""Find photos, make files that COLMAP reads of those that it does not, and tell which camera took them."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from PIL import Image
+
+from lapgs_plugin.errors import MissingExtraError, SceneError, printable
+from lapgs_plugin.limits import PHOTO_PIXELS
+from lapgs_plugin.scenes.images import JPEG_QUALITY
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+HEIC = (".heic", ".heif", ".hif")
+"""Photos of phones that neither COLMAP nor OpenImageIO reads."""
+SHOWN = 10
+"""File names in a message, at most."""
+MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 271, 272, 0x8769, 37386, 41989
+"""Tags of EXIF."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Name the files to make a scene from.
+
+    Attributes:
+        folder: of the files.
+        files: by the name that COLMAP gets, sorted: relative to the folder; of HEIC photos that of their JPEG.
+        clip: the video, if frames are to be picked from one; `files` is empty then.
+    """
+
+    folder: Path
+    files: dict[str, Path]
+    clip: Path | None = None
+
+    @property
+    def made(self) -> bool:
+        """Whether COLMAP cannot read the files where they are."""
+        return self.clip is not None or any(path.suffix.lower() in HEIC for path in self.files.values())
+
+
+def find_photos(source: Path) -> Photos:
+    """Return the photos in a folder and below, or the video.
+
+    Raises:
+        SceneError: there are fewer than two photos, or two would have the same name after undistortion.
+        MissingExtraError: there are HEIC photos, and pillow-heif is not installed.
+    """
+    if source.is_file():
+        return Photos(source.parent, {}, source)
+    if not source.is_dir():
+        raise SceneError(f"{source}: no such folder of photos or video")
+    present = sorted(file for file in source.rglob("*") if file.is_file() and not file.name.startswith("."))
+    heic = [file for file in present if file.suffix.lower() in HEIC]
+    if heic and find_spec("pillow_heif") is None:
+        raise MissingExtraError(
+            f"{source}: {len(heic)} HEIC photos ({listed([file.name for file in heic])}) need pillow-heif: "
+            "pip install 'lapgs_plugin[heic]'; or convert them to JPEG"
+        )
+    chosen = [file for file in present if file.suffix.lower() in (*SUFFIXES, *HEIC)]
+    others = sorted({file.suffix.lower() or file.name for file in present} - {*SUFFIXES, *HEIC})
+    if len(chosen) < 2:
+        found = f" (and files of type {', '.join(others)})" if others else ""
+        raise SceneError(
+            f"{source}: {len(chosen)} photos{found}, expected at least 2, better 30, as JPEG, PNG, TIFF, BMP, WebP or "
+            "HEIC; of a video give the file itself"
+        )
+    if others:
+        left = [file.name for file in present if file not in chosen]
+        logger.warning("not photos, left out: %s", listed(left))
+    files: dict[str, Path] = {}
+    for file in chosen:
+        place = file.relative_to(source)
+        name = (place.with_suffix(".jpg") if file.suffix.lower() in HEIC else place).as_posix()
+        if (other := files.setdefault(name, file)) != file:
+            raise _same_name(source, other, file, name)
+    by_target: dict[str, Path] = {}
+    for name, file in sorted(files.items()):
+        if (other := by_target.setdefault(target_name(name), file)) != file:
+            raise _same_name(source, other, file, target_name(name))
+    return Photos(source, dict(sorted(files.items())))
+
+
+def _same_name(source: Path, one: Path, other: Path, name: str) -> SceneError:
+    one, other = (each.relative_to(source) for each in (one, other))
+    return SceneError(f"{source}: {one} and {other} would both become {name}; rename one of them")
+
+
+def target_name(name: str) -> str:
+    """Return the name of the undistorted image: JPEG stays JPEG, all else becomes PNG."""
+    path = Path(name)
+    return name if path.suffix.lower() in (".jpg", ".jpeg") else path.with_suffix(".png").as_posix()
+
+
+def listed(names: list[str]) -> str:
+    """Return names for a message, the first few of many."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return printable(", ".join(names[:SHOWN])) + more
+
+
+def convert_heic(source: Path, target: Path) -> None:
+    """Write a HEIC photo as JPEG, upright, with its EXIF data, which hold the focal length.
+
+    Raises:
+        SceneError: it cannot be decoded.
+    """
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with Image.open(source) as photo:
+            width, height = photo.size
+            PHOTO_PIXELS.check(width * height, f"{source}: {width}x{height} pixels", "make it smaller", SceneError)
+            exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
+            photo.convert("RGB").save(target, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", exif=exif)
+    except (OSError, SyntaxError, ValueError, RuntimeError) as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(f"{source}: the photo cannot be decoded ({error}); copy or convert it again") from error
+
+
+def camera_of(photo: Path) -> tuple[str, ...]:
+    """Return maker, model and focal lengths by EXIF, empty where a photo does not tell."""
+    with suppress(Exception), Image.open(photo) as opened:  # other software reads the photo; EXIF only helps
+        exif = opened.getexif()
+        inner = exif.get_ifd(EXIF_FOLDER)
+        values = (exif.get(MAKE), exif.get(MODEL), inner.get(FOCAL), inner.get(FOCAL_35MM))
+        return tuple("" if value is None else str(value).strip("\0 ") for value in values)
+    return ("",) * 4

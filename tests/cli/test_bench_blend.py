@@ -1,0 +1,39 @@
+"""`lapgs bench blend` where there is no GPU, and its options."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+import torch
+
+from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.errors import UserInputError
+from tests.cli.commands import succeeding
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--views", "1,no"), "--views '1,no': expected numbers of views such as 1,8"),
+        (("--sizes", "800"), "--sizes '800': expected"),
+    ],
+)
+def test_bad_options_are_one_line(options: tuple[str, ...], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        succeeding(bench_app, 120)("blend", *options)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
+def test_it_needs_a_gpu() -> None:
+    with pytest.raises(UserInputError, match="PyTorch finds no CUDA device"):
+        succeeding(bench_app, 120)("blend")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+@pytest.mark.parametrize("shapes", ["8x8", "8x8x4x3", "8x8x8x2", "32x4x1x4", "8xax4x2"])
+def test_shapes_that_fill_no_warp_are_refused(shapes: str) -> None:
+    from lapgs_plugin.evaluation.bench_blend import parse_shapes
+
+    with pytest.raises(UserInputError, match=f"--shapes '{shapes}': expected"):
+        parse_shapes(shapes)

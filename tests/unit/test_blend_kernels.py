@@ -1,0 +1,107 @@
+"""Our gradients of blending against autograd in float64, interpreted or compiled, and against gsplat's on a GPU."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+CHECKS = """
+import torch
+from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward
+
+def blended(means, conics, colors, opacities, background, offsets, flat, height, width):
+    # Every pixel blends the pairs of its tile, in order.
+    cameras, down, across = offsets.shape
+    ends = [*offsets.flatten().tolist(), len(flat)]
+    images, last = background[:, :, None, None].repeat(1, 1, height, width), torch.zeros(cameras, height, width).int()
+    for tile in range(offsets.numel()):
+        camera, row, column = tile // (down * across), tile // across % down * 16, tile % across * 16
+        ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        ys, xs = (each[row : row + 16, column : column + 16] for each in (ys, xs))
+        left, color = torch.ones(ys.shape, dtype=means.dtype), torch.zeros(3, *ys.shape, dtype=means.dtype)
+        ended = torch.zeros(ys.shape, dtype=torch.bool)
+        for pair in range(ends[tile], ends[tile + 1]):
+            one = int(flat[pair])
+            x, y = means[one, 0] - xs, means[one, 1] - ys
+            sigma = 0.5 * (conics[one, 0] * x * x + conics[one, 2] * y * y) + conics[one, 1] * x * y
+            alpha = (opacities[one] * torch.exp(-sigma)).clamp_max(0.999)
+            alpha = torch.where((sigma < 0) | (alpha < 1 / 255), 0.0, alpha)
+            ended = ended | (left * (1 - alpha) <= 1e-4)
+            alpha = torch.where(ended, 0.0, alpha)
+            color = color + alpha * left * colors[one][:, None, None]
+            left = left * (1 - alpha)
+            there = last[camera, row : row + 16, column : column + 16]
+            there[alpha > 0] = pair
+        images[camera, :, row : row + 16, column : column + 16] = color + left * background[camera][:, None, None]
+    return images, last
+
+def check(shapes, cameras, count, height, width, absolute, limit):
+    torch.manual_seed(count)
+    down, across = -(-height // 16), -(-width // 16)
+    means = torch.rand(cameras * count, 2) * torch.tensor([width, height])
+    factors = 8 * (torch.rand(cameras * count, 2, 2) - 0.5)
+    inverse = torch.linalg.inv(factors @ factors.mT + 0.3 * torch.eye(2))
+    conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1)
+    colors, opacities = torch.randn(cameras * count, 3), (1.3 * torch.rand(cameras * count)).clamp(0.05, 1.0)
+    means[0], conics[0], colors[0] = torch.nan, torch.nan, torch.nan  # culled: memory that nobody wrote
+    # Every Gaussian is in the list of every tile of its image, but the first one; the first tile is empty.
+    lists = [torch.arange(1, count) + camera * count for camera in range(cameras) for _ in range(down * across)]
+    lists[0] = lists[0][:0]
+    flat = torch.cat(lists).int()
+    offsets = torch.tensor([0, *[len(each) for each in lists[:-1]]]).cumsum(0).int().view(cameras, down, across)
+    background, by_images = torch.rand(cameras, 3), torch.randn(cameras, 3, height, width)
+    leaves = [each.double().requires_grad_() for each in (means, conics, colors, opacities)]
+    images, last = blended(*leaves, background.double(), offsets, flat, height, width)
+    expected = torch.autograd.grad((images * by_images).sum(), leaves)
+    assert int(last.max()) < len(flat) - 1 or count < 60  # pixels end before the last Gaussian of a long list
+    given = [each.to(DEVICE) for each in (means, conics, colors, opacities, offsets, flat, last)]
+    given += [images.detach().float().to(DEVICE), by_images.to(DEVICE)]
+    for shape in shapes:
+        whole, *found = blend_backward(*given, absolute, shape)
+        for one, other in zip(found, expected, strict=True):
+            one, other = one.cpu().view_as(other), other.nan_to_num()
+            worst = float((one - other).abs().max() / other.abs().max())
+            print(shape, cameras, count, f"{worst:.1e}")
+            assert worst < limit
+        if absolute:  # as much as the sum at least
+            assert (whole.view_as(means) >= found[0].view_as(means).abs() - 1e-5 * whole.max()).all()
+            assert (whole > 1.5 * found[0].abs()).any()
+        else:
+            assert whole is found[0]
+
+check([Shape(8, 8, 4, 1)], 2, 7, 5, 21, True, 1e-5)  # worst seen 1.6e-6
+check([Shape()], 1, 60, 5, 21, False, 1e-5)  # worst seen 1.4e-6
+if DEVICE == "cuda":
+    shapes = [Shape(*each) for each in ((8, 8, 4, 2), (8, 4, 4, 4), (8, 4, 4, 2), (16, 4, 2, 4), (16, 16, 4, 1, 2))]
+    # An alpha that is FAINTEST up to rounding counts in one of both.
+    check(shapes, 2, 100, 37, 50, True, 1e-3)
+    check(shapes, 1, 500, 21, 35, False, 1e-3)
+
+    from lapgs_plugin.rasterizers.gsplat.blend_gradients import triton_works
+    found = triton_works.difference(torch.device(DEVICE))
+    print("from gsplat", found)
+    assert found < 1e-3
+"""
+
+
+def run_checks(device: str, **environment: str) -> None:
+    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{CHECKS}"]
+    done = subprocess.run(command, check=False, env={**os.environ, **environment}, capture_output=True, text=True)
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+def test_interpreted() -> None:
+    run_checks("cpu", TRITON_INTERPRET="1")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_compiled() -> None:
+    run_checks("cuda")

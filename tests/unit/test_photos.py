@@ -1,0 +1,307 @@
+"""Photos and videos as people have them: HEIC, masks, EXIF, several cameras, clips; and what goes wrong with them."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sqlite3
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pillow_heif
+import pycolmap
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
+from lapgs_plugin.scenes import clip as clip_module
+from lapgs_plugin.scenes import left_out, load_scene
+from lapgs_plugin.scenes import photos as photos_module
+from lapgs_plugin.scenes import prepare as prepare_module
+from lapgs_plugin.scenes.clip import judge, pick_frames, sharp_and_moving, write_frames
+from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
+from lapgs_plugin.scenes.images import write_image
+from lapgs_plugin.scenes.left_out import left_out_because
+from lapgs_plugin.scenes.photos import find_photos
+from lapgs_plugin.scenes.prepare import prepare_scene
+from lapgs_plugin.scenes.sample.raycast import render
+from tests.unit.test_prepare import FOCAL, SIZE, WORLD, _arc, _centre_errors
+
+ORIENTATION, UPSIDE_DOWN = 274, 3
+RANDOM = np.random.default_rng(0)
+WALL = np.kron(RANDOM.integers(0, 255, (12, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)  # (96, 480, 3)
+
+
+def _pixels(index: int) -> NDArray[np.uint8]:
+    return np.rint(render(WORLD, _arc(SIZE, FOCAL)[index]).clip(0, 1) * 255).astype(np.uint8)
+
+
+def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
+    """One in HEIC, one upside down by EXIF, masks over a third of each, pairs by retrieval, all at once."""
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    hidden = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
+    hidden[:, 120:] = 1
+    for index in range(5):
+        picture, mask = Image.fromarray(_pixels(index)), hidden
+        if index == 1:
+            pillow_heif.register_heif_opener()
+            picture.save(photos / "01.heic", quality=95)
+        elif index == 2:
+            exif = Image.Exif()
+            exif[ORIENTATION] = UPSIDE_DOWN
+            picture.rotate(180).save(photos / "02.jpg", quality=98, subsampling=0, exif=exif)
+            mask = hidden[::-1, ::-1]
+        else:
+            picture.save(photos / f"{index:02d}.png")
+        write_image(masks / f"{index:02d}_mask.png", torch.from_numpy(mask.copy()).permute(2, 0, 1))
+    out = tmp_path / "scene"
+    result = prepare_scene(photos, out, matcher="retrieval", masks=masks, progress=False)
+    assert len(result.registered) == 5
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    assert _centre_errors(model).max() < 0.02  # seen 4.4e-3
+    scene = load_scene(out, progress=False)
+    by_name = {view.name: view for view in scene.train}
+    assert sorted(by_name) == ["00.png", "01.jpg", "02.jpg", "03.png", "04.png"]
+    assert sorted(file.name for file in (out / "masks").iterdir()) == [f"{name}.png" for name in sorted(by_name)]
+    for image in model.images.values():
+        inside = by_name[image.name].mask
+        assert inside is not None
+        columns, rows = np.array([point.xy for point in image.points2D]).T.astype(int)
+        far_inside = cv2.dilate(inside[0].numpy().astype(np.uint8), np.ones((7, 7)))  # masks are undistorted, too
+        assert far_inside[rows.clip(0, far_inside.shape[0] - 1), columns.clip(0, far_inside.shape[1] - 1)].all()
+    assert by_name["02.jpg"].mask is not None
+    assert bool(by_name["02.jpg"].mask[0, :, 5].all())  # stored pixels, as COLMAP and trainers read them
+    assert not bool(by_name["00.png"].mask[0, :, 5].any())
+
+
+def test_transparent_pixels_are_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    alpha = np.zeros((64, 96, 1), np.uint8)
+    alpha[10:50, 20:70] = 255
+    for index in range(3):
+        pixels = WALL[:64, 4 * index : 4 * index + 96]
+        cv2.imwrite(str(photos / f"{index}.png"), pixels if index == 2 else np.concatenate([pixels, alpha], axis=2))
+    _stopping_before_colmap(photos, tmp_path / "scene", monkeypatch)
+    made = tmp_path / "scene" / ".prepare" / "masks"
+    assert sorted(file.name for file in made.iterdir()) == ["0.png.png", "1.png.png"]
+    assert np.array_equal(cv2.imread(str(made / "0.png.png"))[..., :1], alpha)
+
+
+def _stopping_before_colmap(photos: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> None:
+    def stop(*arguments: object) -> None:
+        raise LapgsError("stopped")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(prepare_module, "_find_features", stop)
+        with pytest.raises(LapgsError, match="stopped"):
+            prepare_scene(photos, out, progress=False, **options)
+
+
+def _write_clip(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
+    height, width = frames[0].shape[:2]
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=10, quality=10, macro_block_size=1)
+    writer.send(None)
+    for frame in frames:
+        writer.send(np.ascontiguousarray(frame).tobytes())
+    writer.close()
+    return path
+
+
+def _blurred(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return cv2.GaussianBlur(frame, (0, 0), 2.0).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """24 frames along a wall, of which every fourth is sharp."""
+    frames = [WALL[:64, 6 * index : 6 * index + 96] for index in range(24)]
+    blurred = [frame if index % 4 == 2 else _blurred(frame) for index, frame in enumerate(frames)]
+    return _write_clip(tmp_path_factory.mktemp("clip") / "walk.mp4", blurred)
+
+
+def test_sharp_frames_are_picked_evenly_and_written(clip: Path, tmp_path: Path) -> None:
+    assert pick_frames(clip, 6, lambda done, total: None) == [2, 6, 10, 14, 18, 22]
+    write_frames(clip, [2, 10], tmp_path, lambda done, total: None)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["frame_000002.jpg", "frame_000010.jpg"]
+    written = cv2.imread(str(tmp_path / "frame_000010.jpg"))[..., ::-1].astype(np.float64)
+    error = {number: np.abs(written - WALL[:64, 6 * number : 6 * number + 96]).mean() for number in (8, 10, 12)}
+    assert min(error, key=error.__getitem__) == 10
+
+
+def test_frames_where_the_camera_stands_still_are_left_out() -> None:
+    moving = [judge(WALL[:64, 8 * step : 8 * step + 96, 0]) for step in (0, 0, 0, 0, 1, 2, 3, 3)]
+    assert sharp_and_moving(moving, 8) == [0, 4, 5, 6]
+
+
+def test_a_video_gives_its_frames_to_colmap(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        _stopping_before_colmap(clip, tmp_path / "scene", monkeypatch, frames=6)
+    assert "walk.mp4: 6 sharp frames, evenly spread" in caplog.text
+    made = tmp_path / "scene" / ".prepare" / "photos"
+    assert [file.name for file in sorted(made.iterdir())] == [f"frame_{number:06d}.jpg" for number in range(2, 24, 4)]
+    job = prepare_module._Job(made.parent, find_photos(clip), "auto", "incremental", "auto", None, False)
+    assert (job.matcher, len(job.names)) == ("sequential", 6)
+
+
+def test_videos_that_cannot_be_used_are_one_line(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(kind: type[Exception], message: str, video: Path, **options: object) -> None:
+        with pytest.raises(kind, match=message) as caught:
+            prepare_scene(video, tmp_path / "scene", progress=False, **options)
+        assert "\n" not in str(caught.value)
+        assert not (tmp_path / "scene").exists()
+
+    still = _write_clip(tmp_path / "still.mp4", [WALL[:64, :96]] * 12)
+    refused(SceneError, r"still\.mp4: 12 frames show the same view, expected a camera that moves", still)
+    (tmp_path / "no.mp4").write_bytes(b"no clip" * 50)
+    refused(SceneError, r"no\.mp4: the video cannot be decoded", tmp_path / "no.mp4")
+    (tmp_path / "cut.mp4").write_bytes(clip.read_bytes()[:1000])
+    refused(SceneError, r"cut\.mp4: the video cannot be decoded", tmp_path / "cut.mp4")
+    refused(UserInputError, "--frames 1: expected at least 2", clip, frames=1)
+    monkeypatch.setattr(clip_module, "find_spec", lambda name: None)
+    refused(MissingExtraError, r"needs imageio-ffmpeg: pip install 'lapgs_plugin\[video\]'", clip)
+
+
+@pytest.fixture
+def noise(tmp_path: Path) -> Path:
+    folder = tmp_path / "noise"
+    for index in range(3):
+        write_image(folder / f"{index}.jpg", torch.from_numpy(RANDOM.random((3, 64, 80), dtype=np.float32)))
+    return folder
+
+
+def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (noise / "IMG_1.HEIC").write_bytes(b"damaged")
+    with pytest.raises(SceneError, match=r"IMG_1\.HEIC: the photo cannot be decoded"):
+        prepare_scene(noise, tmp_path / "scene", progress=False)
+    assert not (tmp_path / "scene").exists()
+    monkeypatch.setattr(photos_module, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"1 HEIC photos \(IMG_1\.HEIC\) need pillow-heif: pip install"):
+        prepare_scene(noise, tmp_path / "scene", progress=False)
+    shutil.copy(noise / "0.jpg", noise / "IMG_1.jpg")
+    monkeypatch.undo()
+    with pytest.raises(SceneError, match=r"IMG_1\.HEIC and IMG_1\.jpg would both become IMG_1\.jpg"):
+        find_photos(noise)
+
+
+def test_files_that_are_no_photos_are_named(noise: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a.dng", "b.mov"):
+        (noise / name).write_bytes(b"")
+    assert list(find_photos(noise).files) == ["0.jpg", "1.jpg", "2.jpg"]
+    assert "not photos, left out: a.dng, b.mov" in caplog.text
+
+
+def test_photos_of_several_cameras_get_cameras_of_their_own(
+    noise: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, model in (("0.jpg", "One"), ("1.jpg", "One"), ("2.jpg", "Two")):
+        exif = Image.Exif()
+        exif[photos_module.MODEL] = model
+        with Image.open(noise / name) as picture:
+            picture.load()
+        picture.save(noise / name, exif=exif)
+    job = prepare_module._Job(tmp_path, find_photos(noise), "auto", "incremental", "auto", None, False)
+    sizes = dict.fromkeys(job.names, (80, 64))
+    with caplog.at_level(logging.INFO):
+        assert prepare_module._one_camera(job, sizes, None) is False
+    assert "photos of 2 cameras or sizes: 2 of 80x64 One; 1 of 80x64 Two" in caplog.text
+    assert prepare_module._one_camera(job, sizes, True) is True
+    assert prepare_module._one_camera(job, dict.fromkeys(("0.jpg", "1.jpg"), (80, 64)), None) is True
+
+
+def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    for index in range(2):
+        write_image(masks / f"{index}.png", torch.ones(3, 64, 80))
+
+    def refused(message: str) -> None:
+        with pytest.raises(SceneError, match=message):
+            prepare_scene(noise, tmp_path / "scene", masks=masks, progress=False)
+        assert not (tmp_path / "scene").exists()
+
+    refused(r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or 2_mask\.png")
+    write_image(masks / "2.png", torch.ones(3, 80, 64))
+    refused(r"2\.png: the mask is 64x80 pixels, its photo 80x64 \(EXIF turns .*\); expected the same size")
+
+
+def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
+    images = {key: SimpleNamespace(camera_id=1, has_pose=True) for key in range(placed)}
+    camera = SimpleNamespace(focal_length_x=fx, focal_length_y=fy)
+    return SimpleNamespace(images=images, cameras={1: camera}, num_reg_images=lambda: placed)
+
+
+@pytest.mark.parametrize(
+    ("asked", "again", "chosen", "message"),
+    [
+        ("auto", 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
+        ("auto", 5, "first", "with one focal length only 5 of 8 photos could be placed"),
+        ("OPENCV", 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
+    ],
+)
+def test_implausible_focal_lengths_are_told_and_tried_again(
+    asked: str,
+    again: int,
+    chosen: str,
+    message: str,
+    noise: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    models = {None: _model(1090, 1000, 8), "RADIAL": _model(1000, 1000, again)}
+    monkeypatch.setattr(prepare_module, "_map", lambda job, title, folder, model=None: [models[model]])
+    job = prepare_module._Job(tmp_path, find_photos(noise), "auto", "incremental", asked, None, False)
+    with caplog.at_level(logging.INFO):
+        (best,) = prepare_module._place_cameras(job)
+    assert best is models[None if chosen == "first" else "RADIAL"]
+    assert message in caplog.text
+
+
+def test_cameras_of_a_database_get_one_focal_length(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera(
+            model="OPENCV", width=80, height=64, params=[90, 110, 40, 32, 0.1, 0, 0, 0], camera_id=1
+        )
+        database.write_camera(camera, use_camera_id=True)
+    colmap_worker._replace_cameras(str(path), "RADIAL")
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+    assert (camera.camera_id, camera.model.name, camera.width, camera.height) == (1, "RADIAL", 80, 64)
+    assert camera.params.tolist() == [100, 40, 32, 0, 0]
+
+
+def test_reasons_for_photos_without_a_place(tmp_path: Path) -> None:
+    names = ["placed.jpg", "blurred.jpg", "alone.jpg", "mirror.jpg", "other_room.jpg"]
+    with sqlite3.connect(tmp_path / "a.db") as database:
+        database.execute("CREATE TABLE images (image_id, name)")
+        database.execute("CREATE TABLE keypoints (image_id, rows)")
+        database.execute("CREATE TABLE two_view_geometries (pair_id, rows)")
+        for key, name in enumerate(names, start=1):
+            database.execute("INSERT INTO images VALUES (?, ?)", (key, name))
+            database.execute("INSERT INTO keypoints VALUES (?, ?)", (key, 20 if name == "blurred.jpg" else 900))
+        for one, other, rows in ((1, 2, 50), (1, 3, 3), (1, 4, 60)):
+            pair = pycolmap.image_pair_to_pair_id(one, other)
+            database.execute("INSERT INTO two_view_geometries VALUES (?, ?)", (pair, rows))
+    database.close()
+    models = [SimpleNamespace(images={key: SimpleNamespace(has_pose=True)}) for key in (1, 5)]
+    assert left_out_because(tmp_path / "a.db", models, names[1:]) == {
+        left_out.BLURRED: ["blurred.jpg"],
+        left_out.ALONE: ["alone.jpg"],
+        left_out.UNSURE: ["mirror.jpg"],
+        left_out.APART: ["other_room.jpg"],
+    }
+
+
+def test_many_photos_are_matched_by_retrieval(tmp_path: Path) -> None:
+    for count, matcher in ((500, "exhaustive"), (501, "retrieval")):
+        found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(count)})
+        assert prepare_module._Job(tmp_path, found, "auto", "incremental", "auto", None, False).matcher == matcher
