@@ -2,9 +2,88 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterable
+from datetime import timedelta
+from typing import Any
+
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
+
+LEAST_SECONDS, MOST_SECONDS, STEP = 10.0, 60.0, 0.05
+"""Outside of a terminal a line is printed at every `STEP` of the work and at least every `MOST_SECONDS`, but not more
+often than every `LEAST_SECONDS`."""
+
+
+class LoggingProgress(Progress):
+    """Show a progress bar in a terminal, and print lines elsewhere: count, share, rate, time left, figures.
+
+    A task's field `figures` is a text with the rate and more about the work, shown at the end of its lines.
+
+    Args:
+        unit: of the items that are counted.
+    """
+
+    def __init__(self, *columns: ProgressColumn, console: Console, unit: str, **options: Any) -> None:
+        super().__init__(*columns, console=console, disable=not console.is_terminal, **options)
+        self._unit = unit
+        self._printed: dict[TaskID, tuple[float, float]] = {}  # when, and completed items
+
+    def add_task(self, *arguments: Any, **options: Any) -> TaskID:
+        """Add a task as rich does."""
+        task = super().add_task(*arguments, **options)
+        self._printed[task] = time.monotonic(), self._task(task).completed
+        return task
+
+    def update(self, task_id: TaskID, **options: Any) -> None:
+        """Update a task as rich does, and print a line if one is due."""
+        super().update(task_id, **options)
+        self._print_if_due(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """Advance a task as rich does, and print a line if one is due."""
+        super().advance(task_id, advance)
+        self._print_if_due(task_id)
+
+    def _task(self, task_id: TaskID) -> Task:
+        return self._tasks[task_id]
+
+    def _print_if_due(self, task_id: TaskID) -> None:
+        if not self.disable:
+            return
+        task, now = self._task(task_id), time.monotonic()
+        since, done = self._printed[task_id]
+        if task.finished:
+            due = done < task.completed
+        else:
+            passed, moved = now - since, task.completed - done
+            due = passed >= MOST_SECONDS or (passed >= LEAST_SECONDS and moved >= STEP * (task.total or 0))
+        if due:
+            self._printed[task_id] = now, task.completed
+            self.console.print(" ".join(self._words(task)), highlight=False, markup=False, soft_wrap=True)
+
+    def _words(self, task: Task) -> Iterable[str]:
+        """Yield the parts of a line about a task."""
+        yield f"{task.description} {task.completed:.0f}"
+        if task.total:
+            yield f"of {task.total:.0f} {self._unit} ({task.percentage:.0f} %)"
+        figures, rate = str(task.fields.get("figures") or ""), task.finished_speed or task.speed
+        if rate and not figures:
+            yield f"{rate:.1f} a second" if rate >= 1.0 else f"{1.0 / rate:.1f} s each"
+        if task.time_remaining:
+            yield f"{timedelta(seconds=round(task.time_remaining))} left"
+        if figures:
+            yield figures
 
 
 class RateColumn(ProgressColumn):
@@ -23,11 +102,12 @@ class RateColumn(ProgressColumn):
 
 def item_progress(unit: str) -> Progress:
     """Return a bar with count, rate in `unit` and remaining time, for use as a context manager."""
-    return Progress(
+    return LoggingProgress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         RateColumn(unit),
         TimeRemainingColumn(),
         console=Console(stderr=True),
+        unit=unit,
     )

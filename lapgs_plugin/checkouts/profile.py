@@ -9,7 +9,7 @@ import ast
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from types import FunctionType, ModuleType
 from typing import Any
@@ -97,11 +97,16 @@ class Profile:
         """Return modules of the checkout, each with a name, that hold an object."""
         return [(module, name) for module in self.modules for name, held in vars(module).items() if held is value]
 
-    def places(self, rasterizer: BoundRasterizer, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
-        """Return where the checkout looks objects of a rasterizer's module up, as owners and names."""
-        found = [place for name in names for place in self.holders(vars(rasterizer.module)[name])]
-        # An import in a function looks the name up in the rasterizer's module at each call.
-        return found + [(rasterizer.module, name) for name in names if rasterizer.use.inside]
+    def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
+        """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
+        use = rasterizer.use
+        found = self.holders(vars(rasterizer.module)[name])
+        if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
+            found.append((rasterizer.module, name))
+        holder = self.script.module if use.holder == "__main__" else sys.modules[use.holder]
+        if name in vars(holder) and (holder, name) not in found:  # something that wraps it
+            found.append((holder, name))
+        return found
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
         """Return a model, made with the arguments that the script gives.

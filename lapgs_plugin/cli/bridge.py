@@ -150,6 +150,7 @@ def _build_chosen(registry: Registry[Any], by: str, name: str, given: dict[str, 
 
 
 def given_options(context: typer.Context) -> set[str]:
-    """Return the parameters that were given on the command line."""
+    """Return the parameters that were given on the command line or in a settings file."""
     sources: Mapping[str, Any] = {name: context.get_parameter_source(name) for name in context.params}
-    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    given = {"COMMANDLINE", "DEFAULT_MAP"}
+    return {name for name, source in sources.items() if source is not None and source.name in given}

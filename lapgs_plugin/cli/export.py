@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.rendering import refuse
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import RunArchive
 
 FORMATS = ("ply", "spz")
+PAGE = "scene.html"
 
 
 def export(
@@ -25,6 +27,16 @@ def export(
     ] = "ply",
     level: Annotated[
         int | None, typer.Option(help="Level to export; 0 is the finest. Default: all finished levels.")
+    ] = None,
+    html: Annotated[
+        bool,
+        typer.Option(
+            "--html",
+            help="Write RUN/export/scene.html instead: a viewer with the scene in one file, which opens offline.",
+        ),
+    ] = False,
+    scene: Annotated[
+        Path | None, typer.Option(help="With --html: the scene's folder now. Default: where it was trained.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/export.")] = None,
 ) -> None:
@@ -40,6 +52,8 @@ def export(
         lapgs export runs/garden --format spz
 
         lapgs export runs/garden --level 1 --out /tmp/base
+
+        lapgs export runs/garden --html        (a page for the web)
     """
     from lapgs_plugin.fields.spz import save_spz
     from lapgs_plugin.files import one_line_errors
@@ -48,6 +62,11 @@ def export(
     if file_format not in FORMATS:
         raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")
     archive = RunArchive.open(run)
+    refuse({"--scene": None if html else scene}, "needs --html")
+    if html:
+        refuse({"--format": None if file_format == "ply" else file_format}, "does not go with --html")
+        _write_page(archive, level, scene, archive.path(EXPORT) if out is None else out)
+        return
     levels, folder = _levels(archive, level), archive.path(EXPORT) if out is None else out
     fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
     with one_line_errors(folder):
@@ -65,6 +84,28 @@ def export(
             f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
             + (", a residual" if field.signed else "")
         )
+
+
+def _write_page(archive: RunArchive, level: int | None, scene: Path | None, folder: Path) -> None:
+    """Write a level's field, by default the finest, as a page."""
+    from lapgs_plugin.files import one_line_errors
+    from lapgs_plugin.rendering.run import run_cameras
+    from lapgs_plugin.reports.splat_page import write_splat_page
+
+    chosen = archive.manifest.record(0 if level is None else level).level
+    field = archive.field(chosen)
+    if field.signed:
+        raise UserInputError(
+            f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; train with --hierarchy "
+            "nested for a page of full quality, or take the base with --level "
+            f"{archive.manifest.levels - 1}"
+        )
+    cameras = list(run_cameras(archive, scene)[0].values())
+    with one_line_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    path = folder / PAGE
+    write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
+    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB, opens in a browser without a network")
 
 
 def _levels(archive: RunArchive, level: int | None) -> tuple[int, ...]:

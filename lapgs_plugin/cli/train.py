@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, write_config
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -43,6 +45,7 @@ def train(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
     view: ViewOption = False,
     view_port: ViewPortOption = None,
+    config: ConfigOption = None,
 ) -> None:
     """Train a scene coarse to fine with the built-in trainer, on a GPU (gsplat) or a CPU.
 
@@ -57,6 +60,8 @@ def train(
         lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
 
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+
+        lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
     """
     from rich.console import Console
     from rich.markup import escape
@@ -65,6 +70,7 @@ def train(
     from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.scenes.masks import resolve_masks
     from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
+    from lapgs_plugin.training.tensorboard import require_tensorboard
 
     if resume and overwrite:
         raise UserInputError("--resume and --overwrite contradict each other; give one of them")
@@ -79,6 +85,8 @@ def train(
         context.obj.train(settings, reference, control.rasterizer)
         return
     reference = replace(reference, masks=resolve_masks(scene, photos.masks))
+    if control.log is not None:
+        require_tensorboard()
     if control.gpu_busy:
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
     console = Console(stderr=True)
@@ -87,6 +95,7 @@ def train(
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(control.rasterizer), overwrite)
+        write_config(archive.path(RUN_CONFIG), context)
     with archive:
         _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
     keep_preview(out.absolute())
@@ -216,8 +225,9 @@ def _run(
     from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.scenes.masks import share_inside
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.monitor import ProgressMonitor
-    from lapgs_plugin.training.trainer import Trainer
+    from lapgs_plugin.training.monitor import Monitor, ProgressMonitor
+    from lapgs_plugin.training.tensorboard import TensorboardMonitor
+    from lapgs_plugin.training.trainer import Trainer, make_plan
 
     if control.threads is not None:
         torch.set_num_threads(control.threads)
@@ -230,7 +240,11 @@ def _run(
             markup=False,
         )
     placed = training_rasterizer(manifest.rasterizer, settings)
-    with one_pool(), ProgressMonitor(console, manifest.levels) as monitor:
+    with one_pool(), ExitStack() as opened:
+        monitor: Monitor = opened.enter_context(ProgressMonitor(console, manifest.levels))
+        if control.log is not None:
+            plan = make_plan(scene.smallest_size, settings, len(scene.train))
+            monitor = opened.enter_context(TensorboardMonitor(archive.path("tensorboard"), plan, monitor))
         trainer = Trainer(
             scene=scene,
             settings=settings,

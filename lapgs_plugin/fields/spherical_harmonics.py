@@ -13,7 +13,7 @@ from torch import Tensor
 
 MAX_SH_DEGREE = 3
 
-_C0 = math.sqrt(1 / (4 * math.pi))
+SH_C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi))
 _C3 = (
@@ -37,7 +37,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """
     assert 0 <= degree <= MAX_SH_DEGREE, degree
     x, y, z = directions.unbind(-1)  # (n,) each
-    values = [torch.full_like(x, _C0)]
+    values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:

@@ -13,6 +13,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_key, view_name
+from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.masks import fill_outside
@@ -96,6 +98,10 @@ class StageRendering:
         found = (self._by_matrix.get(m) for value in _values(settings) for m in _matrices(value))
         return next((key for key in found if key is not None), None)
 
+    def _fits(self, key: str, image: Tensor) -> bool:
+        """Return whether an image has the size of a view at this level, as far as that is known."""
+        return self.accumulated is None or self.accumulated.get(key).shape == image.shape
+
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         if self.targets is not None:
@@ -151,7 +157,11 @@ class StageRendering:
         outputs = rasterizer(**inputs)
         place = _image_place(outputs, settings)
         stored = outputs if place is None else outputs[place]
-        image = self.compose(self.key(noted, settings), _channels_first(stored))
+        image = _channels_first(stored)
+        key = self.key(noted, settings)
+        if noted is None and key is not None and not self._fits(key, image):
+            key = None  # a viewer's camera at the place of a photo's
+        image = self.compose(key, image)
         if self.capture:
             self.captured = image
         image = _as_stored(image, stored)
@@ -212,11 +222,16 @@ class RasterizerWrapper:
 
         return make_settings
 
-    def entry(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the replacement of a rasterizer's class, or of a function that rasterizes."""
-        return self._rasterizer(original) if inspect.isclass(original) else self._function(original)
+    def entries(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
+        """Return where a checkout looks rasterizers up, as owners and names, each with its replacement's maker."""
+        return [
+            (*place, self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function)
+            for rasterizer in profile.rasterizers
+            for name in rasterizer.entries
+            for place in profile.places(rasterizer, name)
+        ]
 
-    def _rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = original(*args, **kwargs)
             stage, noted = self.stage, self.noted

@@ -175,9 +175,8 @@ class BareRunRecorder:
         background = torch.full((3,), float(self._call.white_background), device=self._device)
         wrapper = RasterizerWrapper()
         wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
-        profile = self._adapter.profile
-        found = [place for each in profile.rasterizers for place in profile.places(each, each.entries)]
-        with Attachment([Replacement(owner, name, wrapper.entry, None, "render()") for owner, name in found]):
+        found = wrapper.entries(self._adapter.profile)
+        with Attachment([Replacement(owner, name, make, None, "render()") for owner, name, make in found]):
             return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
 
     def _rendered(

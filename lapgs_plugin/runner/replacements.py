@@ -76,8 +76,9 @@ class StageReplacements:
         made = [(function, wrapper.renderer) for function in profile.renderers]
         found = [(owner, name, make) for value, make in made for owner, name in profile.holders(value)]
         for rasterizer in profile.rasterizers:
-            found += [(*place, wrapper.settings) for place in profile.places(rasterizer, rasterizer.settings)]
-            found += [(*place, wrapper.entry) for place in profile.places(rasterizer, rasterizer.entries)]
+            for name in rasterizer.settings:
+                found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]
+        found += wrapper.entries(profile)
         return [Replacement(owner, name, make, None, consumer) for owner, name, make in found]
 
     def _in_model(self, profile: Profile) -> list[Replacement]:

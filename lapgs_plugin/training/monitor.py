@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.progress import LoggingProgress
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class ProgressMonitor(Monitor):
 
     def __init__(self, console: Console, levels: int) -> None:
         self._levels = levels
-        self._progress = Progress(
+        self._progress = LoggingProgress(
             TextColumn("{task.description}", table_column=Column(no_wrap=True)),
             BarColumn(bar_width=None, table_column=Column(ratio=1)),
             MofNCompleteColumn(table_column=Column(no_wrap=True)),
@@ -60,6 +61,7 @@ class ProgressMonitor(Monitor):
             TimeRemainingColumn(compact=True, elapsed_when_finished=True, table_column=Column(no_wrap=True)),
             console=console,
             expand=True,
+            unit="iterations",
         )
         self._task: TaskID | None = None
         self._psnr: float | None = None

@@ -386,3 +386,12 @@ class TrainingControl(MeasuringOptions):
         panel=RUN,
         least=1,
     )
+    log: str | None = option(
+        None,
+        "tensorboard: also write the figures of history.jsonl for TensorBoard, into the run folder.",
+        panel=RUN,
+    )
+
+    def __post_init__(self) -> None:
+        if self.log not in (None, "tensorboard"):
+            raise UserInputError(f"--log {self.log}: expected tensorboard; history.jsonl is always written")

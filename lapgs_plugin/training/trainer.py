@@ -111,7 +111,8 @@ def warm_up(
     model.step(means_rate=0.0, active_coefficients=1)
     if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch:
         images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
-        photometric_loss(images, torch.zeros_like(images)).backward()  # type: ignore[no-untyped-call]  # torch's
+        none = torch.zeros(images.shape, dtype=target_types[0], device=device)
+        photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))
     if on_gpu:
         densification_statistics.triton_works()

@@ -50,6 +50,9 @@ def test_every_command_parses(document: Path, tmp_path: Path, monkeypatch: pytes
     # The rehearsal of `lapgs run` recognises a checkout; its script is never started.
     shutil.copytree(ROOT / "tests/contract/checkouts/graphdeco", tmp_path / "checkout")
     monkeypatch.chdir(tmp_path / "checkout")
+    config = Path("runs/garden/run.toml")  # a command with --config reads it when it is parsed
+    config.parent.mkdir(parents=True)
+    config.write_text('scene = "data/garden"\n')
     for words in commands(document):
         command, context = parsed(words)
         given = context.params

@@ -13,51 +13,77 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
 
-BLOCK_ROWS, BLOCK_COLUMNS = 8, 128
+BLOCK = 128
+MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 8, 1500
+"""Rows of a program. It takes fewer where an image would make less than so many programs."""
 MOST_TAPS, MOST_TRANSPOSED = 5, 12
 """Upper bounds: coarse samples in the sum of a fine one, and fine samples whose sums a coarse one is in."""
 
 # Triton compiles a kernel again for integers that are 1 or multiples of 16. Without this it would do so for many image
 # sizes. Column strides stay specialized: they are 1 or 3, and a known 1 makes faster code.
 OF_ANY_VALUE = (
-    *("height", "width", "source_image", "source_plane", "source_row"),
+    *("height", "width", "rows", "source_image", "source_plane", "source_row"),
     *("added_image", "added_plane", "added_row", "out_image", "out_plane", "out_row"),
 )
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _across(row: tl.tensor, stride: int, weights: tl.tuple, inside: tl.tensor, taps: tl.constexpr) -> tl.tensor:
+    """Return sums over neighbours in a row."""
+    total = weights[0] * tl.load(row, inside, 0.0)
+    for tap in tl.static_range(1, taps):
+        total += weights[tap] * tl.load(row + tap * stride, inside, 0.0)
+    return total
 
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _kernel(
     source: tl.tensor, added: tl.tensor, out: tl.tensor,
     first_row: tl.tensor, row_weights: tl.tensor, first_column: tl.tensor, column_weights: tl.tensor,
-    height: int, width: int,
+    height: int, width: int, rows: int,
     source_image: int, source_plane: int, source_row: int, source_column: int,
     added_image: int, added_plane: int, added_row: int, added_column: int,
     out_image: int, out_plane: int, out_row: int, out_column: int,
-    adds: tl.constexpr, planes: tl.constexpr, taps_down: tl.constexpr, taps_across: tl.constexpr,
-    block_rows: tl.constexpr, block_columns: tl.constexpr,
+    adds: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
+    taps_down: tl.constexpr, taps_across: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Filter a block of all planes of an image; *_image, *_plane, *_row, *_column are strides."""
-    rows = tl.program_id(1) * block_rows + tl.arange(0, block_rows)  # (r,)
-    columns = tl.program_id(0) * block_columns + tl.arange(0, block_columns)  # (c,)
-    in_rows, in_columns = rows < height, columns < width
-    inside = in_rows[:, None] & in_columns[None, :]
-    row, column = tl.load(first_row + rows, in_rows, 0), tl.load(first_column + columns, in_columns, 0)
+    """Filter some rows of a strip of `block` columns and colours; *_image, *_plane, *_row, *_column are strides.
+
+    The rows of the source that a row of the result is summed over are kept, filtered across, while they are needed.
+    """
+    places = tl.program_id(0) * block + tl.arange(0, block)
+    inside = places < width * planes
+    # Neighbouring threads write neighbouring values.
+    column = places // planes if interleaved else places % width
+    plane = places % planes if interleaved else places // width
     image = tl.program_id(2).to(tl.int64)
-    for plane in tl.static_range(planes):  # one block reads all colours, which may be interleaved in memory
-        total = tl.zeros((block_rows, block_columns), tl.float32)
+    row = tl.program_id(1) * rows
+    end = tl.minimum(row + rows, height)
+    weights = ()
+    for tap in tl.static_range(taps_across):
+        weights = weights + (tl.load(column_weights + column * taps_across + tap, inside, 0.0),)  # type: ignore[assignment]  # noqa: RUF005
+    start = tl.load(first_column + column, inside, 0)
+    start = source + image * source_image + plane * source_plane + start * source_column
+    added += image * added_image + plane * added_plane + column * added_column
+    out += image * out_image + plane * out_plane + column * out_column
+    first = tl.load(first_row + row)
+    kept = ()
+    for tap in tl.static_range(taps_down):
+        there = start + (first + tap).to(tl.int64) * source_row
+        kept = kept + (_across(there, source_column, weights, inside, taps_across),)  # type: ignore[assignment]  # noqa: RUF005
+    while row < end:
+        wanted = tl.load(first_row + row)
+        while first < wanted:
+            there = start + (first + taps_down).to(tl.int64) * source_row
+            kept = kept[1:] + (_across(there, source_column, weights, inside, taps_across),)  # type: ignore[assignment]  # noqa: RUF005
+            first += 1
+        total = tl.zeros((block,), tl.float32)
         if adds:
-            there = added + image * added_image + plane * added_plane
-            total += tl.load(there + rows[:, None] * added_row + columns[None, :] * added_column, inside, 0.0)
-        for down in tl.static_range(taps_down):
-            by_row = tl.load(row_weights + rows * taps_down + down, in_rows, 0.0)
-            across = tl.zeros_like(total)
-            start = source + image * source_image + plane * source_plane + (row + down)[:, None] * source_row
-            for tap in tl.static_range(taps_across):
-                by_column = tl.load(column_weights + columns * taps_across + tap, in_columns, 0.0)
-                across += by_column[None, :] * tl.load(start + (column + tap)[None, :] * source_column, inside, 0.0)
-            total += by_row[:, None] * across
-        there = out + image * out_image + plane * out_plane
-        tl.store(there + rows[:, None] * out_row + columns[None, :] * out_column, total, inside)
+            total += tl.load(added + row.to(tl.int64) * added_row, inside, 0.0)
+        for tap in tl.static_range(taps_down):
+            total += tl.load(row_weights + row * taps_down + tap) * kept[tap]
+        tl.store(out + row.to(tl.int64) * out_row, total, inside)
+        row += 1
 
 
 class _Taps(NamedTuple):
@@ -82,7 +108,7 @@ def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> 
 
 
 class _Upsampled(torch.autograd.Function):
-    """Map (coarse, grid, size) to Up(coarse); the gradient applies the transpose of Up, one side after the other."""
+    """Map (coarse, grid, size) to Up(coarse); the gradient applies the transpose of Up."""
 
     @staticmethod
     def forward(ctx: Any, coarse: Tensor, grid: str, size: tuple[int, int]) -> Tensor:
@@ -95,11 +121,9 @@ class _Upsampled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (height, width), device = ctx.size, gradient.device
-        lower = gradient.new_empty(*ctx.shape[:-1], width)  # half as many rows
-        _filter(gradient, _up_transposed(ctx.grid, height, device), _identity(width, device), lower)
         out = gradient.new_empty(ctx.shape)
-        _filter(lower, _identity(ctx.shape[-2], device), _up_transposed(ctx.grid, width, device), out)
+        rows, columns = (_up_transposed(ctx.grid, side, gradient.device) for side in ctx.size)
+        _filter(gradient, rows, columns, out)
         return out, None, None
 
 
@@ -107,15 +131,16 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
     """Write weighted sums of `source`, plus `added` if given, to `out`."""
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
-    height, width = out.shape[-2:]
-    blocks = triton.cdiv(width, BLOCK_COLUMNS), triton.cdiv(height, BLOCK_ROWS), len(images[2])
-    launch: Any = _kernel[blocks]
+    b, planes, height, width = images[2].shape
+    strips, count = triton.cdiv(planes * width, BLOCK), MOST_ROWS
+    while count > LEAST_ROWS and strips * triton.cdiv(height, count) * b < ENOUGH_PROGRAMS:
+        count //= 2
+    launch: Any = _kernel[strips, triton.cdiv(height, count), b]
     launch(
-        *images, *rows, *columns, height, width,
+        *images, *rows, *columns, height, width, count,
         *(stride for image in images for stride in image.stride()),
-        adds=added is not None, planes=images[2].shape[1],
-        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1],
-        block_rows=BLOCK_ROWS, block_columns=BLOCK_COLUMNS,
+        adds=added is not None, planes=planes, interleaved=images[2].stride(1) == 1,
+        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
     )  # fmt: skip
 
 
@@ -129,12 +154,6 @@ def _up(grid: str, size: int, device: torch.device) -> _Taps:
 @torch.inference_mode(False)  # the cache serves calls that need gradients
 def _up_transposed(grid: str, size: int, device: torch.device) -> _Taps:
     return _to_device(*transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2), size, MOST_TRANSPOSED, device)
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)  # the cache serves calls that need gradients
-def _identity(size: int, device: torch.device) -> _Taps:
-    return _Taps(torch.arange(size, dtype=torch.int32, device=device), torch.ones(size, 1, device=device))
 
 
 def _to_device(first: Tensor, weights: Tensor, samples: int, most: int, device: torch.device) -> _Taps:

@@ -1,0 +1,81 @@
+"""Read and write settings files: `lapgs train --config run.toml`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lapgs_plugin import __version__
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import atomic_write
+from lapgs_plugin.untrusted import read_toml
+
+RUN_CONFIG = "run.toml"
+"""File of a run folder with the options that made the run."""
+OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
+"""Parameters that say where a run goes and how it is started, not what it is."""
+
+
+def _load(context: typer.Context, path: Path | None) -> Path | None:
+    """Take the values of a settings file as defaults of the command's other parameters."""
+    if path is not None:
+        context.default_map = {**(context.default_map or {}), **_read(context, path)}
+    return path
+
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        is_eager=True,
+        callback=_load,
+        metavar="FILE",
+        help="TOML file of options, such as the run.toml of a run folder. Options on the command line come first.",
+    ),
+]
+
+
+def _read(context: typer.Context, path: Path) -> dict[str, Any]:
+    """Return a settings file's values by the names of the command's parameters.
+
+    Raises:
+        UserInputError: the file is not TOML, has a key that is no option, or a value that is not a string, number or
+            boolean.
+    """
+    if not path.is_file():
+        raise UserInputError(f"--config {path}: no such file; a run folder has one, {RUN_CONFIG}")
+    known = {each.name for each in context.command.params} - OF_ONE_CALL
+    values: dict[str, Any] = {}
+    for key, value in read_toml(path, dict[str, Any]).items():
+        name = key.replace("-", "_")
+        if name not in known:
+            raise UserInputError(
+                f"{path}: {key} is not an option of {context.command_path} that a settings file may have; "
+                f"{context.command_path} --help lists them"
+            )
+        if not isinstance(value, str | int | float):
+            raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")
+        values[name] = value
+    return values
+
+
+def write_config(path: Path, context: typer.Context) -> None:
+    """Write the parameters of a command that runs as a settings file that makes the same run.
+
+    Parameters that are None and `OF_ONE_CALL` are left out.
+    """
+    lines = [
+        f"# Made by lapgs {__version__}. The same again: {context.command_path} --config {path.name} -o NEW_FOLDER"
+    ]
+    for name in (str(each.name) for each in context.command.params):
+        value = context.params.get(name)
+        if value is None or name in OF_ONE_CALL or (isinstance(value, float) and not math.isfinite(value)):
+            continue
+        text = json.dumps(str(value.absolute()) if isinstance(value, Path) else value, ensure_ascii=False)
+        lines.append(f"{name.replace('_', '-')} = {text}")
+    with atomic_write(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())

@@ -1,0 +1,58 @@
+"""Write a page that shows a field in any browser with WebGL 2: one file, which needs no network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.splat import splat_bytes
+from lapgs_plugin.rendering.rig import Rig, forward
+from lapgs_plugin.reports.report import render_page, write_page
+
+TEMPLATE = "splats.html.jinja"
+NEAREST_TARGET = 0.05
+"""Least distance of the point that the view turns around, in distances of the cameras from their focus."""
+
+
+def write_splat_page(
+    field: GaussianField, path: Path, title: str, cameras: Sequence[Camera], background: tuple[float, float, float]
+) -> Path:
+    """Write the page.
+
+    Args:
+        field: an ordinary field, of which the page shows SH degree 0.
+        path: of the page.
+        title: of the page.
+        cameras: of the training views; the page starts at the first and turns around the point that all look at.
+        background: RGB in [0, 1] behind the Gaussians.
+
+    Raises:
+        FieldError: the field is a residual, or holds NaN or inf.
+        RunFolderError: the page cannot be written.
+    """
+    splats = base64.b64encode(splat_bytes(field)).decode()
+    start = json.dumps({**_start(cameras), "background": background})
+    # Base64 and our own JSON of numbers hold nothing to escape.
+    return write_page(path, render_page(TEMPLATE, title=title, start=Markup(start), splats=Markup(splats)))
+
+
+def _start(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Return the first view as the page takes it: pose, field of view, and the point and axis to turn around."""
+    rig, camera = Rig.of(cameras), cameras[0]
+    place, ahead = camera.position.double().numpy(), forward(camera)
+    depth = max(float(np.dot(rig.focus - place, ahead)), NEAREST_TARGET * rig.distance)
+    return {
+        "place": place.tolist(),
+        "rotation": camera.world_to_camera[:3, :3].double().numpy().ravel().tolist(),  # rows right, down, forward
+        "target": (place + depth * ahead).tolist(),
+        "up": rig.up.tolist(),
+        "focal": [camera.fx / camera.width, camera.fy / camera.height],
+    }

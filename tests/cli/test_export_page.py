@@ -1,0 +1,117 @@
+"""The page of `lapgs export --html`: its bytes, and what a browser without a network shows of them."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from lapgs_plugin.errors import FieldError, UserInputError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.splat import LAYOUT, splat_bytes
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.runs.archive import RunArchive
+from tests.cli.run_folder import BACKGROUND, write_run, write_scene
+from tests.cli.test_export import lapgs_export
+from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
+from tests.training_scene import HEIGHT, WIDTH, blob_field
+
+ENLARGED = 8
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    run = write_run(folder / "run", write_scene(folder / "scene"), nested=True)
+    assert "scene.html: 200 Gaussians" in lapgs_export(run, "--html")
+    return run
+
+
+def test_splats_take_32_bytes_each_the_most_important_first() -> None:
+    field = blob_field(50)
+    logits = field.opacity_logits.clone()
+    logits[7] = -9.0  # invisible
+    field = replace(field, opacity_logits=logits)
+    packed = splat_bytes(field)
+    assert len(packed) == 49 * 32
+    splats = np.frombuffer(packed, LAYOUT)
+    importance = splats["rgba"][:, 3] / 255 * splats["scale"].prod(axis=1)
+    assert (importance[:-1] >= importance[1:] * 0.98).all()  # opacities are rounded
+    index = int((field.means - torch.from_numpy(splats["mean"][0].copy())).norm(dim=1).argmin())
+    assert np.allclose(splats["scale"][0], field.log_scales[index].exp().numpy(), rtol=1e-6)
+    color = (0.5 + field.sh[index, 0] / (2 * np.sqrt(np.pi))).clamp(0, 1)
+    assert np.abs(splats["rgba"][0] / 255 - [*color, torch.sigmoid(field.opacity_logits[index])]).max() <= 0.51 / 255
+    quaternion = torch.nn.functional.normalize(field.quaternions[index], dim=0).numpy()
+    assert np.abs((splats["quaternion"][0] - 128.0) / 128 - quaternion).max() <= 1 / 128
+    with pytest.raises(FieldError, match="residual has signed colours"):
+        splat_bytes(replace(field, signed=True))
+
+
+def test_the_page_is_one_file_with_the_splats(run: Path) -> None:
+    page = (run / "export" / "scene.html").read_text()
+    assert not re.search(r"(src|href)=|https?://", page)
+    (data,) = re.findall(r'id="splats">([A-Za-z0-9+/=]+)<', page)
+    assert base64.b64decode(data) == splat_bytes(RunArchive.open(run).field(0))
+
+
+def test_pages_that_cannot_be_made_are_one_line(tmp_path: Path) -> None:
+    residuals = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+    with pytest.raises(UserInputError, match="level 0 is a residual"):
+        lapgs_export(residuals, "--html")
+    with pytest.raises(UserInputError, match="--format does not go with --html"):
+        lapgs_export(residuals, "--html", "--format", "spz")
+    with pytest.raises(UserInputError, match="--scene needs --html"):
+        lapgs_export(residuals, "--scene", tmp_path)
+    assert not (residuals / "export").exists()
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_browser_shows_the_splats_as_a_rasterizer_renders_them(run: Path) -> None:
+    pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    troubles: list[str] = []
+    camera = next(iter(run_cameras(RunArchive.open(run))[0].values())).resized(ENLARGED * WIDTH, ENLARGED * HEIGHT)
+    with headless_chromium(*SOFTWARE_3D) as browser:
+        page = browser.new_page(viewport={"width": camera.width, "height": camera.height}, device_scale_factor=1)
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda request: request.url[:5] in ("file:", "data:") or troubles.append(request.url))
+        page.goto((run / "export" / "scene.html").as_uri())
+        page.wait_for_selector("canvas[data-shown]", state="attached")
+        page.keyboard.press("h")  # hides the words
+        first = _picture(page)
+        assert psnr(_tensor(first), _rendered(run, camera)) > 38  # seen 44.9: colours have 8 bits
+        page.mouse.move(200, 150)
+        page.mouse.down()
+        page.mouse.move(260, 150)
+        page.mouse.up()
+        page.wait_for_timeout(100)
+        turned = _picture(page)
+        assert psnr(_tensor(turned), _tensor(first)) < 30  # seen 19.2
+        page.keyboard.press("r")
+        page.wait_for_timeout(100)
+        assert np.array_equal(_picture(page), first)
+    assert troubles == []
+
+
+def _picture(page: object) -> NDArray[np.uint8]:
+    png = np.frombuffer(page.screenshot(), np.uint8)  # type: ignore[attr-defined]  # playwright's page
+    return cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def _tensor(picture: NDArray[np.uint8]) -> torch.Tensor:
+    return torch.from_numpy(picture.copy()).permute(2, 0, 1) / 255
+
+
+def _rendered(run: Path, camera: Camera) -> torch.Tensor:
+    field = RunArchive.open(run).field(0)
+    with torch.no_grad():
+        return CpuRasterizer()(field, camera, background=torch.tensor(BACKGROUND)).image

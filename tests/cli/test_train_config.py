@@ -1,0 +1,91 @@
+"""`lapgs train --config`, the settings file in run folders, and `--log tensorboard`."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.training import tensorboard
+from lapgs_plugin.untrusted import read_json_lines, read_toml
+from tests.cli.commands import succeeding
+
+lapgs = succeeding(app, 120)
+SHORT = ("--iterations", 8, "--sh-degree", 1, "--rasterizer", "cpu")
+
+
+def test_a_run_folder_has_the_file_that_makes_it_again(scene: Path, tmp_path: Path) -> None:
+    lapgs("train", scene, "-o", tmp_path / "first", "--eval", "--split", "1/4,3/4", *SHORT)
+    config = tmp_path / "first" / "run.toml"
+    assert read_toml(config)["split"] == "1/4,3/4"
+    lapgs("train", "--config", config, "-o", tmp_path / "second")
+    first, second = (RunArchive.open(tmp_path / name) for name in ("first", "second"))
+    assert second.manifest.settings == first.manifest.settings
+    assert second.manifest.scene == first.manifest.scene
+    assert [second.field_path(level).read_bytes() for level in (0, 1)] == [
+        first.field_path(level).read_bytes() for level in (0, 1)
+    ]
+
+
+def test_the_command_line_comes_before_the_file(scene: Path, tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text(f'scene = "{scene}"\niterations = 8\nsh-degree = 1\nrasterizer = "cpu"\nseed = 3\n')
+    lapgs("train", "--config", config, "-o", tmp_path / "run", "--seed", 5, "--levels", 1)
+    manifest = RunArchive.open(tmp_path / "run").manifest
+    assert (manifest.seed, manifest.settings["iterations"], manifest.levels) == (5, 8, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("iteratons = 5", "iteratons is not an option of"),
+        ('out = "elsewhere"', "out is not an option of"),
+        ("levels = [2]", r"levels is \[2\], expected a string, a number, true or false"),
+        ('levels = "two"', "--levels two: expected a valid integer"),
+        ("levels 2", "is not TOML"),
+        ("joint = 2.0", "--joint 2"),
+    ],
+)
+def test_a_mistake_in_the_file_is_one_line(scene: Path, tmp_path: Path, text: str, message: str) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text(text)
+    with pytest.raises(UserInputError, match=message):
+        lapgs("train", scene, "--config", config, "-o", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_that_is_not_there(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="no such file"):
+        lapgs("train", scene, "--config", tmp_path / "none.toml", "-o", tmp_path / "run")
+
+
+def test_tensorboard_has_the_figures_of_the_history(scene: Path, tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # TensorBoard's own
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    lapgs("train", scene, "-o", tmp_path / "run", "--eval", "--log", "tensorboard", *SHORT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+        events.Reload()
+    entries = read_json_lines(tmp_path / "run" / "history.jsonl")
+    steps = [entry["iteration"] + (4 if entry["level"] == 0 else 0) for entry in entries]
+    losses = events.Scalars("training/loss")
+    assert [event.step for event in losses] == steps
+    assert [event.value for event in losses] == pytest.approx([entry["loss"] for entry in entries], rel=1e-6)
+    assert len(events.Scalars("held out/PSNR")) == 2
+
+
+def test_without_tensorboard_nothing_is_written(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "torch.utils.tensorboard.writer", None)
+    with pytest.raises(UserInputError, match="is not installed"):
+        tensorboard.require_tensorboard()
+    with pytest.raises(UserInputError, match="is not installed"):
+        lapgs("train", scene, "-o", tmp_path / "run", "--log", "tensorboard", *SHORT)
+    with pytest.raises(UserInputError, match="expected tensorboard"):
+        lapgs("train", scene, "-o", tmp_path / "run", "--log", "wandb", *SHORT)
+    assert not (tmp_path / "run").exists()
