@@ -22,8 +22,8 @@ SCHEDULER = "utils.schedule_utils"
 class Adapter(generic.Adapter):
     """Drive a DashGaussian checkout, whose plain `train.py` needs nothing of this.
 
-    From the second level on renders have the level's size. A residual field starts with as many Gaussians as it may
-    have, and the budget grows by those that qualify for densification, as it does in the checkout.
+    A residual is rendered at its level's size. It starts with as many Gaussians as it may have, and the budget grows by
+    those that qualify for densification, as it does in the checkout. Nested levels keep the checkout's own schedule.
     """
 
     info = BackboneInfo(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
 from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.checkouts.attachment import Replacement
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -43,14 +45,17 @@ class Adapter(generic.Adapter):
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
-        # The folder of the run exists.
-        changed.dataset.ignore_check_output = True
         opt = changed.opt
         opt.oneupSHdegree_from_iter = 0 if window.start > 0 else window.scaled(opt.oneupSHdegree_from_iter)
         opt.prune_way = PRUNING.get(opt.prune_way, opt.prune_way)
         if window.start > 0:
             opt.use_sparse_shs = False
         return changed
+
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        return [
+            Replacement(self.train, "prepare_output_and_logger", _in_any_folder, ("args",), "training() at its start")
+        ]
 
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
         field = super().snapshot(gaussians, signed)
@@ -63,3 +68,13 @@ class Adapter(generic.Adapter):
         of_coefficient = torch.arange(field.sh.shape[1], device=field.sh.device).sqrt().floor()
         kept = of_coefficient <= degrees[:, None]  # (n, k)
         return field.with_parameters({"sh": field.sh * kept[:, :, None]})
+
+
+def _in_any_folder(original: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Let the checkout write into the run's folder, which exists, and whose contents were asked about before."""
+
+    def prepare_output_and_logger(args: Any) -> Any:
+        args.ignore_check_output = True
+        return original(args)
+
+    return prepare_output_and_logger

@@ -7,8 +7,9 @@ import torch
 from arguments import ModelParams, OptimizationParams, PipelineParams
 from scene import GaussianModel, Scene
 from scene.renderer import render
+from utils import plain_main
 from utils.loss_utils import l1_loss, ssim
-from utils.plain_main import LossBar, background_of, parsed, parser_of, prepare_output_and_logger
+from utils.plain_main import LossBar, background_of, parsed, parser_of
 
 
 def get_sparse_shs_mask(scene, gaussians, pipe, bg, opt):
@@ -33,7 +34,6 @@ def training(
     load_from_h5,
 ):
     first_iter = 0
-    assert dataset.ignore_check_output or not Path(dataset.model_path).exists(), "exists"
     prepare_output_and_logger(dataset)
     gaussians = GaussianModel(dataset.sh_degree if opt.oneupSHdegree_from_iter == 0 else 0)
     scene = Scene(dataset, gaussians, shuffle=True)
@@ -83,6 +83,11 @@ def training(
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
+
+
+def prepare_output_and_logger(args):
+    assert args.ignore_check_output or not Path(args.model_path).exists(), "exists"
+    plain_main.prepare_output_and_logger(args)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ from utils.gaussian_base import GaussianBase
 
 class GaussianModel(GaussianBase):
     create_from_pcd = plain_model.create_from_pcd
-    training_setup = plain_model.training_setup
+
+    def training_setup(self, training_args):
+        plain_model.training_setup(self, training_args)
 
     def prune_and_densify(self, max_grad, min_opacity, extent, max_screen_size, radii, densify_rate=1.0):
         before = len(self.get_xyz)

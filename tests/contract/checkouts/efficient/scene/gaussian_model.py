@@ -8,9 +8,11 @@ from utils.gaussian_base import GaussianBase
 
 class GaussianModel(GaussianBase):
     create_from_pcd = plain_model.create_from_pcd
-    training_setup = plain_model.training_setup
     densify_and_prune = plain_model.densify_and_prune
     sparse_shs_degree = None
+
+    def training_setup(self, training_args):
+        plain_model.training_setup(self, training_args)
 
     def set_shs_memory(self, sh_degree):
         self.max_sh_degree = sh_degree

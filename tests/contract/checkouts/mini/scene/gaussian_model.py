@@ -9,7 +9,9 @@ from utils.sh_utils import RGB2SH
 
 class GaussianModel(GaussianBase):
     create_from_pcd = plain_model.create_from_pcd
-    training_setup = plain_model.training_setup
+
+    def training_setup(self, training_args):
+        plain_model.training_setup(self, training_args)
 
     def densify_and_prune_split(self, max_grad, min_opacity, extent, max_screen_size, mask):
         plain_model.densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size)

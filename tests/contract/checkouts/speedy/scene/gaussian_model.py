@@ -6,8 +6,10 @@ from utils.gaussian_base import GaussianBase
 
 class GaussianModel(GaussianBase):
     create_from_pcd = plain_model.create_from_pcd
-    training_setup = plain_model.training_setup
     densify_and_prune = plain_model.densify_and_prune
+
+    def training_setup(self, training_args):
+        plain_model.training_setup(self, training_args)
 
     def prune_gaussians(self, percent, import_score):
         ordered = import_score.sort(dim=0).values
