@@ -18,12 +18,13 @@ demo: $(VENV)/.installed
 	$(BIN)/lapgs render $(DEMO)/hierarchy
 	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
 
-# Two processes of one thread each take half the time of one process of two: most tests start others or hardly compute.
-# A browser that draws in software needs the machine for itself.
-test: check
+# The smoke benchmark compiles the CPU kernels that the tests use, while mypy takes the other core. Two processes of one
+# thread each take half the time of one process of two: most tests start others or hardly compute. A browser that draws in
+# software needs the machine for itself.
+test: $(VENV)/.installed
+	$(MAKE) -j2 --output-sync=target check smoke
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m 'not slow and not browser'
 	$(BIN)/pytest -m 'browser and not slow'
-	$(MAKE) smoke
 
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)

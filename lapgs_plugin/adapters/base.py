@@ -103,6 +103,7 @@ class BackboneInfo:
         raster_defaults: settings of the rasterizer that its options have by default, where these change the image and
             differ from `extensions.CONSTANTS`.
         telling_options: options in the `cfg_args` file that no other backbone writes.
+        unscaled: its options that count iterations in a stage of any length; see `checkouts.schedule`.
     """
 
     name: str
@@ -116,6 +117,7 @@ class BackboneInfo:
     density_scores: tuple[str, ...] = ()
     raster_defaults: Mapping[str, Any] = field(default_factory=dict)
     telling_options: tuple[str, ...] = ()
+    unscaled: tuple[str, ...] = ()
 
     @property
     def files(self) -> tuple[str, ...]:

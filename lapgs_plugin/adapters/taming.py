@@ -43,6 +43,7 @@ class Adapter(generic.Adapter):
         stand_in="taming",
         density_scores=("compute_gaussian_score",),
         own_files=("utils/taming_utils.py",),
+        unscaled=("ho_iteration",),
     )
 
     @staticmethod

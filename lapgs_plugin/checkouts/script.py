@@ -23,16 +23,22 @@ class Script:
     Attributes:
         path: absolute path of the script; its folder is the checkout.
         module: the script's namespace, `__main__` while it is loaded.
+        tree: syntax tree of the whole script.
     """
 
     path: Path
     module: ModuleType
+    tree: ast.Module
     _main: CodeType
 
     @property
     def checkout(self) -> Path:
         """Folder of the checkout."""
         return self.path.parent
+
+    def function(self, name: str) -> ast.FunctionDef | None:
+        """Return the syntax tree of a function of the script."""
+        return next((node for node in self.tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
 
     def run_main(self) -> None:
         """Execute the main block. Its exceptions, including SystemExit and KeyboardInterrupt, are passed on."""
@@ -63,7 +69,8 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         UserInputError: it is not Python, or has no main block.
     """
     path = require_script(path)
-    definitions, main = _split(path)
+    tree = _parse(path)
+    definitions, main = _split(tree, path)
     module = ModuleType("__main__")
     module.__file__ = str(path)
     before = sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"]
@@ -72,7 +79,7 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     sys.modules["__main__"] = module
     try:
         exec(definitions, module.__dict__)
-        yield Script(path, module, main)
+        yield Script(path, module, tree, main)
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
@@ -80,21 +87,26 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
             del sys.modules[name]
 
 
-def _split(path: Path) -> tuple[CodeType, CodeType]:
-    """Return the script without its main block, and the main block, both with the script's line numbers."""
+def _parse(path: Path) -> ast.Module:
     try:
-        tree = ast.parse(path.read_bytes(), str(path))
+        return ast.parse(path.read_bytes(), str(path))
     except (SyntaxError, ValueError) as error:
         raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
+
+
+def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:
+    """Return the script without its main block, and the main block, both with the script's line numbers."""
     blocks = [node for node in tree.body if _is_main_block(node)]
     if not blocks:
         raise UserInputError(
             f'{path} has no `if __name__ == "__main__":` block; expected the training script of a 3DGS checkout'
         )
     main = ast.Module(body=list(blocks), type_ignores=[])
-    tree.body = [node for node in tree.body if node not in blocks]
+    definitions = ast.Module(body=[node for node in tree.body if node not in blocks], type_ignores=[])
     # dont_inherit: the script must not get this file's future statements.
-    return compile(tree, str(path), "exec", dont_inherit=True), compile(main, str(path), "exec", dont_inherit=True)
+    return compile(definitions, str(path), "exec", dont_inherit=True), compile(
+        main, str(path), "exec", dont_inherit=True
+    )
 
 
 def _is_main_block(node: ast.stmt) -> bool:

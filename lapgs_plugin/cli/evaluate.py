@@ -59,10 +59,11 @@ def evaluate(
 ) -> None:
     """Measure PSNR, SSIM and LPIPS of RUN on its held-out views, and write RUN/metrics.json.
 
-    The metrics are means over views of float images clamped to [0, 1], as 3DGS reports them. LPIPS is skipped if the
-    weights of its network are missing. A run without held-out views (`lapgs train --eval`) is measured on its training
-    views, where the metrics are higher. The output also shows training times and frames per second of the composed
-    image.
+    The metrics are means over views of float images clamped to [0, 1], as 3DGS reports them. PSNR is also measured on
+    the right half of each view after an affine colour fit on its left half, for photos whose exposure changes. LPIPS is
+    skipped if the weights of its network are missing. A run without held-out views (`lapgs train --eval`) is measured
+    on its training views, where the metrics are higher. The output also shows training times and frames per second of
+    the composed image.
 
     With --trajectory the command measures flicker instead: how much each frame differs from the one before after
     warping it by the rendered depth, where both show the same surface. It writes RUN/stability.json.
@@ -137,11 +138,12 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
     missing = list(metrics["lpips_missing"])
     headings = [f"LPIPS ({title_of(name)})" for name in (*measured, *missing)]
-    table = Table("view", "PSNR (dB)", "SSIM", *headings, box=box.SIMPLE_HEAD)
+    table = Table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings, box=box.SIMPLE_HEAD)
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
         distances = [*(f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured), *("not measured" for _ in missing)]
-        table.add_row(escape(printable(view["name"])), f"{view['psnr']:.2f}", f"{view['ssim']:.4f}", *distances)
+        figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
+        table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
     console.print(f"[bold]Views, worst first[/bold]{more}", table, highlight=False)
 
@@ -186,6 +188,11 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
         f"{metrics['num_views']} {kind} views{where}; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
+        highlight=False,
+    )
+    console.print(
+        f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR on the right halves of the views, after a colour fit on "
+        "their left halves: compare this where exposure or white balance change from photo to photo",
         highlight=False,
     )
     if (peak := metrics["peak_memory_bytes"]) is not None:

@@ -11,10 +11,11 @@ from lapgs_plugin.cli.rendering import refuse
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
+    from lapgs_plugin.fields.gaussian_field import GaussianField
     from lapgs_plugin.runs.archive import RunArchive
 
 FORMATS = ("ply", "spz")
-PAGE = "scene.html"
+PAGE, MERGED = "scene.html", "merged"
 
 
 def export(
@@ -28,15 +29,23 @@ def export(
     level: Annotated[
         int | None, typer.Option(help="Level to export; 0 is the finest. Default: all finished levels.")
     ] = None,
+    merge: Annotated[
+        bool,
+        typer.Option(
+            "--merge",
+            help="Fit one ordinary field to the images of a run with residuals, and write it as merged.ply instead: an "
+            "approximation for other viewers. Prints the PSNR that it keeps.",
+        ),
+    ] = False,
+    iterations: Annotated[int | None, typer.Option(min=1, help="With --merge: views to fit to. Default: 3000.")] = None,
     html: Annotated[
         bool,
         typer.Option(
-            "--html",
-            help="Write RUN/export/scene.html instead: a viewer with the scene in one file, which opens offline.",
+            "--html", help="Write scene.html instead: a viewer with the scene in one file, which opens offline."
         ),
     ] = False,
     scene: Annotated[
-        Path | None, typer.Option(help="With --html: the scene's folder now. Default: where it was trained.")
+        Path | None, typer.Option(help="With --merge or --html: the scene's folder now. Default: where it was trained.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/export.")] = None,
 ) -> None:
@@ -45,7 +54,7 @@ def export(
     Files are named level_<l>_base, level_<l>_residual or level_<l>_field. The base and nested levels are ordinary
     fields that open in any 3DGS viewer. A residual of a Laplacian hierarchy is not: its signed colours are added to the
     upsampled image of the coarser levels, so another viewer cannot show the composition. A comment in the header of its
-    file says so.
+    file says so; --merge makes an ordinary field that approximates the composition.
 
     Examples:
 
@@ -53,19 +62,21 @@ def export(
 
         lapgs export runs/garden --level 1 --out /tmp/base
 
-        lapgs export runs/garden --html        (a page for the web)
+        lapgs export runs/garden --merge       (residuals as one ordinary field)
+
+        lapgs export runs/garden --merge --html       (a page for the web)
     """
-    from lapgs_plugin.fields.spz import save_spz
     from lapgs_plugin.files import one_line_errors
     from lapgs_plugin.runs.archive import EXPORT, RunArchive
 
     if file_format not in FORMATS:
         raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")
     archive = RunArchive.open(run)
-    refuse({"--scene": None if html else scene}, "needs --html")
-    if html:
-        refuse({"--format": None if file_format == "ply" else file_format}, "does not go with --html")
-        _write_page(archive, level, scene, archive.path(EXPORT) if out is None else out)
+    _check_together(file_format, level, merge, iterations, html, scene)
+    if html or merge:
+        _write_one(
+            archive, level, merge, iterations, html, scene, file_format, archive.path(EXPORT) if out is None else out
+        )
         return
     levels, folder = _levels(archive, level), archive.path(EXPORT) if out is None else out
     fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
@@ -75,37 +86,86 @@ def export(
         note = _note(archive, each)
         kind = "base" if each == archive.manifest.levels - 1 else "residual" if field.signed else "field"
         path = folder / f"level_{each}_{kind}.{file_format}"
-        with one_line_errors(path):
-            if file_format == "spz":
-                save_spz(field, path, note)
-            else:
-                field.save_ply(path, [note])
+        _write_field(field, path, note)
         print(
             f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
             + (", a residual" if field.signed else "")
         )
 
 
-def _write_page(archive: RunArchive, level: int | None, scene: Path | None, folder: Path) -> None:
-    """Write a level's field, by default the finest, as a page."""
+def _check_together(
+    file_format: str, level: int | None, merge: bool, iterations: int | None, html: bool, scene: Path | None
+) -> None:
+    """Refuse options that would have no effect together."""
+    if not merge:
+        refuse({"--iterations": iterations}, "needs --merge")
+        refuse({"--scene": None if html else scene}, "needs --merge or --html")
+    else:
+        refuse({"--level": level}, "does not go with --merge, which makes one field of all levels")
+    if html:
+        refuse({"--format": None if file_format == "ply" else file_format}, "does not go with --html")
+
+
+def _write_one(
+    archive: RunArchive,
+    level: int | None,
+    merge: bool,
+    iterations: int | None,
+    html: bool,
+    scene: Path | None,
+    file_format: str,
+    folder: Path,
+) -> None:
+    """Write one field, merged or of a level (by default the finest), as a file or a page."""
     from lapgs_plugin.files import one_line_errors
     from lapgs_plugin.rendering.run import run_cameras
     from lapgs_plugin.reports.splat_page import write_splat_page
 
     chosen = archive.manifest.record(0 if level is None else level).level
-    field = archive.field(chosen)
+    field = _merged(archive, scene, iterations) if merge else archive.field(chosen)
     if field.signed:
         raise UserInputError(
-            f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; train with --hierarchy "
-            "nested for a page of full quality, or take the base with --level "
-            f"{archive.manifest.levels - 1}"
+            f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
+            "field to the run"
         )
-    cameras = list(run_cameras(archive, scene)[0].values())
+    path = folder / (PAGE if html else f"{MERGED}.{file_format}")
+    cameras = list(run_cameras(archive, scene)[0].values()) if html else []
     with one_line_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    path = folder / PAGE
-    write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
-    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB, opens in a browser without a network")
+    if html:
+        write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
+    else:
+        _write_field(field, path, f"one field fitted to the images of {archive.path().name}")
+    opens = ", opens in a browser without a network" if html else ""
+    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{opens}")
+
+
+def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> GaussianField:
+    """Return a field that approximates the run, and print how well it does."""
+    from rich.console import Console
+
+    from lapgs_plugin.training.merge import ITERATIONS, merge_levels
+    from lapgs_plugin.training.monitor import ProgressMonitor
+
+    with ProgressMonitor(Console(stderr=True), 1) as monitor:
+        merged = merge_levels(archive, scene, iterations=iterations or ITERATIONS, monitor=monitor)
+    line = f"{merged.kept:.2f} dB PSNR against the run's own images of {merged.views} views that it was not fitted to"
+    if merged.photo_psnr is not None:
+        line += f"; against the photos {merged.photo_psnr[1]:.2f} dB, where the run has {merged.photo_psnr[0]:.2f}"
+    print(f"merged field: {line}")
+    return merged.field
+
+
+def _write_field(field: GaussianField, path: Path, note: str) -> None:
+    """Write a field as PLY or SPZ, by the suffix of the path."""
+    from lapgs_plugin.fields.spz import save_spz
+    from lapgs_plugin.files import one_line_errors
+
+    with one_line_errors(path):
+        if path.suffix == ".spz":
+            save_spz(field, path, note)
+        else:
+            field.save_ply(path, [note])
 
 
 def _levels(archive: RunArchive, level: int | None) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import median
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,29 +17,37 @@ from lapgs_plugin.evaluation.bench_scene import make_scene
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import blend_gradients, direct
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blending, Gradients
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blended, Gradients, ToBlend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 
-Kernel = Callable[[Blending, Tensor], Gradients]
+if TYPE_CHECKING:
+    from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape
 
 
 @dataclass(frozen=True)
 class BlendTime:
-    """Hold the times of one kernel.
+    """Hold the times of one pair of kernels.
 
     Attributes:
-        kernel: "gsplat", or the shape of ours.
-        forward, backward: median milliseconds for one view; forward is gsplat's always.
-        difference: of the gradients from gsplat's, relative to the largest.
+        kernels: "gsplat", or the shape of ours.
+        forward, backward: median milliseconds for one view.
+        difference: of images and gradients from gsplat's, relative to the largest.
     """
 
-    kernel: str
+    kernels: str
     forward: float
     backward: float
     difference: float
 
 
-def parse_shapes(text: str | None) -> dict[str, Kernel]:
+class Kernels(NamedTuple):
+    """Blend with `forward`, and return the gradients with `backward`."""
+
+    forward: Callable[[], Blended]
+    backward: Callable[[Blended, Tensor], Gradients]
+
+
+def parse_shapes(text: str | None) -> dict[str, Shape]:
     """Parse shapes such as "8x8x4x2,8x4x4x4x1", in the order of `blend_kernels.Shape`; None for the default one.
 
     Raises:
@@ -46,14 +55,7 @@ def parse_shapes(text: str | None) -> dict[str, Kernel]:
     """
     from lapgs_plugin.rasterizers.gsplat import blend_kernels
 
-    def bound(shape: blend_kernels.Shape) -> Kernel:
-        def run(given: Blending, by_images: Tensor) -> Gradients:
-            tensors = (*given[:4], given.offsets, given.flat, given.last, given.images, by_images)
-            return blend_kernels.blend_backward(*tensors, False, shape)
-
-        return run
-
-    kernels = {}
+    shapes = {}
     for entry in (text or "x".join(map(str, blend_kernels.SHAPE))).split(","):
         numbers = [int(number) if number.isdigit() else 0 for number in entry.strip().split("x")]
         if not 4 <= len(numbers) <= 5 or any(number < 1 or number & (number - 1) for number in numbers):
@@ -64,8 +66,8 @@ def parse_shapes(text: str | None) -> dict[str, Kernel]:
                 f"--shapes {entry!r}: expected LANESxROWSxSPLAT_LANESxSPLATS[xWARPS] with LANES and ROWS up to "
                 f"{blend_kernels.TILE} and LANES times SPLAT_LANES = 32 times WARPS"
             )
-        kernels[entry.strip()] = bound(shape)
-    return kernels
+        shapes[entry.strip()] = shape
+    return shapes
 
 
 def random_views(width: int, height: int, gaussians: int, views: int) -> tuple[GaussianField, list[Camera]]:
@@ -100,55 +102,63 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
 
 
 @torch.no_grad()
-def blended(
-    field: GaussianField, cameras: Sequence[Camera], device: torch.device
-) -> tuple[Blending, Callable[[], object]]:
-    """Render views on a GPU; return what blending took and made, and a function that blends again."""
-    from lapgs_plugin.rasterizers.gsplat.kernels import activate, visible_colors
-
+def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera], device: torch.device) -> ToBlend:
+    """Project a field on a GPU for some views, and sort it into tiles."""
     field = field.to(device)
-    there = CameraCache().get(cameras, field.means)
-    count, size = len(cameras), (there.width, there.height)
-    means = field.means.contiguous()
-    scales, opacities = activate(field.log_scales.contiguous(), field.opacity_logits.contiguous())
-    projected = direct.project(
-        means, field.quaternions.contiguous(), scales, opacities, there.poses, there.intrinsics, size
+    on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device=device)
+    found = direct.forward(
+        field.means.contiguous(), field.quaternions.contiguous(), field.log_scales.contiguous(),
+        field.opacity_logits.contiguous(), field.sh.contiguous(), on_device, background, field.sh_degree, field.signed,
+        describes=False, ours=False,
+    )  # fmt: skip
+    return found.given
+
+
+def contenders(given: ToBlend, size: tuple[int, int], shapes: str | None) -> dict[str, Kernels]:
+    """Return gsplat's kernels, and ours in several shapes."""
+    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
+
+    def ours(shape: Shape) -> Kernels:
+        def forward() -> Blended:
+            images, counts = blend_forward(*given, size, shape)
+            return Blended(images, images.new_empty(0), counts)
+
+        def backward(blended: Blended, by_images: Tensor) -> Gradients:
+            rest = given.offsets, given.flat, blended.last, blended.images, by_images
+            return blend_backward(*given[:4], *rest, False, shape)
+
+        return Kernels(forward, backward)
+
+    gsplat = Kernels(
+        partial(blend_gradients.blend, given, size, ours=False),
+        partial(blend_gradients.gradients, given, absolute=False),
     )
-    radii, means2d, _, conics = projected
-    colors, _, _ = visible_colors(
-        means, there.centres, field.sh.contiguous(), field.sh_degree, field.signed, radii, None
-    )
-    opacities = opacities.expand(count, -1).contiguous()
-    background = torch.zeros(count, 3, device=device)
-    images, alphas, last, offsets, flat = direct.blend(projected, colors, opacities, background, size, count)
-    planes = images.permute(0, 3, 1, 2).contiguous()
-    given = Blending(means2d, conics, colors, opacities, background, offsets, flat, alphas, last, planes)
-    forward = direct.compiled_functions().rasterize_to_pixels_3dgs_fwd
-    tensors = means2d, conics, colors, opacities, background, None, *size, direct.TILE, offsets, flat
-    return given, lambda: forward(*tensors)
+    return {"gsplat": gsplat, **{name: ours(shape) for name, shape in parse_shapes(shapes).items()}}
 
 
 def run_case(
     field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: str | None, device: torch.device
 ) -> Iterator[BlendTime]:
     """Time all kernels for some views of a field, in turns."""
-    given, forward = blended(field, cameras, device)
-    by_images = torch.randn(given.images.shape, generator=torch.Generator().manual_seed(0)).to(device)
-    kernels: dict[str, Kernel] = {"gsplat": partial(blend_gradients.by_gsplat, absolute=False), **parse_shapes(shapes)}
-    expected = kernels["gsplat"](given, by_images)[1:]
-    differences = {}
-    for name, kernel in kernels.items():
-        pairs = zip(kernel(given, by_images)[1:], expected, strict=True)
-        differences[name] = max(float((one - other).abs().max() / other.abs().max()) for one, other in pairs)
-    found: dict[str, list[float]] = {name: [] for name in kernels}
-    forwards = []
+    given, (width, height) = sorted_gaussians(field, cameras, device), (cameras[0].width, cameras[0].height)
+    generator = torch.Generator().manual_seed(0)
+    by_images = torch.randn(len(cameras), height, width, 3, generator=generator).to(device)
+    kernels = contenders(given, (width, height), shapes)
+    results = {}
+    for name, one in kernels.items():
+        made = one.forward()
+        results[name] = made, (made.images, *one.backward(made, by_images)[1:])
+    forward: dict[str, list[float]] = {name: [] for name in kernels}
+    backward: dict[str, list[float]] = {name: [] for name in kernels}
     for _ in range(repeats):
-        forwards.append(_milliseconds(forward))
-        for name, kernel in kernels.items():
-            found[name].append(_milliseconds(partial(kernel, given, by_images)))
-    count = len(cameras)
-    for name, each in found.items():
-        yield BlendTime(name, median(forwards) / count, median(each) / count, differences[name])
+        for name, one in kernels.items():
+            forward[name].append(_milliseconds(one.forward))
+            backward[name].append(_milliseconds(partial(one.backward, results[name][0], by_images)))
+    count, expected = len(cameras), results["gsplat"][1]
+    for name, (_, found) in results.items():
+        pairs = zip(found, expected, strict=True)
+        difference = max(float((one - other).abs().max() / other.abs().max()) for one, other in pairs)
+        yield BlendTime(name, median(forward[name]) / count, median(backward[name]) / count, difference)
 
 
 def _milliseconds(run: Callable[[], object], calls: int = 5) -> float:

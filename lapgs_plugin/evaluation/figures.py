@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
-from lapgs_plugin.evaluation.metrics import psnr, ssim
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr, ssim
 from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.composition import Composition, to_full_size
@@ -46,6 +46,7 @@ class ViewMetrics:
     Attributes:
         name: name of the view's image.
         psnr, ssim: of the composition at full resolution; PSNR in dB.
+        fitted_psnr: PSNR in dB of its right half after a colour fit on its left half.
         lpips: the measured distances, by variant.
         level_psnr: by level, PSNR in dB of I_hat^l against level l of the photo's Gaussian pyramid, both at the
             level's size.
@@ -55,6 +56,7 @@ class ViewMetrics:
 
     name: str
     psnr: float
+    fitted_psnr: float
     ssim: float
     lpips: dict[str, float]
     level_psnr: dict[int, float]
@@ -77,7 +79,8 @@ def measure_view(view: View, composition: Composition, renderer: HierarchyRender
     }
     whole = composition.composed[0]
     distances = lpips.measure(fill_outside(whole, photo, mask), photo)
-    return ViewMetrics(view.name, level_psnr[0], ssim(whole, photo, mask), distances, level_psnr, upsampled)
+    fitted = color_fitted_psnr(whole, photo, mask)
+    return ViewMetrics(view.name, level_psnr[0], fitted, ssim(whole, photo, mask), distances, level_psnr, upsampled)
 
 
 def evaluate_run(
@@ -171,6 +174,7 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
 
     Keys, with levels as text as JSON requires:
         psnr, ssim, lpips_<variant>: means over the views, at full resolution.
+        fitted_psnr: mean PSNR after a colour fit, see `color_fitted_psnr`; absent in older files.
         lpips_missing: by variant, why it could not be measured; added by `evaluate_run`.
         fps: frames a second of the composed image, the median over some views; added by `evaluate_run`.
         masked: whether pixels outside of masks were left out; added by `evaluate_run`, absent in older files.
@@ -184,6 +188,7 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
     records = manifest.records
     return {
         "psnr": fmean(view.psnr for view in views),
+        "fitted_psnr": fmean(view.fitted_psnr for view in views),
         "ssim": fmean(view.ssim for view in views),
         **{LPIPS_KEY.format(name): fmean(view.lpips[name] for view in views) for name in views[0].lpips},
         "split": split,
@@ -214,4 +219,4 @@ def _level_figures(record: LevelRecord, views: Sequence[ViewMetrics]) -> dict[st
 
 def _view_figures(view: ViewMetrics) -> dict[str, Any]:
     distances = {LPIPS_KEY.format(name): value for name, value in view.lpips.items()}
-    return {"name": view.name, "psnr": view.psnr, "ssim": view.ssim, **distances}
+    return {"name": view.name, "psnr": view.psnr, "fitted_psnr": view.fitted_psnr, "ssim": view.ssim, **distances}

@@ -9,8 +9,11 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.photometric_loss import in_torch
 
+LITTLE = 1e-6
+"""Weight of the identity in a colour fit, relative to that of the pixels."""
 SMALLEST_MSE = 1e-10
 """Smallest mean squared error that counts, near the resolution of float32 images: no PSNR is above 100 dB."""
 
@@ -25,6 +28,46 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     squares = (image.detach().clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).double().square()
     mse = float(squares.mean() if mask is None else (squares * mask).sum() / (len(squares) * mask.sum()))
     return -10.0 * math.log10(max(mse, SMALLEST_MSE))
+
+
+@torch.no_grad()
+def color_fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return the PSNR in dB of the right half of an image, after a colour fit on its left half.
+
+    The fit is the affine transform of RGB, A rgb + b, with the least squared error. It removes differences of exposure
+    and white balance that no other photo of a scene tells, as `fit_colors` explains.
+
+    Args:
+        image, target, mask: as `psnr` takes them, at least two pixels wide.
+    """
+    middle = image.shape[-1] // 2
+    left, right = slice(None, middle), slice(middle, None)
+    masks = [None if mask is None else mask[..., half] for half in (left, right)]
+    fit = fit_colors(image[..., left], target[..., left], masks[0])
+    if masks[1] is not None and not bool(masks[1].any()):
+        right, masks[1] = slice(None), mask  # nothing counts there
+    return psnr(transform_colors(image[..., right].float(), fit.float()), target[..., right], masks[1])
+
+
+@torch.no_grad()
+def fit_colors(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the transform (3, 4) for which A rgb + b is closest to the target, in least squares.
+
+    A tiny weight of the identity decides what the pixels leave open, such as all of it for an image of one colour.
+
+    Args:
+        image, target: (3, h, w), clamped to [0, 1] here.
+        mask: (1, h, w) bool or weights of the pixels; None counts all.
+    """
+    pixels, wanted = (each.clamp(0.0, 1.0).flatten(1).double() for each in (image, target))  # (3, n)
+    pixels = torch.cat([pixels, torch.ones_like(pixels[:1])])  # (4, n)
+    counted = pixels if mask is None else pixels * mask.flatten(1)
+    identity = torch.eye(3, 4, dtype=torch.float64)
+    little = LITTLE * max(1.0, float(counted[3].sum()))
+    normal = (counted @ pixels.T).cpu() + little * torch.eye(4, dtype=torch.float64)
+    right = (counted @ wanted.T).cpu() + little * identity.T
+    transform: Tensor = torch.linalg.solve(normal, right).T
+    return transform.to(image.device)
 
 
 @torch.no_grad()

@@ -154,8 +154,10 @@ def _spec(
     variant: Variant,
     seed: int,
 ) -> RunSpec:
-    preset = PRESETS[backbone.preset].arguments(scene.name) if backbone.preset else []
-    options = {**backbone.options, **variant.options}
+    chosen = variant.preset.get(name, backbone.preset)
+    preset = None if chosen is None else PRESETS[chosen]
+    published = [] if preset is None else preset.arguments(scene.name)
+    options = {**backbone.options, **({} if preset is None else preset.options), **variant.options}
     if variant.method != "bare":
         # Stored even when the file does not set it: a changed default must make a new run.
         options = {"hierarchy": DEFAULT_HIERARCHY.value, **options}
@@ -174,7 +176,7 @@ def _spec(
         iterations=_iterations(experiment, selection, variant),
         seed=seed,
         options=options,
-        arguments=[] if backbone.checkout is None else [*preset, *backbone.arguments, *variant.arguments],
+        arguments=[] if backbone.checkout is None else [*published, *backbone.arguments, *variant.arguments],
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
@@ -112,8 +112,8 @@ class Backbone(_StrictModel):
             raise ValueError("give either rasterizer (the built-in trainer) or checkout (a script of its own)")
         if self.rasterizer is not None and (self.preset is not None or self.arguments):
             raise ValueError("preset and arguments are for the script of a checkout")
-        if self.preset is not None and self.preset not in PRESETS:
-            raise ValueError(f"preset {self.preset!r} is not known, expected {', '.join(PRESETS)}")
+        if self.preset is not None:
+            _require_preset(self.preset)
         return self
 
     @property
@@ -129,6 +129,7 @@ class Variant(_StrictModel):
         name: its name in tables.
         method: "hierarchy"; or "bare": the checkout's script by itself, or one level of the built-in trainer.
         backbones: backbones that it is trained on; empty means all.
+        preset: by backbone, published options in place of those of the backbone.
         iterations, resolution: override those of the experiment and of the scene.
         options: options of `lapgs train` or `lapgs run`; they override those of the backbone.
         arguments: arguments of the checkout's script, after those of the backbone.
@@ -140,6 +141,7 @@ class Variant(_StrictModel):
     name: str
     method: Literal["hierarchy", "bare"] = "hierarchy"
     backbones: list[str] = []
+    preset: dict[str, str] = {}
     iterations: int | None = Field(None, ge=1)
     resolution: str | None = None
     options: Options = {}
@@ -147,6 +149,13 @@ class Variant(_StrictModel):
     section: str = ""
     paper: str | dict[str, str] = ""
     baseline: bool = False
+
+    @field_validator("preset")
+    @classmethod
+    def _known_presets(cls, presets: dict[str, str]) -> dict[str, str]:
+        for name in presets.values():
+            _require_preset(name)
+        return presets
 
     def paper_row(self, backbone: str) -> str:
         """Return the name of its row in the paper's table, "" without one."""
@@ -197,7 +206,7 @@ class Experiment(_StrictModel):
 
     def _unknown_backbones(self) -> Iterator[str]:
         for number, variant in enumerate(self.variants):
-            unknown = {*variant.backbones, *(variant.paper if isinstance(variant.paper, dict) else ())}
+            unknown = {*variant.backbones, *variant.preset, *(variant.paper if isinstance(variant.paper, dict) else ())}
             for name in sorted(unknown - self.backbones.keys()):
                 yield (
                     f"variants.{number}: variant {variant.name!r} names backbone {name!r}, expected "
@@ -214,6 +223,9 @@ class Experiment(_StrictModel):
                 yield f"{where} is bare, which is one level; leave levels out"
             if variant.method == "bare" and variant.options.keys() - OF_BARE_RUNS and all(checkouts):
                 yield f"{where} is bare: options of `lapgs run` have no effect; set the script's arguments"
+            for name in variant.preset.keys() & self.backbones.keys():
+                if self.backbones[name].checkout is None or name not in names:
+                    yield f"{where} has a preset for {name}, which it does not train with a checkout; leave it out"
             if variant.arguments and not any(checkouts):
                 yield f"{where} has arguments, but no checkout whose script takes them"
 
@@ -254,6 +266,11 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     if problems:
         raise ExperimentError(f"{path}: {problem}" for problem in problems)
     return experiment
+
+
+def _require_preset(name: str) -> None:
+    if name not in PRESETS:
+        raise ValueError(f"preset {name!r} is not known, expected {', '.join(PRESETS)}")
 
 
 def _first_duplicate(names: Sequence[T]) -> T | None:

@@ -41,11 +41,13 @@ class Preset:
         source: where they are published.
         common: options for every scene.
         scenes: further options by scene.
+        options: options of `lapgs run` for what the script has no option for.
     """
 
     source: str
     common: tuple[str, ...]
     scenes: Mapping[str, tuple[str, ...]]
+    options: Mapping[str, Any]
 
     def arguments(self, scene: str) -> list[str]:
         """Return the script's arguments for a scene; unknown scenes have the common ones."""
@@ -137,7 +139,10 @@ def _datasets() -> dict[str, Dataset]:
 def _presets() -> dict[str, Preset]:
     return {
         f"{backbone}.{name}": Preset(
-            preset["source"], tuple(preset["common"]), {s: tuple(words) for s, words in preset["scenes"].items()}
+            preset["source"],
+            tuple(preset["common"]),
+            {s: tuple(words) for s, words in preset["scenes"].items()},
+            preset.get("options", {}),
         )
         for backbone, presets in _read("presets.toml").items()
         for name, preset in presets.items()

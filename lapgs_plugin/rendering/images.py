@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +27,7 @@ def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> di
 
     Args:
         composition: of one or more levels.
-        photo: at the finest composed level's size; adds "compare": photo, composition and difference side by side.
+        photo: at the finest composed level's size; adds "compare": photo, composition and difference `side_by_side`.
         raw: keep the sign of residuals and differences, for formats with negative values; otherwise around mid-grey.
 
     Returns:
@@ -44,8 +45,32 @@ def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> di
         images["composed" if finest == 0 else f"composed_{finest}"] = composed
     if photo is not None:
         difference = composed.clamp(0.0, 1.0) - photo
-        images["compare"] = torch.cat([photo, composed, difference if raw else around_grey(difference)], dim=2)
+        shown = difference if raw else around_grey(difference)
+        images["compare"] = side_by_side({"photo": photo, "composition": composed, "difference": shown})
     return images
+
+
+def side_by_side(panels: Mapping[str, Tensor]) -> Tensor:
+    """Return panels (3, h, w) of one size beside each other, each under its name: (3, caption + h, panels * w).
+
+    The caption's height is `caption_height(h)`.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    _, height, width = next(iter(panels.values())).shape
+    strip = caption_height(height)
+    captions = Image.new("L", (len(panels) * width, strip), 255)
+    draw, font = ImageDraw.Draw(captions), ImageFont.load_default(size=round(0.7 * strip))
+    for index, name in enumerate(panels):
+        draw.text(((index + 0.5) * width, strip / 2), name, fill=0, font=font, anchor="mm")
+    images = torch.cat([each.cpu() for each in panels.values()], dim=2)
+    drawn = torch.from_numpy(np.array(captions)).to(images) / 255.0  # (strip, panels * w)
+    return torch.cat([drawn.expand(3, -1, -1), images], dim=1)
+
+
+def caption_height(height: int) -> int:
+    """Return the height in pixels of the captions above panels of a height."""
+    return max(16, height // 20)
 
 
 def file_stems(views: Sequence[View]) -> dict[str, str]:

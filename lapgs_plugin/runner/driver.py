@@ -12,12 +12,14 @@ are one field: a single call trains them (`single_call`). Everything between ren
 
 from __future__ import annotations
 
+import inspect
 import logging
 import os
 import shutil
 import tempfile
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ import torch
 from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.checkouts.level_views import SceneImages
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.runner.active_stage import ActiveStage
@@ -130,6 +133,7 @@ class HierarchyDriver:
                 self._context.watcher.run_started(archive)
                 try:
                     run = TrainingRun(call, scene, archive, path)
+                    self._log_schedule(call)
                     if self._signs_nothing:
                         SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
                     else:
@@ -154,7 +158,7 @@ class HierarchyDriver:
             window = StageWindow(
                 stage, start, plan.iterations, plan.levels, options.color_factor, options.threshold_factor(stage)
             )
-            call = self._adapter.stage_call(run.call, window, str(run.archive.path(f"level_{stage.level}")))
+            call = self._stage_call(run, window)
             active = self._active = ActiveStage(self._context, run, window, call, tuple(finished), before)
             try:
                 active.load_images()
@@ -170,6 +174,29 @@ class HierarchyDriver:
                 active.close()
             finished.append(active.as_finished)
             start += stage.iterations
+
+    def _stage_call(self, run: TrainingRun, window: StageWindow) -> TrainingCall:
+        """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""
+        level = window.stage.level
+        call = self._adapter.stage_call(run.call, window, str(run.archive.path(f"level_{level}")))
+        schedule = self._schedule(run.call)
+        if schedule is None:
+            return call
+        changed = schedule.for_stage(_variables(run.call), call.values, window, self._adapter.info.unscaled)
+        if changed.notes:
+            logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
+        return replace(call, values=changed.arguments(call.values), function=changed.function(call.function))
+
+    def _log_schedule(self, call: TrainingCall) -> None:
+        schedule = self._schedule(call)
+        if schedule is not None:
+            lines = schedule.describe(_variables(call))
+            logger.info("%s acts by iteration: %s", self._adapter.script.path.name, "; ".join(lines) or "nowhere")
+
+    def _schedule(self, call: TrainingCall) -> Schedule | None:
+        """Return the schedule of the script's training function."""
+        tree = self._adapter.script.function(inspect.unwrap(call.function).__name__)
+        return None if tree is None else Schedule(tree)
 
     @property
     def _signs_nothing(self) -> bool:
@@ -194,6 +221,11 @@ class HierarchyDriver:
             archive.close()
             raise
         return archive
+
+
+def _variables(call: TrainingCall) -> dict[str, Any]:
+    """Return what a call's function sees by name: globals and arguments."""
+    return {**inspect.unwrap(call.function).__globals__, **call.values}
 
 
 def _default_folder() -> str:

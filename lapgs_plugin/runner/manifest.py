@@ -82,5 +82,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
         "prune": 0.0,
         "residual_threshold": 1.0,
         "residual_resets": settings.get("hierarchy", residuals) == residuals,
+        "sh_rate": 1.0,
+        "prune_by_size": True,
     }
     return {**before, **values, **settings, **backbone}

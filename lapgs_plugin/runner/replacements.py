@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import wraps
 from typing import Any
@@ -9,9 +10,13 @@ from typing import Any
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
+
+SIZE_LIMIT = "max_screen_size"
+"""Parameter of the family's density control: with None it removes no Gaussian for its size."""
 
 
 class StageReplacements:
@@ -84,6 +89,16 @@ class StageReplacements:
     def _in_model(self, profile: Profile) -> list[Replacement]:
         start = "training() at the start of every iteration"
         control = dict.fromkeys(profile.density_control, self._make_density_control)
+        if not self._context.options.prune_by_size:
+            methods = {name: inspect.signature(getattr(profile.model, name)) for name in control}
+            limited = [name for name, signature in methods.items() if SIZE_LIMIT in signature.parameters]
+            if not limited:
+                raise UserInputError(
+                    f"--no-prune-by-size: densification of {self._context.adapter.info.title} has no {SIZE_LIMIT} to "
+                    "leave out; leave the option out"
+                )
+            for name in limited:
+                control[name] = lambda original: self._make_density_control(_without_size_limit(original))
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
         return [
@@ -170,3 +185,16 @@ class StageReplacements:
             return None
 
         return reset_opacity
+
+
+def _without_size_limit(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a density control method that removes no Gaussian for its size."""
+    signature = inspect.signature(original)
+
+    @wraps(original)
+    def method(*args: Any, **kwargs: Any) -> Any:
+        bound = signature.bind(*args, **kwargs)
+        bound.arguments[SIZE_LIMIT] = None
+        return original(*bound.args, **bound.kwargs)
+
+    return method

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
-from lapgs_plugin.hierarchy.settings import STORAGE, HierarchySettings
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
 from lapgs_plugin.options import option
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
@@ -16,6 +18,18 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
 class RunSettings(HierarchySettings):
     """Choose how `lapgs run` trains a checkout; everything else is the checkout's own."""
 
+    sh_rate: float = option(
+        1.0,
+        "Factor on the backbone's learning rate of SH above degree 0, in every level; for backbones whose script has "
+        "no option for it.",
+        panel=PANEL,
+    )
+    prune_by_size: bool = option(
+        True,
+        "Let the backbone's densification remove Gaussians that are large on screen or in the scene.",
+        panel=PANEL,
+        names=("--prune-by-size/--no-prune-by-size",),
+    )
     fused_adam: bool = option(
         True,
         "Step the backbone's plain Adam optimizers in one kernel a tensor.",
@@ -28,6 +42,11 @@ class RunSettings(HierarchySettings):
         "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
         "folder masks/ if there is one).",
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.sh_rate > 0 and math.isfinite(self.sh_rate)):
+            raise UserInputError(f"--sh-rate {self.sh_rate}: expected a positive factor")
 
     def for_manifest(self) -> dict[str, Any]:
         """Return what the manifest has under "settings"."""

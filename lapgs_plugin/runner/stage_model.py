@@ -16,6 +16,9 @@ from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext, StageResult
 from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
 
+SH_REST = "f_rest"
+"""Parameter group of SH above degree 0 in the family's optimizers."""
+
 
 class StageModel:
     """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
@@ -48,8 +51,11 @@ class StageModel:
             setattr(gaussians, name, value)
 
     def prepare_optimizers(self, gaussians: Any) -> None:
-        """Give the checkout's new optimizers inherited state, and fuse their steps on a GPU."""
+        """Give the checkout's new optimizers inherited state and the rate of SH, and fuse their steps on a GPU."""
         for optimizer in self._adapter.optimizers(gaussians):
+            for group in optimizer.param_groups:
+                if group.get("name") == SH_REST:
+                    group["lr"] *= self._options.sh_rate
             if self._before is not None:
                 self._inherit_moments(optimizer, self._before.moments)
             if self._options.fused_adam and self._device.type == "cuda":

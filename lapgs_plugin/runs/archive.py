@@ -3,6 +3,7 @@
     RUN/manifest.json              everything needed to render the run again
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
+    RUN/level_<l>/exposure.json    colour transforms of the training photos after that level, if exposure is compensated
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
     RUN/preview.jpg                an image that the viewer shows until it can render
@@ -25,7 +26,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
@@ -48,9 +51,13 @@ logger = logging.getLogger(__name__)
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
-PLY, OPTIMIZER = "point_cloud.ply", "optimizer.pt"
+PLY, OPTIMIZER, EXPOSURE = "point_cloud.ply", "optimizer.pt", "exposure.json"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Exposures = dict[str, Annotated[list[Row], Field(min_length=3, max_length=3)]]
+"""Affine colour transforms by photo, three rows of four numbers each: colours of the scene to colours of the photo."""
 
 
 class RunArchive:
@@ -220,6 +227,7 @@ class RunArchive:
         field: GaussianField,
         optimizer_state: dict[str, Any] | None = None,
         trained_along: Mapping[int, GaussianField] | None = None,
+        exposure: Exposures | None = None,
     ) -> None:
         """Write a trained level: first its PLY, then the manifest that lists it; remove its checkpoint.
 
@@ -233,6 +241,7 @@ class RunArchive:
             optimizer_state: for full inheritance, the state that `optimizer_state` returns to the next level; kept
                 until that one is finished.
             trained_along: finished fields after joint training, by level, each with as many Gaussians as before.
+            exposure: colour transforms of the training photos by name; None without compensation.
 
         Raises:
             FieldError: a field holds NaN or inf; nothing is written.
@@ -253,6 +262,8 @@ class RunArchive:
             with one_line_errors(path, training=True):
                 path.parent.mkdir(exist_ok=True)
                 field.save_ply(path)
+            if exposure is not None:
+                self._write_json(str(path.with_name(EXPOSURE)), dict(exposure), training=True)
             if optimizer_state is not None:
                 write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
@@ -287,6 +298,18 @@ class RunArchive:
                 f"{path} does not exist, and the next level continues from it; start again with --overwrite"
             )
         return read_tensors(path, "start again with --overwrite")
+
+    def exposure(self, level: int) -> Exposures | None:
+        """Read the colour transforms of the training photos after a finished level; None without compensation.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        path = self.path(f"level_{level}", EXPOSURE)
+        if not _exists(path):
+            return None
+        found: Exposures = read_json(path, Exposures, error=RunFolderError, advice="train again with --overwrite")
+        return found
 
     def append_history(self, entry: dict[str, Any]) -> None:
         """Append one entry to the history: JSON with finite numbers, with "level" and "iteration"."""
@@ -449,6 +472,7 @@ def _remove_results(folder: Path) -> None:
     for level in folder.glob("level_*/"):
         (level / PLY).unlink(missing_ok=True)
         (level / OPTIMIZER).unlink(missing_ok=True)
+        (level / EXPOSURE).unlink(missing_ok=True)
         for waiting in level.glob(TRAINED_ALONG.format("*")):
             waiting.unlink()
         if not any(level.iterdir()):

@@ -15,7 +15,8 @@ class MeasuringOptions:
 
     test_every: int | None = option(
         None,
-        "Measure held-out PSNR every so many iterations, for the curves of `lapgs report`. Default: at the end.",
+        "Measure held-out PSNR every so many iterations, for the curves of `lapgs report`. Default: at the end; "
+        "`lapgs train` then also measures some held-out views during its stages.",
         panel=PANEL,
         least=1,
     )

@@ -27,6 +27,8 @@ class HistoryEntry(TypedDict):
     elapsed: NotRequired[NonNegativeFloat]
     loss: NotRequired[float]
     psnr: NotRequired[float]
+    sampled_psnr: NotRequired[float]
+    sampled_fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     num_gaussians: NotRequired[NonNegativeInt]
 
@@ -37,6 +39,7 @@ class MetricsOfView(TypedDict):
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     name: str
     psnr: float
+    fitted_psnr: NotRequired[float]
     ssim: float
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]
@@ -66,6 +69,7 @@ class Metrics(TypedDict):
 
     __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     psnr: NotRequired[float]
+    fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]

@@ -53,6 +53,26 @@ class ModelState(TypedDict):
     signed: bool
 
 
+class ExposureState(TypedDict):
+    """Result of `exposure.ViewExposures.state`."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    transforms: Tensor
+    gradient: Tensor | None
+    moments: dict[str, Tensor]
+
+
+class BestState(TypedDict):
+    """The best state of a stage so far, with --keep best."""
+
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+    psnr: float
+    iteration: PositiveInt
+    model: ModelState
+    joint: dict[int, ModelState] | None
+    exposure: ExposureState | None
+
+
 class StageState(TypedDict):
     """Result of `stage.StageRun.state`, and the overhead so far."""
 
@@ -63,6 +83,8 @@ class StageState(TypedDict):
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
+    exposure: NotRequired[ExposureState | None]
+    best: NotRequired[BestState]
     random: Tensor
     random_gpu: NotRequired[Tensor]
     overhead: dict[str, NonNegativeFloat]
@@ -121,6 +143,29 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
         )
 
 
+def check_exposure(state: ExposureState | None, views: int | None, path: Path) -> None:
+    """Check the state of colour transforms.
+
+    Args:
+        state: from a checkpoint; None without transforms.
+        views: number of training views; None if the run has no transforms.
+        path: of the checkpoint, for the message.
+
+    Raises:
+        RunFolderError: it is of another number of views, or damaged.
+    """
+    if state is None and views is None:
+        return
+    shape = torch.Size([views or 0, 3, 4])
+    tensors = [] if state is None else [state["transforms"], state["gradient"], *state["moments"].values()]
+    right = state is not None and views is not None and state["moments"].keys() in (set(), MOMENTS)
+    shapes = ((each, shape if each.ndim else torch.Size([])) for each in tensors if each is not None)
+    if not (right and all(_is_finite(each, wanted, torch.float32) for each, wanted in shapes)):
+        raise RunFolderError(
+            f"{path} is damaged: exposure is not the state of colour transforms for {views or 0} views; {ADVICE}"
+        )
+
+
 def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
     """Check the optimizer state of a finished level against its field.
 
@@ -144,6 +189,12 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
     if iteration > stage.iterations:
         raise ValueError(f"progress.iteration is {iteration}, expected at most {stage.iterations}")
     _check_model(state["model"], "model", stage.signed, settings.sh_degree)
+    if (best := state.get("best")) is not None:
+        if best["iteration"] > iteration:
+            raise ValueError(f"best.iteration is {best['iteration']}, expected at most {iteration}")
+        _check_model(best["model"], "best.model", stage.signed, settings.sh_degree)
+        for level, model in (best["joint"] or {}).items():
+            _check_model(model, f"best.joint.{level}", model["signed"], settings.sh_degree)
     joint = state.get("joint") or {}
     wanted = set(finished) if joint_from is not None and iteration >= joint_from else set()
     if joint.keys() != wanted:

@@ -23,7 +23,8 @@ class Tick:
         loss: smoothed photometric loss.
         num_gaussians: Gaussians being optimized.
         rate: iterations a second since the last tick.
-        psnr: held-out PSNR in dB of the composed image at full resolution; None if it was not measured now.
+        psnr: mean PSNR in dB of all held-out views, composed at full resolution; None if it was not measured now.
+        sampled_psnr, sampled_fitted_psnr: of some held-out views, always the same ones; the latter after a colour fit.
     """
 
     level: int
@@ -33,6 +34,8 @@ class Tick:
     num_gaussians: int
     rate: float
     psnr: float | None = None
+    sampled_psnr: float | None = None
+    sampled_fitted_psnr: float | None = None
 
 
 class Monitor:
@@ -89,7 +92,8 @@ class ProgressMonitor(Monitor):
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         assert self._task is not None
-        self._psnr = tick.psnr if tick.psnr is not None else self._psnr  # measured rarely: the last one stays visible
+        found = tick.sampled_psnr if tick.psnr is None else tick.psnr
+        self._psnr = self._psnr if found is None else found  # measured rarely: the last one stays visible
         held_out = "" if self._psnr is None else f" {self._psnr:.2f} dB"
         figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
         self._progress.update(self._task, completed=tick.iteration, figures=figures)

@@ -18,6 +18,8 @@ PIXELS_OF_A_STEP = 1 << 22
 """Most pixels of all views of one step where the number of views is left to the program."""
 STEPS_OF_A_STAGE = 900
 """Fewest steps of a stage where the program chooses the number of views; a short stage takes fewer views a step."""
+RECOVERY = 300
+"""Iterations that a field needs after a reset of opacities."""
 PIXELS_OF_A_LAUNCH = 1 << 22
 """Pixels of views that are rendered together. More of them would take memory and save no time."""
 
@@ -152,6 +154,20 @@ class StageSchedule:
                 due += (self.gather_from - 1 - due) % self.gather
             found.add(due)
         return frozenset(due for due in found if due < self.iterations)
+
+    def sampled(self, count: int) -> frozenset[int]:
+        """Return so many iterations, evenly spread and ending with the last, after which quality is measured.
+
+        Those that follow a reset of opacities closely come before it instead: no field looks like itself then.
+        """
+        found = set()
+        for index in range(1, count + 1):
+            due = math.ceil(self.iterations * index / count)
+            reset, since = divmod(due, self.reset_every)
+            if reset and due < self.densify_until + RECOVERY and since < RECOVERY and index < count:
+                due -= since + self.views  # the step that ends with the reset is the one after it
+            found.add(max(1, due))
+        return frozenset(found)
 
     def means_learning_rate(self, iteration: int) -> float:
         """Return the step size of positions in units of the scene's extent; its logarithm decays linearly."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.options import check_bounds, option, option_name, options_of
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
@@ -29,6 +30,12 @@ SH_RATE_VIEWS, MOST_SH_RATE = 32, 8.0
 views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
+
+LAST, BEST = "last", "best"
+"""Choices of --keep."""
+ON, OFF = "on", "off"
+EXPOSURES = (AUTO, ON, OFF)
+"""Choices of --exposure."""
 
 ANTIALIASING = "antialiasing"
 """Key of `TrainSettings.raster` for rasterizers and manifests."""
@@ -167,6 +174,17 @@ class TrainSettings(HierarchySettings):
         f"to {SH_RATE_VIEWS} to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
+    exposure: str = option(
+        AUTO,
+        "Learn an affine colour transform for each training photo, for photos whose exposure or white balance change: "
+        "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
+        panel=SCHEDULE,
+    )
+    keep: str = option(
+        LAST,
+        "State that each level archives: last, or best by a few training views, which are then not trained on.",
+        panel=SCHEDULE,
+    )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     ssim_weight: float = 0.2
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -186,6 +204,7 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"sh_every {self.sh_every}: expected at least 1")
         self._check_base()
         self._check_unused()
+        self._check_exposure()
         if self.gather < 1:
             raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         _ = self.asked_views
@@ -213,6 +232,18 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(
                 f"--base-sh-degree {degree} with --inherit full: a level that inherits all coefficients has as "
                 "many; inherit geometry or xyz"
+            )
+
+    def _check_exposure(self) -> None:
+        """Refuse unknown choices, and transforms of an image that is not compared with the photo."""
+        if self.exposure not in EXPOSURES:
+            raise UserInputError(f"--exposure {self.exposure}: expected {', '.join(EXPOSURES)}")
+        if self.keep not in (LAST, BEST):
+            raise UserInputError(f"--keep {self.keep}: expected {LAST} or {BEST}")
+        if self.exposure == ON and not SUPERVISIONS[self.supervision].composes:
+            raise UserInputError(
+                f"--exposure on with --supervision {self.supervision}: that compares residuals, which have no "
+                "exposure; leave one out"
             )
 
     def _check_unused(self) -> None:
@@ -262,7 +293,10 @@ class TrainSettings(HierarchySettings):
     @property
     def paper_settings(self) -> Mapping[str, object]:
         """See `HierarchySettings.paper_settings`."""
-        return {**super().paper_settings, "gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0}
+        return {
+            **super().paper_settings,
+            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF},
+        }
 
     def sh_degree_of(self, stage: Stage) -> int:
         """Return the highest SH degree of a stage's field."""
@@ -362,7 +396,7 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
     **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
-    "protocol": "default",
+    **{"protocol": "default", "exposure": OFF, "keep": LAST},
 }
 """Settings that older manifests do not name, with the values they had."""
 

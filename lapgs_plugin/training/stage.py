@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -30,6 +30,7 @@ from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
@@ -103,6 +104,7 @@ class StageRun:
         joint_from: the iteration from which finished fields are trained jointly; None if they never are.
         unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: finished fields while they are trained jointly; None before.
+        exposures: colour transforms of the training views; None without compensation of exposure.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
@@ -126,6 +128,7 @@ class StageRun:
     joint_from: int | None = None
     unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
+    exposures: ViewExposures | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
@@ -184,6 +187,11 @@ class StageRun:
         """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
         return self.progress.iteration % every < self.step_views or self.progress.iteration == self.stage.iterations
 
+    def reached(self, iterations: Collection[int]) -> bool:
+        """Return whether the last step had one of some iterations."""
+        last = self.progress.iteration
+        return any(iteration in iterations for iteration in range(last - self.step_views + 1, last + 1))
+
     @property
     def num_optimized(self) -> int:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
@@ -241,6 +249,8 @@ class StageRun:
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.joint is not None:
             self.joint.step(means_rate, rest, scale)
+        if self.exposures is not None:
+            self.exposures.after_step(last, len(iterations))
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -280,6 +290,8 @@ class StageRun:
         for model in models:
             for param in model.params.values():
                 param.grad = None
+        if self.exposures is not None:
+            self.exposures.forget_gradients()
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
@@ -324,7 +336,11 @@ class StageRun:
             compose = self.accumulated.adder(names)
         else:
             compose = partial(add_prediction, accumulated=self._prediction(names))
-        return lambda rendered: [photometric_loss(compose(rendered), target, self.settings.ssim_weight)]
+
+        def losses(rendered: Tensor) -> list[Tensor]:
+            return [photometric_loss(self._exposed(names, compose(rendered)), target, self.settings.ssim_weight)]
+
+        return losses
 
     def _hooked_losses(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
         """Return what computes the losses of some views by all hooks, from their renders."""
@@ -334,9 +350,13 @@ class StageRun:
         self._context = contexts[-1]
 
         def losses(rendered: Tensor) -> list[Tensor]:
-            images = [rendered] if len(contexts) == 1 else rendered.unbind()
-            pairs = zip(contexts, images, strict=True)
-            return [self.hooks.loss(context, self.hooks.compose(context, image)) for context, image in pairs]
+            parts = (
+                [(names, rendered)] if len(contexts) == 1 else zip(([name] for name in names), rendered, strict=True)
+            )
+            return [
+                self.hooks.loss(context, self._exposed(shown, self.hooks.compose(context, image)))
+                for context, (shown, image) in zip(contexts, parts, strict=True)
+            ]
 
         return losses
 
@@ -388,6 +408,10 @@ class StageRun:
             return result.image, result
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
+    def _exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
+        """Return the composed image of a view, or images of several, at the exposure of their photos."""
+        return image if self.exposures is None else self.exposures.apply(names, image)
+
     def _is_joint(self, iteration: int) -> bool:
         """Return whether finished fields are trained jointly in an iteration."""
         return self.joint_from is not None and iteration >= self.joint_from
@@ -436,9 +460,8 @@ class StageRun:
                 image = render_image(self.rasterizer, field, view.camera, self.background, degree)
                 below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
                 self.breakdown.mark("densification")
-                whole = fill_outside(
-                    image if below is None else image + below, target, self.images.get_weights([view.name])
-                )
+                composed = self._exposed([view.name], image if below is None else image + below)
+                whole = fill_outside(composed, target, self.images.get_weights([view.name]))
                 loss = photometric_loss(whole, target, self.settings.ssim_weight)
             return ScoredView(
                 render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
@@ -490,6 +513,7 @@ class StageRun:
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "joint": None if self.joint is None else self.joint.state(),
+            "exposure": None if self.exposures is None else self.exposures.state(),
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -508,6 +532,9 @@ class StageRun:
         if (joint := state.get("joint")) is not None:
             assert self.unfreeze is not None
             self.joint = self.unfreeze(joint)
+        if (exposure := state.get("exposure")) is not None:
+            assert self.exposures is not None, "the trainer looks for it"
+            self.exposures.restore(exposure)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)

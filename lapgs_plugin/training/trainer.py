@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from statistics import fmean
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
@@ -38,13 +40,25 @@ from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
+from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments
+from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_exposure, check_moments
+from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.quality import (
+    SAMPLED_VIEWS,
+    SAMPLES_OF_A_STAGE,
+    SAMPLES_TO_KEEP_BEST,
+    QualityWatch,
+    copied,
+    require_views_to_set_aside,
+    set_aside,
+    spread_views,
+)
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import BEST, OFF, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.views import level_views
 
@@ -65,12 +79,15 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         views: number of training views; None if unknown.
 
     Raises:
-        UserInputError: levels, split and image size do not go together, or a step takes more views than there are.
+        UserInputError: levels, split and image size do not go together, or there are too few views for a step or for
+            --keep best.
     """
     if views is not None and (asked := settings.asked_views or 1) > views:
         raise UserInputError(
             f"--views-per-step {asked}: the scene has {views} training views; give at most as many, or auto"
         )
+    if views is not None and settings.keep == BEST:
+        require_views_to_set_aside(views)
     return StagePlan.create(size, settings.iterations, settings.levels, settings.shares, settings.kind)
 
 
@@ -135,7 +152,8 @@ class Trainer:
         monitor: shows progress.
         checkpoint_every: iterations between two checkpoints; None writes one every minute. One is also written when the
             user stops a run.
-        test_every: iterations between two measurements of held-out PSNR; None measures it at the end of each stage.
+        test_every: iterations between two measurements of all held-out views; None measures all at the end of each
+            stage, and some of them a few times before.
         breakdown: measure the parts of iterations.
         gpu_busy: profile some iterations of each stage; needs a CUDA device.
         watcher: looks at the fields between iterations.
@@ -155,13 +173,20 @@ class Trainer:
     watcher: Watcher = field(default_factory=Watcher)
 
     def __post_init__(self) -> None:
-        self.plan = make_plan(self.scene.smallest_size, self.settings, len(self.scene.train))
+        views = len(self.scene.train)
+        self._aside = set_aside(self.scene.train) if self.settings.keep == BEST else []
+        aside = {view.name for view in self._aside}
+        self.scene = replace(self.scene, train=tuple(view for view in self.scene.train if view.name not in aside))
+        self.plan = make_plan(self.scene.smallest_size, self.settings, views)
         self._pyramid = Pyramid(self.settings.grid)
         self._supervision = SUPERVISIONS[self.settings.supervision]
         check_storage(self.settings, self.device)
         if self.gpu_busy:
             require_cuda(self.device)
         self._overhead = Overhead()
+        self._quality = QualityWatch()
+        self._best: dict[str, Any] | None = None  # the stage's best state so far, see `checkpoint.BestState`
+        self._samples: frozenset[int] = frozenset()  # iterations of the stage after which some views are measured
         self._images: LevelImages | None = None
         self._train_cache: UpsampledImages | None = None
         self._test_cache: UpsampledImages | None = None
@@ -208,6 +233,39 @@ class Trainer:
             check_checkpoint(state, path, stage, self.settings, self.archive.available_levels)
         return state
 
+    def _exposures(self, stage: Stage, checkpoint: dict[str, Any] | None) -> ViewExposures | None:
+        """Return the colour transforms that a stage starts with; None if the run does not compensate exposure."""
+        names, levels = [view.name for view in self.scene.train], self.archive.available_levels
+        start: Tensor | None
+        if levels:
+            archived = self.archive.exposure(levels[-1])
+            start = None if archived is None else start_from(archived, names)
+        elif checkpoint is not None:  # `restore` has the values
+            start = None if checkpoint.get("exposure") is None else identities(len(names))
+        else:
+            with self._overhead.timed("exposure"):
+                start = self._first_exposures()
+        if start is None:
+            return None
+        done = sum(each.iterations for each in self.plan if each.level > stage.level)
+        return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
+
+    def _first_exposures(self) -> Tensor | None:
+        """Return the colour transforms (v, 3, 4) that the run starts with, as --exposure says and the photos differ."""
+        choice = self.settings.exposure
+        if choice == OFF or not self._supervision.composes:
+            return None
+        measured = measure_exposure(self.scene)
+        found, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
+        if choice == AUTO and not differ:
+            return None
+        self.monitor.say(
+            f"exposure differs by {found}: each photo gets a colour transform; --exposure off trains without"
+            if differ
+            else f"exposure differs by {found}, hardly at all; each photo gets a colour transform all the same"
+        )
+        return from_gains(measured.gains) if differ else identities(len(self.scene.train))
+
     def _moments(self, level: int, field: GaussianField) -> dict[str, Any]:
         """Return Adam's state that the next level inherits from a finished one with its field."""
         moments = self.archive.optimizer_state(level)
@@ -218,10 +276,14 @@ class Trainer:
         """Train and archive one stage."""
         self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
         self._memory = PeakMemory(self.device)
-        run = self._prepare(stage, self._first_model(stage, checkpoint))
+        run = self._prepare(stage, self._first_model(stage, checkpoint), checkpoint)
+        self._samples = run.schedule.sampled(SAMPLES_OF_A_STAGE if not self._aside else SAMPLES_TO_KEEP_BEST)
+        self._best = None if checkpoint is None else checkpoint.get("best")
         if checkpoint is not None:
             path = self.archive.path(CHECKPOINT)
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
+            views = None if run.exposures is None else len(run.exposures.names)
+            check_exposure(checkpoint.get("exposure"), views, path)
             run.restore(checkpoint)
             if self.breakdown and not run.breakdown.measures:
                 self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
@@ -271,8 +333,8 @@ class Trainer:
         """Return whether the next stage inherits Adam's state from this one."""
         return stage.level > 0 and self.settings.inherit_mode == "full"
 
-    def _prepare(self, stage: Stage, model: TrainableField) -> StageRun:
-        """Return a stage that is ready to train a model."""
+    def _prepare(self, stage: Stage, model: TrainableField, checkpoint: dict[str, Any] | None) -> StageRun:
+        """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
         batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         schedule = StageSchedule.create(
@@ -308,6 +370,7 @@ class Trainer:
             densifier=self.settings.strategy_of(stage).density_control(schedule, self.scene.extent),
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
+            exposures=self._exposures(stage, checkpoint),
             breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
@@ -329,7 +392,7 @@ class Trainer:
 
         return JointFields(
             models={level: model(level) for level in self.archive.available_levels},
-            cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test)},
+            cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test, *self._aside)},
             rasterizer=self.rasterizer,
             background=torch.tensor(self.scene.background).to(self.device),
             pyramid=self._pyramid,
@@ -343,7 +406,7 @@ class Trainer:
         with self._overhead.timed("cache"):
             self._train_cache = self._predictions(stage, self.scene.train, TRAIN)
         with self._overhead.timed("evaluation"):
-            self._test_cache = self._predictions(stage, self.scene.test, TEST)
+            self._test_cache = self._predictions(stage, [*self.scene.test, *self._aside], TEST)
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
         """Return Up(I_hat^(l+1)) of each view, for the stage of level l."""
@@ -398,12 +461,16 @@ class Trainer:
         iteration = run.progress.iteration
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
+        due_sample = run.reached(self._samples)
         due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
-        if due_test or due_tick or stop.requested:
+        if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
-        psnr = self._held_out_psnr(run) if due_test and self.scene.test else None
-        if psnr is not None or due_tick:
-            self._tick(run, psnr)
+        measured = self._held_out(run, due_test, due_sample and self.test_every is None)
+        if due_sample and self._aside:
+            self._note_best(run)
+        if measured or due_tick:
+            self._tick(run, measured)
+        self._watch_quality(run, measured)
         if self.watcher.wants_look():
             run.settle()
             with self._overhead.timed("view"):
@@ -421,7 +488,7 @@ class Trainer:
             return run.progress.iteration % self.checkpoint_every < run.step_views
         return time.monotonic() - self._last_checkpoint >= CHECKPOINT_SECONDS
 
-    def _tick(self, run: StageRun, psnr: float | None) -> None:
+    def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self._last_tick
         progress = run.progress
         self._last_tick = (progress.seconds, progress.iteration)
@@ -433,34 +500,88 @@ class Trainer:
             loss=progress.loss,
             num_gaussians=run.num_optimized,
             rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
-            psnr=psnr,
+            **measured,
         )
         self.archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
         self.monitor.tick(run.stage, tick)
 
+    def _held_out(self, run: StageRun, every: bool, sample: bool) -> dict[str, float]:
+        """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
+        some = spread_views(self.scene.test, SAMPLED_VIEWS) if self.scene.test and sample else []
+        views = self.scene.test if every else some
+        with self._overhead.timed("evaluation") if views else nullcontext():
+            found = {view.name: self._psnr(run, view) for view in views}
+        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
+        if some:
+            plain, fitted = zip(*(found[view.name] for view in some), strict=True)
+            measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}
+        return measured
+
     @torch.no_grad()
-    def _held_out_psnr(self, run: StageRun) -> float:
-        """Return the mean PSNR in dB of the held-out views, composed so far and upsampled to full resolution."""
+    def _psnr(self, run: StageRun, view: View) -> tuple[float, float]:
+        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, as it is and fitted."""
+        camera = level_camera(view.camera, run.stage.level)
+        image = self.rasterizer(run.model.field, camera, background=run.background).image
+        cached = None if self._test_cache is None else self._test_cache.get
+        predict = cached if run.joint is None else run.joint.predict
+        image = add_prediction(image, None if predict is None else predict(view.name))
+        whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
+        mask = None if view.mask is None else view.mask.to(self.device)
+        photo = view.image.to(self.device)
+        return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
+
+    def _note_best(self, run: StageRun) -> None:
+        """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
         with self._overhead.timed("evaluation"):
-            values = []
-            for view in self.scene.test:
-                camera = level_camera(view.camera, run.stage.level)
-                image = self.rasterizer(run.model.field, camera, background=run.background).image
-                cached = None if self._test_cache is None else self._test_cache.get
-                predict = cached if run.joint is None else run.joint.predict
-                image = add_prediction(image, None if predict is None else predict(view.name))
-                whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
-                mask = None if view.mask is None else view.mask.to(self.device)
-                values.append(psnr(whole, view.image.to(self.device), mask))
-            return math.fsum(values) / len(values)
+            fitted = run.exposures is not None
+            found = fmean(self._psnr(run, view)[fitted] for view in self._aside)
+            if self._best is None or found > self._best["psnr"]:
+                state = run.state()
+                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure")}
+                self._best = {"psnr": found, "iteration": run.progress.iteration, **parts}
+            if run.progress.iteration == run.stage.iterations and self._best["iteration"] < run.stage.iterations:
+                self.monitor.say(
+                    f"level {run.stage.level}: archives the state after iteration {self._best['iteration']} of "
+                    f"{run.stage.iterations}, {self._best['psnr'] - found:.2f} dB better than the last one on "
+                    f"{len(self._aside)} training views that were set aside"
+                )
+
+    def _take_best(self, run: StageRun) -> None:
+        """Return to the best state of a finished stage."""
+        best = self._best
+        if best is None or best["iteration"] == run.stage.iterations:
+            return
+        settings = self.settings
+        run.model = TrainableField.from_state(
+            best["model"], settings.rates, self.scene.extent, device=self.device, sparse=settings.sparse_adam
+        )
+        run.joint = None if best["joint"] is None else self._unfreeze(best["joint"])
+        if run.exposures is not None:
+            run.exposures.restore(best["exposure"])
+
+    def _watch_quality(self, run: StageRun, measured: Mapping[str, float]) -> None:
+        """Say it if held-out views got worse while the training loss fell."""
+        key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
+        found, level = measured.get(key), run.stage.level
+        if found is None or not self._quality.falls(level, found, run.progress.loss):
+            return
+        helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
+        if run.exposures is None and self._supervision.composes:
+            helps.insert(0, "--exposure on if brightness or colours of the photos change")
+        self.monitor.say(
+            f"level {level}, iteration {run.progress.iteration}: held-out PSNR fell to {found:.1f} dB from "
+            f"{self._quality.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
+        )
 
     def _save_checkpoint(self, run: StageRun) -> None:
         with self._overhead.timed("checkpoints"):
-            self.archive.save_checkpoint({**run.state(), "overhead": dict(self._overhead)})
+            kept = {} if self._best is None else {"best": self._best}
+            self.archive.save_checkpoint({**run.state(), **kept, "overhead": dict(self._overhead)})
         self._last_checkpoint = time.monotonic()
 
     def _finish(self, run: StageRun) -> None:
         """Archive a finished stage."""
+        self._take_best(run)
         field = run.model.field.detach()
         record = LevelRecord(
             level=run.stage.level,
@@ -477,7 +598,9 @@ class Trainer:
             gpu_busy_seconds=run.busy.seconds(),
         )
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
-        self.archive.finish_level(record, field, moments, None if run.joint is None else run.joint.fields)
+        along = None if run.joint is None else run.joint.fields
+        exposure = None if run.exposures is None else run.exposures.archived()
+        self.archive.finish_level(record, field, moments, along, exposure)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property

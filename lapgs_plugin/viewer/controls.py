@@ -188,4 +188,5 @@ class Controls:
     def _band_name(self, level: int) -> str:
         if self._run.renderer.levels == 1:
             return "level 0"
-        return f"level {level}, {'base' if level == self._run.renderer.levels - 1 else 'residual'}"
+        base = level == self._run.renderer.levels - 1
+        return f"level {level}, {'base' if base else 'field' if self._run.renderer.nested else 'residual'}"

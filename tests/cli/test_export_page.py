@@ -65,11 +65,11 @@ def test_the_page_is_one_file_with_the_splats(run: Path) -> None:
 
 def test_pages_that_cannot_be_made_are_one_line(tmp_path: Path) -> None:
     residuals = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
-    with pytest.raises(UserInputError, match="level 0 is a residual"):
+    with pytest.raises(UserInputError, match="level 0 is a residual, which no viewer shows by itself; add --merge"):
         lapgs_export(residuals, "--html")
     with pytest.raises(UserInputError, match="--format does not go with --html"):
         lapgs_export(residuals, "--html", "--format", "spz")
-    with pytest.raises(UserInputError, match="--scene needs --html"):
+    with pytest.raises(UserInputError, match="--scene needs --merge or --html"):
         lapgs_export(residuals, "--scene", tmp_path)
     assert not (residuals / "export").exists()
 

@@ -20,6 +20,7 @@ from lapgs_plugin.cli.render import render
 from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.rendering.images import caption_height
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import read_image
 from tests.cli.commands import succeeding
@@ -60,8 +61,11 @@ def test_exr_files_add_up_and_png_files_show_them(run: Path) -> None:
 def test_compare_puts_photo_and_composition_side_by_side(run: Path, scene: Path) -> None:
     lapgs("render", run, "--compare")
     folder = run / "renders" / "test" / "photos"
-    compare = cv2.imread(str(folder / "08_compare.png")).astype(int)
     photo, composed = cv2.imread(str(scene / "photos" / "08.png")), cv2.imread(str(folder / "08_composed.png"))
+    whole = cv2.imread(str(folder / "08_compare.png")).astype(int)
+    captions, compare = np.split(whole, [caption_height(len(photo))])
+    words = [(captions[:, start : start + 56] < 128).any() for start in (0, 56, 112)]
+    assert all(words), "each panel has its name"
     np.testing.assert_array_equal(compare[:, :56], photo)
     np.testing.assert_array_equal(compare[:, 56:112], composed)
     expected = 127.5 + (composed.astype(int) - photo.astype(int)) / 2

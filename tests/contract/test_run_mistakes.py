@@ -213,7 +213,9 @@ def test_lpips_of_a_report_is_tried_before_training(scene: Path, tmp_path: Path)
 def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_path: Path) -> None:
     """Every Gaussian turns transparent in the second stage, just before the backbone prunes."""
     folder = tmp_path / "run"
-    method = {"fastgs": "final_prune_fastgs", "taming": "densify_with_score", "graphdeco": "densify_and_prune"}[name]
+    method = {"fastgs": "densify_and_prune_fastgs", "taming": "densify_with_score", "graphdeco": "densify_and_prune"}[
+        name
+    ]
     with captured(tmp_path, []), loaded(STUBS[name], scene, folder) as adapter:
         model = adapter.train.GaussianModel
         original = getattr(model, method)

@@ -19,6 +19,7 @@ from lapgs_plugin.experiments import commands
 from lapgs_plugin.experiments.commands import Locations, run_steps
 from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
 from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.experiments.standard import PRESETS
 from tests.experiments.examples import SMALL, run_spec
 
 
@@ -91,6 +92,19 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
         found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
         assert found == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
         assert specs["residuals"].run_id == specs["default"].run_id != specs["nested"].run_id
+
+
+def test_a_variant_may_have_a_preset_of_its_own() -> None:
+    variants = [
+        {"name": "bare", "method": "bare"},
+        {"name": "own", "preset": {"fast": "graphdeco.ours"}, "options": {"sh_rate": 3.0}},
+    ]
+    planned = plan_runs(experiment(variants=variants), Selection(backbones=["fast"], scenes=["a"], seeds=[0]))
+    bare, own = (run.spec for run in planned)
+    assert bare.arguments == list(PRESETS["fastgs.big"].common)
+    assert own.arguments == list(PRESETS["graphdeco.ours"].common)
+    assert bare.options == {}
+    assert own.options == {"hierarchy": "laplacian", "prune_by_size": False, "sh_rate": 3.0}, "the variant's own last"
 
 
 def test_only_selected_runs_are_planned() -> None:

@@ -1,4 +1,4 @@
-"""Our gradients of blending against autograd in float64, interpreted or compiled, and against gsplat's on a GPU."""
+"""Our kernels that blend against autograd in float64, interpreted or compiled, and against gsplat's on a GPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 CHECKS = """
 import torch
-from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward
+from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward, blend_forward
 
 def blended(means, conics, colors, opacities, background, offsets, flat, height, width):
     # Every pixel blends the pairs of its tile, in order.
@@ -59,10 +59,15 @@ def check(shapes, cameras, count, height, width, absolute, limit):
     images, last = blended(*leaves, background.double(), offsets, flat, height, width)
     expected = torch.autograd.grad((images * by_images).sum(), leaves)
     assert int(last.max()) < len(flat) - 1 or count < 60  # pixels end before the last Gaussian of a long list
-    given = [each.to(DEVICE) for each in (means, conics, colors, opacities, offsets, flat, last)]
-    given += [images.detach().float().to(DEVICE), by_images.to(DEVICE)]
+    by_images, images = (each.permute(0, 2, 3, 1).detach().float().contiguous() for each in (by_images, images))
     for shape in shapes:
-        whole, *found = blend_backward(*given, absolute, shape)
+        splats = [each.to(DEVICE) for each in (means, conics, colors, opacities)]
+        tiles = offsets.to(DEVICE), flat.to(DEVICE)
+        image, counts = blend_forward(*splats, background.to(DEVICE), *tiles, (width, height), shape)
+        off = float((image.cpu() - images).abs().max())
+        print(shape, cameras, count, f"images {off:.1e}")
+        assert off < limit
+        whole, *found = blend_backward(*splats, *tiles, counts, image, by_images.to(DEVICE), absolute, shape)
         for one, other in zip(found, expected, strict=True):
             one, other = one.cpu().view_as(other), other.nan_to_num()
             worst = float((one - other).abs().max() / other.abs().max())
@@ -75,17 +80,17 @@ def check(shapes, cameras, count, height, width, absolute, limit):
             assert whole is found[0]
 
 check([Shape(8, 8, 4, 1)], 2, 7, 5, 21, True, 1e-5)  # worst seen 1.6e-6
-check([Shape()], 1, 60, 5, 21, False, 1e-5)  # worst seen 1.4e-6
+check([Shape()], 1, 60, 5, 21, False, 2e-5)  # worst seen 4.7e-6
 if DEVICE == "cuda":
     shapes = [Shape(*each) for each in ((8, 8, 4, 2), (8, 4, 4, 4), (8, 4, 4, 2), (16, 4, 2, 4), (16, 16, 4, 1, 2))]
-    # An alpha that is FAINTEST up to rounding counts in one of both.
+    # An alpha that is FAINTEST up to rounding may count in one of both; an H200 has 1.9e-6.
     check(shapes, 2, 100, 37, 50, True, 1e-3)
     check(shapes, 1, 500, 21, 35, False, 1e-3)
 
     from lapgs_plugin.rasterizers.gsplat.blend_gradients import triton_works
     found = triton_works.difference(torch.device(DEVICE))
     print("from gsplat", found)
-    assert found < 1e-3
+    assert found < 1e-3  # worst seen 6.4e-5, of gradients on an H200
 """
 
 

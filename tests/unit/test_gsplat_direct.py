@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers.gsplat import blend_gradients
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import GSPLAT, SWITCH, TRITON, triton_works
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
@@ -66,6 +67,7 @@ def test_images_gradients_and_what_densification_sees(
     degree: int, active: int, signed: bool, own_radii: bool, gradients: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(SWITCH, gradients)
+    monkeypatch.setattr(blend_gradients, "FEWEST_PIXELS", 0)
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
     found = []
@@ -134,6 +136,7 @@ def test_several_views_are_those_of_single_calls(
     views: int, degree: int, active: int, signed: bool, gradients: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(SWITCH, gradients)
+    monkeypatch.setattr(blend_gradients, "FEWEST_PIXELS", 0)
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(views, 3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
     cameras = [moved(0.1 * index) for index in range(views)]

@@ -1,9 +1,9 @@
 """Compute the photometric loss on a GPU in two kernels, one for the loss and one for its gradient.
 
-A program of 128 threads takes a strip of an image row, 128 values of interleaved colours, and walks down the rows. Each
-thread filters a row across from its neighbours in memory, which the L1 cache holds, and down in registers: it adds the
-row to the ten sums of output rows that are not complete. No filtered image is written. The loss's kernel writes three
-maps, the derivatives of SSIM by the local means; the gradient's kernel filters them the same way.
+A program of 128 threads takes a strip of the image and walks down its rows; a thread has two neighbouring columns of a
+colour. It filters a row across from its neighbours in memory, which the L1 cache holds, and down in registers: it adds
+the row to the ten sums of output rows that are not complete. No filtered image is written. The loss's kernel writes
+three maps, the derivatives of SSIM by the local means; the gradient's kernel filters them the same way.
 """
 
 from __future__ import annotations
@@ -40,6 +40,15 @@ OF_ANY_VALUE = (
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _place(width: int, colors: tl.constexpr, interleaved: tl.constexpr, block: tl.constexpr, beyond: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Return the first of two columns of each thread, and its colour; neighbouring threads are neighbours in memory."""
+    places, pairs = tl.program_id(0) * block + tl.arange(0, block), (width + 1) // 2
+    color = places % colors if interleaved else places // pairs
+    column = 2 * (places // colors if interleaved else places % pairs)
+    return tl.where(places < pairs * colors, column, width + beyond), color
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _shifted(sums: tl.tuple, row: tl.tensor, window: tl.constexpr, radius: tl.constexpr) -> tl.tuple:
     """Add a row to the sums of output rows that are not complete: (the complete one, the others with a new one)."""
     after = ()
@@ -48,68 +57,84 @@ def _shifted(sums: tl.tuple, row: tl.tensor, window: tl.constexpr, radius: tl.co
     return sums[0] + window[2 * radius] * row, after + (window[0] * row,)  # noqa: RUF005  # Triton compiles no stars
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _ssim(
+    mean: tl.tensor, mean_y: tl.tensor, squares: tl.tensor, products: tl.tensor, c1: tl.constexpr, c2: tl.constexpr
+) -> tl.tuple:  # fmt: skip
+    """Return SSIM and its derivatives by the local means of x, x squared and x y; `squares` is that of x^2 + y^2."""
+    means, both = mean * mean + mean_y * mean_y, mean * mean_y
+    luminance, structure = 2.0 * both + c1, 2.0 * (products - both) + c2
+    of_means, of_variances = 1.0 / (means + c1), 1.0 / (squares - means + c2)
+    per = of_means * of_variances
+    ssim = luminance * structure * per
+    slope = 2.0 * (mean_y * (structure - luminance) * per + mean * ssim * (of_variances - of_means))
+    return ssim, slope, -ssim * of_variances, 2.0 * luminance * per
+
+
 @triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, x_column: tl.constexpr,
     y_image: int, y_plane: int, y_row: int, y_column: tl.constexpr,
-    c1: tl.constexpr, c2: tl.constexpr,
+    c1: tl.constexpr, c2: tl.constexpr, interleaved: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the derivatives of SSIM by the local means of x, x squared and x y, and add to the loss.
 
     Args:
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
-        by_mean, by_square, by_product: (images, height, width * colors).
+        by_mean, by_square, by_product: with the strides of x.
         total: the loss.
         scale: of y.
     """
-    places = tl.program_id(0) * block + tl.arange(0, block)  # in a row of interleaved colours
-    column, color = places // colors, places % colors
+    column, color = _place(width, colors, interleaved, block, 2 * radius)
     image = tl.program_id(2).to(tl.int64)
     first = tl.program_id(1) * rows
     last = tl.minimum(first + rows, height)
-    of_x = x + image * x_image + color * x_plane + column * x_column
+    at_x = image * x_image + color * x_plane + column * x_column
     of_y = y + image * y_image + color * y_plane + column * y_column
-    out = image * height * width * colors + places
-    zero = tl.zeros((block,), tl.float32)
-    sums_x = (zero,) * (2 * radius)
-    sums_y, sums_square, sums_product, loss = sums_x, sums_x, sums_x, zero
+    out, inside = tl.join(at_x, at_x + x_column), tl.join(column < width, column + 1 < width)  # (block, 2)
+    zero, zeros = tl.zeros((block,), tl.float32), tl.zeros((block, 2), tl.float32)
+    sums_x = (zeros,) * (2 * radius)
+    sums_y, sums_square, sums_product, loss = sums_x, sums_x, sums_x, zeros
     row = first - radius
     while row < last + radius:  # `range` of a tensor cannot be interpreted
         limit = tl.where((row >= 0) & (row < height), width, 0)  # of the columns; none outside of the image
-        own = tl.where((row >= first) & (row < last), l1_weight, 0.0)
-        row_x, row_y, square, product = zero, zero, zero, zero
-        for tap in tl.static_range(2 * radius + 1):
-            there = (column + (tap - radius)).to(tl.uint32) < limit.to(tl.uint32)
-            one = tl.load(of_x + row.to(tl.int64) * x_row + (tap - radius) * x_column, there, 0.0)
-            other = tl.load(of_y + row.to(tl.int64) * y_row + (tap - radius) * y_column, there, 0)
+        x0, x1, y0, y1, square0, square1, product0, product1 = zero, zero, zero, zero, zero, zero, zero, zero
+        difference0, difference1 = zero, zero
+        for near in tl.static_range(2 * radius + 2):
+            there = (column + (near - radius)).to(tl.uint32) < limit.to(tl.uint32)
+            one = tl.load(x + at_x + row.to(tl.int64) * x_row + (near - radius) * x_column, there, 0.0)
+            other = tl.load(of_y + row.to(tl.int64) * y_row + (near - radius) * y_column, there, 0)
             other = other.to(tl.float32) * scale
-            weighted, weighted_other = window[tap] * one, window[tap] * other
-            row_x += weighted
-            row_y += weighted_other
-            square += weighted * one + weighted_other * other
-            product += weighted * other
-            if tap == radius:
-                loss += own * tl.abs(one - other)
-        mean, sums_x = _shifted(sums_x, row_x, window, radius)
-        mean_y, sums_y = _shifted(sums_y, row_y, window, radius)
-        squares, sums_square = _shifted(sums_square, square, window, radius)
-        products, sums_product = _shifted(sums_product, product, window, radius)
+            square, product = one * one + other * other, one * other
+            if near <= 2 * radius:
+                x0 += window[near] * one
+                y0 += window[near] * other
+                square0 += window[near] * square
+                product0 += window[near] * product
+            if near > 0:
+                x1 += window[near - 1] * one
+                y1 += window[near - 1] * other
+                square1 += window[near - 1] * square
+                product1 += window[near - 1] * product
+            if near == radius:
+                difference0 = tl.abs(one - other)
+            if near == radius + 1:
+                difference1 = tl.abs(one - other)
+        loss += tl.where((row >= first) & (row < last), l1_weight, 0.0) * tl.join(difference0, difference1)
+        mean, sums_x = _shifted(sums_x, tl.join(x0, x1), window, radius)
+        mean_y, sums_y = _shifted(sums_y, tl.join(y0, y1), window, radius)
+        squares, sums_square = _shifted(sums_square, tl.join(square0, square1), window, radius)
+        products, sums_product = _shifted(sums_product, tl.join(product0, product1), window, radius)
         if row >= first + radius:
-            inside = column < width
-            means, both = mean * mean + mean_y * mean_y, mean * mean_y
-            luminance, structure = 2.0 * both + c1, 2.0 * (products - both) + c2
-            of_means, of_variances = 1.0 / (means + c1), 1.0 / (squares - means + c2)
-            per = of_means * of_variances
-            ssim = luminance * structure * per
+            ssim, slope, curvature, share = _ssim(mean, mean_y, squares, products, c1, c2)
             loss -= tl.where(inside, ssim_weight * ssim, 0.0)
-            here = out + (row - radius).to(tl.int64) * (width * colors)
-            slope = 2.0 * (mean_y * (structure - luminance) * per + mean * ssim * (of_variances - of_means))
+            here = out + (row - radius).to(tl.int64) * x_row
             tl.store(by_mean + here, slope, inside)
-            tl.store(by_square + here, -ssim * of_variances, inside)
-            tl.store(by_product + here, 2.0 * luminance * per, inside)
+            tl.store(by_square + here, curvature, inside)
+            tl.store(by_product + here, share, inside)
         row += 1
     tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
 
@@ -120,39 +145,45 @@ def _gradient_kernel(
     by_loss: tl.tensor, gradient: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, x_column: tl.constexpr,
-    y_image: int, y_plane: int, y_row: int, y_column: tl.constexpr,
+    y_image: int, y_plane: int, y_row: int, y_column: tl.constexpr, interleaved: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the gradient by x, with the strides of x; arguments as `_loss_kernel` takes them."""
-    places = tl.program_id(0) * block + tl.arange(0, block)
-    column, color = places // colors, places % colors
+    column, color = _place(width, colors, interleaved, block, 2 * radius)
     image = tl.program_id(2).to(tl.int64)
     first = tl.program_id(1) * rows
     last = tl.minimum(first + rows, height)
-    of_x = image * x_image + color * x_plane + column * x_column
-    of_y = image * y_image + color * y_plane + column * y_column
-    of_maps = image * height * width * colors + places
+    at_x = image * x_image + color * x_plane + column * x_column
+    at_y = image * y_image + color * y_plane + column * y_column
+    # (block, 2) each
+    of_x, of_y = tl.join(at_x, at_x + x_column), tl.join(at_y, at_y + y_column)
+    inside = tl.join(column < width, column + 1 < width)
     factor = tl.load(by_loss)
     l1_weight, ssim_weight = l1_weight * factor, ssim_weight * factor
     zero = tl.zeros((block,), tl.float32)
-    sums_mean = (zero,) * (2 * radius)
+    sums_mean = (tl.zeros((block, 2), tl.float32),) * (2 * radius)
     sums_square, sums_product = sums_mean, sums_mean
     row = first - radius
-    while row < last + radius:  # `range` of a tensor cannot be interpreted
+    while row < last + radius:
         limit = tl.where((row >= 0) & (row < height), width, 0)
-        here = of_maps + row.to(tl.int64) * (width * colors)
-        mean, square, product = zero, zero, zero
-        for tap in tl.static_range(2 * radius + 1):
-            there = (column + (tap - radius)).to(tl.uint32) < limit.to(tl.uint32)
-            near = here + (tap - radius) * colors
-            mean += window[tap] * tl.load(by_mean + near, there, 0.0)
-            square += window[tap] * tl.load(by_square + near, there, 0.0)
-            product += window[tap] * tl.load(by_product + near, there, 0.0)
-        means, sums_mean = _shifted(sums_mean, mean, window, radius)
-        squares, sums_square = _shifted(sums_square, square, window, radius)
-        products, sums_product = _shifted(sums_product, product, window, radius)
+        mean0, mean1, square0, square1, product0, product1 = zero, zero, zero, zero, zero, zero
+        for near in tl.static_range(2 * radius + 2):
+            there = (column + (near - radius)).to(tl.uint32) < limit.to(tl.uint32)
+            here = at_x + row.to(tl.int64) * x_row + (near - radius) * x_column
+            mean, square = tl.load(by_mean + here, there, 0.0), tl.load(by_square + here, there, 0.0)
+            product = tl.load(by_product + here, there, 0.0)
+            if near <= 2 * radius:
+                mean0 += window[near] * mean
+                square0 += window[near] * square
+                product0 += window[near] * product
+            if near > 0:
+                mean1 += window[near - 1] * mean
+                square1 += window[near - 1] * square
+                product1 += window[near - 1] * product
+        means, sums_mean = _shifted(sums_mean, tl.join(mean0, mean1), window, radius)
+        squares, sums_square = _shifted(sums_square, tl.join(square0, square1), window, radius)
+        products, sums_product = _shifted(sums_product, tl.join(product0, product1), window, radius)
         if row >= first + radius:
-            inside = column < width
             at = of_x + (row - radius).to(tl.int64) * x_row
             one = tl.load(x + at, inside, 0.0)
             other = tl.load(y + of_y + (row - radius).to(tl.int64) * y_row, inside, 0).to(tl.float32) * scale
@@ -168,13 +199,13 @@ class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
         total = torch.full((), ssim_weight, device=prediction.device)
-        b, colors, h, w = prediction.shape
-        assert colors == COLORS, f"{colors} colours"
-        maps = [torch.empty(b, h, w * COLORS, device=prediction.device) for _ in range(3)]
+        assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
+        maps = [torch.empty_like(prediction) for _ in range(3)]
+        assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
         grid, sizes = _grid(prediction, target, ssim_weight)
         constants = {"c1": SSIM_C1, "c2": SSIM_C2, **CONSTANTS}
         launch: Any = _loss_kernel[grid]
-        launch(prediction, target, *maps, total, *sizes, **constants)
+        launch(prediction, target, *maps, total, *sizes, interleaved=prediction.stride(1) == 1, **constants)
         ctx.save_for_backward(prediction, target, *maps)
         ctx.ssim_weight = ssim_weight
         return total
@@ -184,17 +215,17 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
         prediction, target, *maps = ctx.saved_tensors
         gradient = torch.empty_like(prediction)
-        assert gradient.stride() == prediction.stride(), "a prediction without gaps"
         grid, sizes = _grid(prediction, target, ctx.ssim_weight)
         launch: Any = _gradient_kernel[grid]
-        launch(prediction, target, *maps, by_loss, gradient, *sizes, **CONSTANTS)
+        given = prediction, target, *maps, by_loss, gradient, *sizes
+        launch(*given, interleaved=prediction.stride(1) == 1, **CONSTANTS)
         return gradient, None, None
 
 
 def _grid(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[tuple[int, int, int], tuple[Any, ...]]:
     """Return the programs of a launch, and the arguments that both kernels share."""
     b, _, h, w = prediction.shape
-    strips = triton.cdiv(w * COLORS, BLOCK)
+    strips = triton.cdiv(triton.cdiv(w, 2) * COLORS, BLOCK)
     rows = MOST_ROWS
     while rows > LEAST_ROWS and strips * triton.cdiv(h, rows) * b < ENOUGH_PROGRAMS:
         rows //= 2

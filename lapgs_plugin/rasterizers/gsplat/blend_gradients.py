@@ -1,4 +1,4 @@
-"""Choose between gsplat's kernel and ours for the gradients of blending."""
+"""Blend by gsplat's kernels or by ours, with gradients."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 
 SWITCH = "LAPGS_BLEND_GRADIENTS"
 TRITON, GSPLAT = "triton", "gsplat"
-DEFAULT = GSPLAT
+DEFAULT = TRITON
+FEWEST_PIXELS = 200_000
+"""Of all images together; of fewer pixels launching our kernels takes longer than gsplat's take to run."""
 LARGEST_DIFFERENCE = 1e-3
 """Largest accepted difference from gsplat's gradients, relative to the largest; gsplat's own rounding makes most of it.
 
@@ -21,8 +23,8 @@ gsplat divides the transmittance behind the last Gaussian, 1e-4 or more with an 
 """
 
 
-class Blending(NamedTuple):
-    """Arguments and results of blending that its gradients need; c cameras, n Gaussians, p pairs with tiles."""
+class ToBlend(NamedTuple):
+    """Sorted Gaussians of c cameras, n for each, with p pairs of a Gaussian and a tile; all contiguous."""
 
     means2d: Tensor  # (c, n, 2)
     conics: Tensor  # (c, n, 3)
@@ -31,17 +33,26 @@ class Blending(NamedTuple):
     background: Tensor  # (c, 3)
     offsets: Tensor  # (c, tiles down, tiles across) first pair of each tile
     flat: Tensor  # (p,) Gaussian of each pair
-    alphas: Tensor  # (c, h, w, 1)
-    last: Tensor  # (c, h, w) last pair that each pixel blends
-    images: Tensor  # (c, 3, h, w), or (3, h, w) of one camera
+
+
+class Blended(NamedTuple):
+    """Images, and what their gradients need."""
+
+    images: Tensor  # (c, h, w, 3)
+    alphas: Tensor  # (c, h, w, 1), empty if our kernels blended
+    last: Tensor  # (c, h, w) the last pair of each pixel by gsplat, or the counts of `blend_forward`
 
 
 Gradients = tuple[Tensor, ...]
-"""Sums of absolute values of the gradient by centres, where asked for; gradients by the first four of `Blending`."""
+"""Sums of absolute values of the gradient by centres, where asked for; gradients by the first four of `ToBlend`."""
 
 
-def blend_backward(blending: Blending, by_images: Tensor, absolute: bool) -> Gradients:
-    """Return the gradients of blending, from that by the images.
+def our_kernels_blend(means: Tensor, pixels: int) -> bool:
+    """Return whether our kernels blend renders that take gradients.
+
+    Args:
+        means: float32 on the device.
+        pixels: of all images together.
 
     Raises:
         UserInputError: the environment variable `SWITCH` has another value.
@@ -49,37 +60,50 @@ def blend_backward(blending: Blending, by_images: Tensor, absolute: bool) -> Gra
     chosen = os.environ.get(SWITCH) or DEFAULT
     if chosen not in (TRITON, GSPLAT):
         raise UserInputError(f"{SWITCH}={chosen}: expected {TRITON} or {GSPLAT}")
-    if chosen == TRITON and triton_works(blending.means2d):
-        return by_our_kernel(blending, by_images, absolute)
-    return by_gsplat(blending, by_images, absolute)
+    return chosen == TRITON and pixels >= FEWEST_PIXELS and triton_works(means)
 
 
-def by_gsplat(blending: Blending, by_images: Tensor, absolute: bool) -> Gradients:
-    """Compute them by gsplat's kernel, a thread for each pixel."""
+def blend(given: ToBlend, size: tuple[int, int], ours: bool) -> Blended:
+    """Blend images of a size (width, height) by our kernels or by gsplat's."""
+    if ours:
+        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
+
+        images, counts = blend_forward(*given, size)
+        return Blended(images, images.new_empty(0), counts)
+    from lapgs_plugin.rasterizers.gsplat.direct import TILE, compiled_functions
+
+    forward = compiled_functions().rasterize_to_pixels_3dgs_fwd
+    return Blended(*forward(*given[:5], None, *size, TILE, *given[5:]))
+
+
+def gradients(given: ToBlend, blended: Blended, by_images: Tensor, absolute: bool) -> Gradients:
+    """Return the gradients of blending by the kernels that blended.
+
+    Args:
+        given, blended: arguments and results of `blend`.
+        by_images: (c, h, w, 3) gradient by its images.
+        absolute: also sum absolute values.
+    """
+    by_images = by_images.contiguous()
+    if len(blended.alphas) == 0:
+        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward
+
+        rest = blended.last, blended.images, by_images
+        return blend_backward(*given[:4], given.offsets, given.flat, *rest, absolute)
     from lapgs_plugin.rasterizers.gsplat.direct import TILE, compiled_functions, zeros
 
-    count, height, width, _ = blending.alphas.shape
-    by_images = by_images.movedim(-3, -1).contiguous().view(count, height, width, 3)
-    by_alphas = zeros(blending.alphas.shape, by_images.device)
+    _, height, width, _ = by_images.shape
     found: Gradients = compiled_functions().rasterize_to_pixels_3dgs_bwd(
-        *blending[:5], None, width, height, TILE, *blending[5:9], by_images, by_alphas, absolute
-    )
+        *given[:5], None, width, height, TILE, *given[5:], blended.alphas, blended.last,
+        by_images, zeros(blended.alphas.shape, by_images.device), absolute,
+    )  # fmt: skip
     return found
 
 
-def by_our_kernel(blending: Blending, by_images: Tensor, absolute: bool) -> Gradients:
-    """Compute them by our kernel, a warp for each region of a tile."""
-    from lapgs_plugin.rasterizers.gsplat import blend_kernels
-
-    images = blending.images.contiguous(), by_images.contiguous()
-    given = (*blending[:4], blending.offsets, blending.flat, blending.last, *images)
-    return blend_kernels.blend_backward(*given, absolute)
-
-
-@matches_reference("gradients of blending by gsplat's kernel, which takes longer", LARGEST_DIFFERENCE)
+@matches_reference("blending by gsplat's kernels, which take longer", LARGEST_DIFFERENCE)
 def triton_works(device: torch.device) -> float:
-    """Compare the gradients by both kernels for two views of random Gaussians, dense enough to hide what is behind."""
-    from lapgs_plugin.rasterizers.gsplat.direct import blend
+    """Compare images and gradients by both for two views of random Gaussians, dense enough to hide what is behind."""
+    from lapgs_plugin.rasterizers.gsplat.direct import sort_into_tiles
 
     generator = torch.Generator().manual_seed(0)
     cameras, count, width, height = 2, 3000, 75, 53
@@ -95,12 +119,13 @@ def triton_works(device: torch.device) -> float:
     radii = (3.4 * covariances.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().int()
     opacities = (1.1 * uniform(cameras, count)).clamp(0.01, 1.0)
     colors = torch.randn(cameras, count, 3, generator=generator)
-    by_images = torch.randn(cameras, 3, height, width, generator=generator).to(device)
+    by_images = torch.randn(cameras, height, width, 3, generator=generator).to(device)
     projected = [value.to(device) for value in (radii, centres, uniform(cameras, count), conics)]
-    _, centres, _, conics = projected
-    colors, opacities, background = (value.to(device) for value in (colors, opacities, uniform(cameras, 3)))
-    images, alphas, last, offsets, flat = blend(projected, colors, opacities, background, (width, height), cameras)
-    images = images.permute(0, 3, 1, 2).contiguous()
-    given = Blending(centres, conics, colors, opacities, background, offsets, flat, alphas, last, images)
-    pairs = zip(by_our_kernel(given, by_images, True), by_gsplat(given, by_images, True), strict=True)
-    return largest((one - other).abs() / other.abs().max() for one, other in pairs)
+    offsets, flat = sort_into_tiles(projected, (width, height), cameras)
+    values = centres, conics, colors, opacities, uniform(cameras, 3), offsets, flat
+    given = ToBlend(*(value.to(device) for value in values))
+    found = []
+    for ours in (True, False):
+        blended = blend(given, (width, height), ours)
+        found.append((blended.images, *gradients(given, blended, by_images, absolute=True)))
+    return largest((one - other).abs() / other.abs().max() for one, other in zip(*found, strict=True))

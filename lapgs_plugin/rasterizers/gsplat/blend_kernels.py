@@ -1,10 +1,11 @@
-"""Compute the gradients of blending in Triton, one program for each region of a tile.
+"""Blend and compute the gradients of blending in Triton, one program for each region of a tile.
 
-gsplat's backward pass gives each pixel a thread. For each Gaussian the threads of a warp add up their gradients by
-shuffles, which takes most of the time. Here a warp holds a bucket of Gaussians by all pixels of its region: it adds up
-pixels in registers first, and it skips Gaussians that do not reach the region.
+gsplat gives each pixel a thread, which goes through all Gaussians of its tile. In the backward pass the threads of a
+warp add up their gradients for each Gaussian by shuffles, which takes most of the time. Here a warp holds a bucket of
+Gaussians by all pixels of its region: it skips Gaussians that do not reach the region, and it adds up pixels in
+registers first.
 
-Gaussians are taken front to back, as in the forward pass. Let g be a pixel's gradient, c_i the colours, a_i the
+The backward pass too takes Gaussians front to back. Let g be a pixel's gradient, c_i the colours, a_i the
 alphas, T_i the transmittances before each Gaussian. The colour that reaches the eye from behind Gaussian i, with the
 background, is the image less the colours up to i. So only its product with g has to be carried along:
 
@@ -31,6 +32,8 @@ QUEUE = tl.constexpr(64)
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
+LEAST = tl.constexpr(1e-4)
+"""Transmittance that no pixel goes below: it ends before."""
 INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
 
 # Kernels are not compiled anew for other sizes.
@@ -49,7 +52,7 @@ class Shape(NamedTuple):
     """
 
     lanes: int = 8
-    rows: int = 8
+    rows: int = 4
     splat_lanes: int = 4
     splats: int = 2
     warps: int = 1
@@ -90,8 +93,8 @@ def _reaches(
     """
     near_x = tl.minimum(tl.maximum(x - (width - 1), 0.0), x)  # difference to the nearest column
     near_y = tl.minimum(tl.maximum(y - (height - 1), 0.0), y)
-    on_column = tl.minimum(tl.maximum(-b * near_x / c, y - (height - 1)), y)
-    on_row = tl.minimum(tl.maximum(-b * near_y / a, x - (width - 1)), x)
+    on_column = tl.minimum(tl.maximum(-b * near_x * _inverse(c), y - (height - 1)), y)
+    on_row = tl.minimum(tl.maximum(-b * near_y * _inverse(a), x - (width - 1)), x)
     limit = tl.log(opacity / FAINTEST) + 0.01  # with room for rounding, which grows with the terms of the exponent
     square = 0.5 * (a * near_x * near_x + c * on_column * on_column)
     found = square * 0.99999 + b * near_x * on_column <= limit
@@ -134,10 +137,125 @@ def _add_gradients(
     tl.atomic_add(by_colors + 3 * of_sums + 2, tl.sum(tl.sum(by_blue, 3), 0), there_of_sums, sem="relaxed")
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _region(
+    across: int, tiles: int, lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr
+) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:
+    """Return the program's tile over all images, its image, and the first row and column of its region."""
+    region = tl.program_id(0)
+    regions: tl.constexpr = (tile // lanes) * (tile // rows)
+    index = region // regions
+    row = (index % tiles) // across * tile + region % regions // (tile // lanes) * rows
+    column = (index % tiles) % across * tile + region % (tile // lanes) * lanes
+    return index, index // tiles, row, column
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _fill(
+    queue: tl.tensor, begin: tl.tensor, stop: tl.tensor, head: tl.tensor, tail: tl.tensor,
+    flat: tl.tensor, means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
+    row: tl.tensor, column: tl.tensor,
+    bucket: tl.constexpr, lanes: tl.constexpr, rows: tl.constexpr, batch: tl.constexpr,
+) -> tuple[tl.tensor, tl.tensor]:  # fmt: skip
+    """Put Gaussians that reach the region in the queue, until it has a bucket of them or the pairs end.
+
+    Returns:
+        The next pair, and how many Gaussians have entered the queue.
+    """
+    in_batch = tl.arange(0, batch)
+    while (begin < stop) & (tail - head < bucket):
+        there = begin + in_batch < stop
+        gaussian = tl.load(flat + begin + in_batch, there, 0)
+        x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
+        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
+        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+        wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
+        slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (QUEUE - 1)
+        tl.debug_barrier()  # all threads have read the bucket before
+        tl.store(queue + slot, gaussian, wanted)
+        tl.debug_barrier()  # threads read what others wrote
+        tail += tl.sum(wanted.to(tl.int32), 0)
+        begin += batch
+    return begin, tail
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _alphas(
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor, there: tl.tensor
+) -> tl.tensor:
+    """Return alphas, 0 where they are below `FAINTEST`; `x` and `y` are centres less pixels."""
+    # The exponent of 2; most of it is the same in all rows.
+    power = (a * (-0.5 * LOG2_E)) * x * x + y * (b * (-LOG2_E) * x + c * (-0.5 * LOG2_E) * y)
+    alpha = tl.minimum(opacity * _exp2(power), OPAQUEST)
+    return tl.where(there & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
+
+
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
-def _backward_kernel(  # noqa: PLR0915  # its steps share too many tensors to be functions
+def _forward_kernel(
+    means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor, background: tl.tensor,
+    offsets: tl.tensor, flat: tl.tensor, images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
+    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
+    lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
+    tile: tl.constexpr, batch: tl.constexpr,
+) -> None:  # fmt: skip
+    # Axes as in the backward kernel.
+    bucket: tl.constexpr = splats * splat_lanes
+    index, image, row, column = _region(across, tiles, lanes, rows, tile)
+    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    inside = (column + along < width) & (row + down < height)
+    transmittance = tl.where(inside, 1.0, 0.0)
+    # Sums over the Gaussians of each thread.
+    red, green, blue, cover = inside * 0.0, inside * 0.0, inside * 0.0, inside * 0.0
+
+    begin = tl.load(offsets + index)
+    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    queue = queues + tl.program_id(0) * QUEUE
+    order = tl.arange(0, splat_lanes)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
+    order = tl.broadcast_to(order, (lanes, splat_lanes, splats, 1))
+    head, tail = 0, 0
+    while (begin < stop) | (head < tail):
+        begin, tail = _fill(
+            queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
+        )
+        there = head + order < tail
+        gaussian = tl.load(queue + ((head + order) & (QUEUE - 1)), there, 0)
+        head += bucket
+        x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)
+        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)
+        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+        color_r, color_g = tl.load(colors + 3 * gaussian, there, 0.0), tl.load(colors + 3 * gaussian + 1, there, 0.0)
+        color_b = tl.load(colors + 3 * gaussian + 2, there, 0.0)
+        tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
+        alpha = _alphas(x, y, a, b, c, opacity, there)
+        left = 1.0 - alpha
+        of_lane = tl.reduce(left, 2, _multiply, keep_dims=True)
+        upto = tl.cumprod(of_lane, 1)
+        after = transmittance * (upto * _inverse(of_lane)) * tl.cumprod(left, 2)
+        transmittance *= tl.reduce(of_lane, 1, _multiply, keep_dims=True)
+        weight = tl.where(after > LEAST, alpha * after * _inverse(left), 0.0)
+        red += tl.sum(weight * color_r, 2, keep_dims=True)
+        green += tl.sum(weight * color_g, 2, keep_dims=True)
+        blue += tl.sum(weight * color_b, 2, keep_dims=True)
+        cover += tl.sum(weight, 2, keep_dims=True)
+        if tl.max(tl.max(tl.max(tl.max(transmittance, 3), 2), 1), 0) <= LEAST:  # all pixels ended
+            begin, tail = stop, head
+    tl.store(counts + tl.program_id(0), tl.minimum(head, tail))
+
+    pixel = images + 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
+    left = 1.0 - tl.sum(cover, 1, keep_dims=True)
+    background += 3 * image
+    tl.store(pixel, tl.sum(red, 1, keep_dims=True) + left * tl.load(background), inside)
+    tl.store(pixel + 1, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
+    tl.store(pixel + 2, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
+
+
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
+def _backward_kernel(
     means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor,
-    offsets: tl.tensor, flat: tl.tensor, last: tl.tensor, images: tl.tensor, by_images: tl.tensor,
+    offsets: tl.tensor, flat: tl.tensor, counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
     by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
     queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
@@ -148,111 +266,104 @@ def _backward_kernel(  # noqa: PLR0915  # its steps share too many tensors to be
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
     # products over splats need no shuffles.
     bucket: tl.constexpr = splats * splat_lanes
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
-    region = tl.program_id(0)
-    index = region // regions
-    image = index // tiles
-    row = (index % tiles) // across * tile + region % regions // (tile // lanes) * rows
-    column = (index % tiles) % across * tile + region % (tile // lanes) * lanes
-
+    index, image, row, column = _region(across, tiles, lanes, rows, tile)
     along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
     inside = (column + along < width) & (row + down < height)
-    pixel = (row + down) * width + column + along  # within an image
-    of_pixels = tl.load(last + image.to(tl.int64) * (width * height) + pixel, inside, -1)
-    plane = image.to(tl.int64) * 3 * (width * height) + pixel
-    red = tl.load(by_images + plane, inside, 0.0)
-    green = tl.load(by_images + plane + width * height, inside, 0.0)
-    blue = tl.load(by_images + plane + 2 * (width * height), inside, 0.0)
-    behind = red * tl.load(images + plane, inside, 0.0)
-    behind += green * tl.load(images + plane + width * height, inside, 0.0)
-    behind += blue * tl.load(images + plane + 2 * (width * height), inside, 0.0)
+    pixel = 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
+    red = tl.load(by_images + pixel, inside, 0.0)
+    green, blue = tl.load(by_images + pixel + 1, inside, 0.0), tl.load(by_images + pixel + 2, inside, 0.0)
+    behind = red * tl.load(images + pixel, inside, 0.0)
+    behind += green * tl.load(images + pixel + 1, inside, 0.0) + blue * tl.load(images + pixel + 2, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
 
-    begin = tl.load(offsets + index)
-    end = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    stop = tl.minimum(end, tl.max(tl.max(tl.max(tl.max(of_pixels, 0), 0), 0), 0) + 1)
-    queue = queues + region.to(tl.int64) * (2 * QUEUE)
-    first_x, first_y = column + 0.5, row + 0.5
-    in_batch = tl.arange(0, batch)
+    begin, count = tl.load(offsets + index), tl.load(counts + tl.program_id(0))
+    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    queue = queues + tl.program_id(0) * QUEUE
     # Which Gaussian of a bucket an element is; those in one thread are consecutive.
     order_of_sums = tl.arange(0, splat_lanes)[:, None] * splats + tl.arange(0, splats)[None, :]
     order = tl.broadcast_to(order_of_sums[None, :, :, None], (lanes, splat_lanes, splats, 1))
-    head, tail = 0, 0  # numbers of pairs that left the queue and that entered it
-    while (begin < stop) | (head < tail):
-        while (begin < stop) & (tail - head < bucket):
-            there = begin + in_batch < stop
-            gaussian = tl.load(flat + begin + in_batch, there, 0)
-            x, y = tl.load(means2d + 2 * gaussian) - first_x, tl.load(means2d + 2 * gaussian + 1) - first_y
-            a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-            c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-            wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
-            slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (QUEUE - 1)
-            tl.debug_barrier()  # all threads have read the bucket before
-            tl.store(queue + slot, begin + in_batch, wanted)
-            tl.store(queue + QUEUE + slot, gaussian, wanted)
-            tl.debug_barrier()  # threads read what others wrote
-            tail += tl.sum(wanted.to(tl.int32), 0)
-            begin += batch
-
-        slot = (head + order) & (QUEUE - 1)
+    head, tail = 0, 0  # numbers of Gaussians that left the queue and that entered it
+    while head < count:
+        begin, tail = _fill(
+            queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
+        )
         there = head + order < tail
-        place = tl.load(queue + slot, there, 2147483647)
-        gaussian = tl.load(queue + QUEUE + slot, there, 0)
+        gaussian = tl.load(queue + ((head + order) & (QUEUE - 1)), there, 0)
         there_of_sums = head + order_of_sums < tail
-        of_sums = tl.load(queue + QUEUE + ((head + order_of_sums) & (QUEUE - 1)), there_of_sums, 0)
+        of_sums = tl.load(queue + ((head + order_of_sums) & (QUEUE - 1)), there_of_sums, 0)
         head += bucket
-        x = tl.load(means2d + 2 * gaussian) - (first_x + along)  # (lanes, splat_lanes, splats, 1)
+        x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)  # (lanes, splat_lanes, splats, 1)
+        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)  # (lanes, splat_lanes, splats, rows)
         a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
         c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-        y = tl.load(means2d + 2 * gaussian + 1) - (first_y + down)  # (lanes, splat_lanes, splats, rows)
+        color_r, color_g = tl.load(colors + 3 * gaussian, there, 0.0), tl.load(colors + 3 * gaussian + 1, there, 0.0)
+        color_b = tl.load(colors + 3 * gaussian + 2, there, 0.0)
         tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
-        # The exponent of 2; most of it is the same in all rows.
-        power = (a * (-0.5 * LOG2_E)) * x * x + y * (b * (-LOG2_E) * x + c * (-0.5 * LOG2_E) * y)
-        alpha = tl.minimum(opacity * _exp2(power), OPAQUEST)
-        alpha = tl.where((place <= of_pixels) & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
+        alpha = _alphas(x, y, a, b, c, opacity, there)
         left = 1.0 - alpha
         inverse = _inverse(left)
         # Products up to each Gaussian: of those before in the same thread, and of threads before.
-        within = tl.cumprod(left, 2)
         of_lane = tl.reduce(left, 2, _multiply, keep_dims=True)
         upto = tl.cumprod(of_lane, 1)
-        before = transmittance * (upto * _inverse(of_lane)) * within * inverse
+        after = transmittance * (upto * _inverse(of_lane)) * tl.cumprod(left, 2)
         transmittance *= tl.reduce(of_lane, 1, _multiply, keep_dims=True)
-
+        alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
+        before = after * inverse
         weight = alpha * before
-        shine = tl.load(colors + 3 * gaussian, there, 0.0) * red
-        shine += tl.load(colors + 3 * gaussian + 1, there, 0.0) * green
-        shine += tl.load(colors + 3 * gaussian + 2, there, 0.0) * blue
+        shine = color_r * red + color_g * green + color_b * blue
         added = weight * shine
-        within = tl.cumsum(added, 2)
         of_lane = tl.sum(added, 2, keep_dims=True)
         upto = tl.cumsum(of_lane, 1)
-        by_alpha = before * shine - (behind - (upto - of_lane) - within) * inverse
+        by_alpha = before * shine - (behind - (upto - of_lane) - tl.cumsum(added, 2)) * inverse
         behind -= tl.sum(of_lane, 1, keep_dims=True)
         by_sigma = tl.where(alpha < OPAQUEST, -alpha * by_alpha, 0.0)
-
         _add_gradients(
             x, y, a, b, c, by_sigma, weight * red, weight * green, weight * blue, of_sums, there_of_sums, conics,
             opacities, by_means2d, by_absolute, by_conics, by_colors, by_opacities, absolute,
         )  # fmt: skip
 
 
-def blend_backward(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, last: Tensor,
-    images: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Return the gradients of blending by centres, conics, colours and opacities.
-
-    All tensors are contiguous; float32, if not said otherwise.
+def blend_forward(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, background: Tensor,
+    offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Blend the Gaussians of each tile; arguments are contiguous.
 
     Args:
-        means2d, conics, colors, opacities: (c, n, 2), (c, n, 3), (c, n, 3) and (c, n) of c cameras.
+        means2d, conics, colors, opacities: (c, n, 2), (c, n, 3), (c, n, 3) and (c, n) float32 of c cameras.
+        background: (c, 3) float32.
         offsets: (c, tiles down, tiles across) int32, the first pair of each tile.
         flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile.
-        last: (c, h, w) int32, the last pair that a pixel blends.
-        images: c images of (3, h, w) with backgrounds.
-        by_images: gradient by them.
+        size: (width, height) of the images.
+        shape: of a program's work.
+
+    Returns:
+        Images (c, h, w, 3), and the number of Gaussians in each region that reach it before all its pixels end.
+    """
+    width, height = size
+    programs, numbers = _launch_of(offsets, flat, size, shape)
+    images = means2d.new_empty(len(offsets), height, width, 3)
+    counts = flat.new_empty(programs)
+    _forward_kernel[(programs,)](
+        means2d, conics, colors, opacities, background, offsets, flat, images, counts,
+        flat.new_empty(programs, QUEUE.value), *numbers,
+        lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
+        tile=TILE, batch=BATCH, num_warps=shape.warps,
+    )  # fmt: skip
+    return images, counts
+
+
+def blend_backward(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, counts: Tensor,
+    images: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Return the gradients of blending by centres, conics, colours and opacities; arguments are contiguous.
+
+    Args:
+        means2d, conics, colors, opacities, offsets, flat: as `blend_forward` takes them.
+        counts, images: its results, made with a shape of the same lanes and rows.
+        by_images: gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
 
@@ -260,19 +371,27 @@ def blend_backward(
         Sums of absolute values (c, n, 2), meaningless without `absolute`; gradients by `means2d`, `conics`, `colors`
         and `opacities`.
     """
-    by_means2d, by_conics, by_colors, by_opacities = (
-        torch.zeros_like(value) for value in (means2d, conics, colors, opacities)
-    )
+    by_means2d = torch.zeros_like(means2d)
     by_absolute = torch.zeros_like(means2d) if absolute else by_means2d
-    height, width = last.shape[-2:]
-    across, all_tiles = offsets.shape[-1], offsets.numel()
-    programs = all_tiles * (TILE // shape.lanes) * (TILE // shape.rows)
-    queues = torch.empty(programs, 2 * QUEUE.value, dtype=torch.int32, device=flat.device)
+    by_opacities = torch.zeros_like(opacities)
+    # One launch for both; each begins at a multiple of 16 bytes, or Triton would compile for where it begins.
+    end = -(-conics.numel() // 4) * 4
+    zeros = conics.new_zeros(2 * end)
+    by_conics, by_colors = zeros[: conics.numel()].view_as(conics), zeros[end : end + colors.numel()].view_as(colors)
+    programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), shape)
+    assert len(counts) == programs
     _backward_kernel[(programs,)](
-        means2d, conics, colors, opacities, offsets, flat, last, images, by_images,
-        by_means2d, by_absolute, by_conics, by_colors, by_opacities, queues,
-        width, height, across, offsets[0].numel(), all_tiles, len(flat),
+        means2d, conics, colors, opacities, offsets, flat, counts, images, by_images,
+        by_means2d, by_absolute, by_conics, by_colors, by_opacities,
+        flat.new_empty(programs, QUEUE.value), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
         tile=TILE, batch=BATCH, absolute=absolute, num_warps=shape.warps,
     )  # fmt: skip
     return by_absolute, by_means2d, by_conics, by_colors, by_opacities
+
+
+def _launch_of(offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape) -> tuple[int, tuple[int, ...]]:
+    """Return the number of programs and the arguments named in `NOT_SPECIALIZED`."""
+    all_tiles, across = offsets.numel(), offsets.shape[-1]
+    numbers = *size, across, offsets[0].numel(), all_tiles, len(flat)
+    return all_tiles * (TILE // shape.lanes) * (TILE // shape.rows), numbers

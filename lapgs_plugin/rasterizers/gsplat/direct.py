@@ -20,7 +20,13 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blending, blend_backward
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import (
+    Blended,
+    ToBlend,
+    blend,
+    gradients,
+    our_kernels_blend,
+)
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
@@ -32,17 +38,11 @@ FAR_PLANE = 1e10
 class Intermediates(NamedTuple):
     """Intermediate results of a render, which the backward pass needs; n Gaussians, c cameras."""
 
+    given: ToBlend
+    blended: Blended
     radii: Tensor  # (c, n, 2)
-    means2d: Tensor  # (c, n, 2)
     depths: Tensor  # (c, n)
-    conics: Tensor  # (c, n, 3)
-    colors: Tensor  # (c, n, 3)
     scales: Tensor  # (n, 3)
-    opacities: Tensor  # (c, n), equal for all cameras
-    offsets: Tensor  # (c, tiles down, tiles across)
-    flat: Tensor  # Gaussian of each pair with a tile
-    alphas: Tensor  # (c, h, w, 1)
-    last: Tensor  # (c, h, w)
     visible_radii: Tensor  # (c, n) the larger of both, 0 where culled
     centres: Tensor  # (c, n, 2) as in `RenderResult.means2d`
 
@@ -70,7 +70,7 @@ def render(
     differentiated = is_differentiated(field)
     absgrad = absgrad and differentiated
     image, found, targets = _render(field, cameras, background, degree, describes=True, absgrad=absgrad)
-    radii, means2d, conics = found.visible_radii, found.centres, found.conics
+    radii, means2d, conics = found.visible_radii, found.centres, found.given.conics
     if len(cameras.poses) == 1:
         radii, means2d, conics = radii[0], means2d[0], conics[0]
     with torch.no_grad():
@@ -106,10 +106,10 @@ def _render(
             options = cameras, background, degree, field.signed, describes, absgrad, box, targets
             image: Tensor = _Render.apply(means, quaternions, log_scales, logits, sh, *options)  # type: ignore[no-untyped-call]  # torch's
             return image, box[0], targets
-        images, found = _forward(
-            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes
+        found = forward(
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes, ours=False
         )
-    return _channels_first(images), found, targets
+    return _channels_first(found.blended.images), found, targets
 
 
 def _channels_first(images: Tensor) -> Tensor:
@@ -126,36 +126,34 @@ class _Render(torch.autograd.Function):
         cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool, absgrad: bool,
         box: list[Intermediates], targets: GradientTargets,
     ) -> Tensor:  # fmt: skip
-        images, found = _forward(
-            means, quaternions, log_scales, logits, sh, cameras, background, degree, signed, describes
+        ours = our_kernels_blend(means, len(cameras.poses) * cameras.width * cameras.height)
+        found = forward(
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, signed, describes, ours
         )
-        images = _channels_first(images)
-        ctx.save_for_backward(means, quaternions, sh, background, *cameras[:3], images, *found)
+        ctx.save_for_backward(means, quaternions, sh, *cameras[:3], *found.given, *found.blended, *found[2:])
         ctx.size, ctx.degree, ctx.signed, ctx.absgrad = cameras[3:], degree, signed, absgrad
         ctx.targets = targets
         box.append(found)
-        return images
+        return _channels_first(found.blended.images)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_image: Tensor) -> tuple[Tensor | None, ...]:
         from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
 
-        means, quaternions, sh, background, poses, intrinsics, centres, images, *rest = ctx.saved_tensors
-        found, (width, height), compiled = Intermediates(*rest), ctx.size, compiled_functions()
-        blending = Blending(
-            found.means2d, found.conics, found.colors, found.opacities, background,
-            found.offsets, found.flat, found.alphas, found.last, images,
-        )  # fmt: skip
+        means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
+        given, blended = ToBlend(*rest[:7]), Blended(*rest[7:10])
+        found, (width, height), compiled = Intermediates(given, blended, *rest[10:]), ctx.size, compiled_functions()
+        by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
-        by_absolute, by_means2d, by_conics, by_colors, by_opacities = blend_backward(blending, by_image, ctx.absgrad)
+        by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
-            compiled.CameraModelType.PINHOLE, found.radii, found.conics, None,
+            compiled.CameraModelType.PINHOLE, found.radii, given.conics, None,
             by_means2d, zeros(found.depths.shape, means.device), by_conics, None, False,
         )  # fmt: skip
         by_sh = finish_gradients(
-            means, centres, sh, ctx.degree, ctx.signed, found.radii, found.colors, found.scales, found.opacities,
+            means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities,
             by_colors, by_means, by_scales, by_opacities,
         )  # fmt: skip
         by_absolute = by_absolute if ctx.absgrad else None
@@ -165,11 +163,11 @@ class _Render(torch.autograd.Function):
         return by_means, by_quaternions, by_scales, by_opacities[0], by_sh, *[None] * 8
 
 
-def _forward(
+def forward(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor,
-    cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool,
-) -> tuple[Tensor, Intermediates]:  # fmt: skip
-    """Return images (c, h, w, 3) and intermediate results; `background` is (c, 3)."""
+    cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool, ours: bool,
+) -> Intermediates:  # fmt: skip
+    """Render; `background` is (c, 3), and `ours` says whether our kernels blend."""
     from lapgs_plugin.rasterizers.gsplat.kernels import activate, visible_colors
 
     size, count = (cameras.width, cameras.height), len(cameras.poses)
@@ -179,11 +177,9 @@ def _forward(
     pixels = means2d if describes else None
     colors, visible_radii, centres = visible_colors(means, cameras.centres, sh, degree, signed, radii, pixels)
     opacities = _for_each_camera(opacities, count)
-    images, alphas, last, offsets, flat = blend(projected, colors, opacities, background, size, count)
-    found = Intermediates(
-        radii, means2d, depths, conics, colors, scales, opacities, offsets, flat, alphas, last, visible_radii, centres
-    )
-    return images, found
+    tiles = sort_into_tiles(projected, size, count)
+    given = ToBlend(means2d, conics, colors, opacities, background, *tiles)
+    return Intermediates(given, blend(given, size, ours), radii, depths, scales, visible_radii, centres)
 
 
 def _for_each_camera(values: Tensor, cameras: int) -> Tensor:
@@ -209,36 +205,28 @@ def project(
     return radii, means2d, depths, conics
 
 
-def blend(
-    projected: Sequence[Tensor], colors: Tensor, opacities: Tensor, background: Tensor | None, size: tuple[int, int],
-    count: int = 1, of_image: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Sort Gaussians into tiles and blend them. This waits for the GPU, for the number of pairs with tiles.
+def sort_into_tiles(
+    projected: Sequence[Tensor], size: tuple[int, int], count: int = 1, of_image: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Sort Gaussians into tiles, front to back. This waits for the GPU, for the number of pairs with tiles.
 
     Args:
         projected: results of `project`; or, without the leading dimension, those of several images in one list.
-        colors, opacities: (count, n, 3) and (count, n), or (n, 3) and (n,) in such a list.
-        background: (count, 3), None for black.
         size: (width, height) of all images.
         count: number of images.
         of_image: in a list, the image number (n,) of each Gaussian.
 
     Returns:
-        Images (count, h, w, 3), opacities (count, h, w, 1), the last Gaussian of each pixel, the first pair of each
-        tile, and the Gaussian of each pair.
+        The first pair of each tile, (count, tiles down, tiles across), and the Gaussian of each pair.
     """
     compiled = compiled_functions()
-    radii, means2d, depths, conics = projected
+    radii, means2d, depths, _ = projected
     across, down = (math.ceil(side / TILE) for side in size)
     # gsplat also takes the index of each Gaussian, but does not use it.
     _, pairs, flat = compiled.intersect_tile(
         means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
     )
-    offsets = compiled.intersect_offset(pairs, count, across, down)
-    images, alphas, last = compiled.rasterize_to_pixels_3dgs_fwd(
-        means2d, conics, colors, opacities, background, None, *size, TILE, offsets, flat
-    )
-    return images, alphas, last, offsets, flat
+    return compiled.intersect_offset(pairs, count, across, down), flat
 
 
 def _write_gradients(targets: GradientTargets, by_centre: Tensor, by_absolute: Tensor | None) -> None:

@@ -68,8 +68,9 @@ class GsplatStack:
             with torch.cuda.device(self._means.device):  # Triton launches on the current device
                 projected, colors = self._project_directly(cameras, viewmats, intrinsics, positions[0])
                 count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
-                images, alphas, *_ = direct.blend(
-                    projected, colors, self._opacities[:count], None, size, len(cameras), of_image
+                offsets, flat = direct.sort_into_tiles(projected, size, len(cameras), of_image)
+                images, alphas, _ = direct.compiled_functions().rasterize_to_pixels_3dgs_fwd(
+                    *projected[1::2], colors, self._opacities[:count], None, None, *size, TILE, offsets, flat
                 )
         else:
             projected = self._project(cameras, viewmats, intrinsics)

@@ -1,0 +1,423 @@
+"""Find in a training function's syntax tree what its loop does at which iteration, and change that for a stage.
+
+A loop compares its variable with options, arguments and numbers: `iteration < opt.densify_until_iter`,
+`iteration % 3000 == 0 and iteration > 15_000`, `iteration in testing_iterations`. Imports no torch.
+"""
+
+from __future__ import annotations
+import __future__
+
+import ast
+import builtins
+import copy
+import inspect
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any, Protocol, cast
+
+RARE = 10
+"""An iteration after 1/RARE of a run is late, and an event whose period is at least that is rare. Earlier iterations
+are warm-up, and shorter periods suit a stage of any length: both stay as they are."""
+
+HARMFUL = re.compile("prun|densif|simpl|reinit|reset", re.IGNORECASE)
+"""Names of functions after which Gaussians need iterations to recover."""
+
+LOGGING = 100
+"""Largest period at which loops only print."""
+
+KEPT = ("iterations", "densify_until_iter", "densify_from_iter", "densification_interval", "opacity_reset_interval")
+"""Options of the family that every adapter sets for a stage."""
+
+SPREAD = ("densify_until_iter",)
+"""Those of them that keep their share of the iterations."""
+
+LIBRARIES = ("torch", "np", "numpy", "math", "random", "os", "time", "sys", "F", "logging", "wandb")
+"""Modules whose functions say nothing about what an event does."""
+
+FLIPPED = {ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE}
+
+FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
+
+Place = tuple[int, int, int | None, int | None]
+
+
+class Window(Protocol):
+    """Place a stage in a run: `adapters.base.StageWindow`."""
+
+    @property
+    def total(self) -> int:
+        """Iterations of the whole run."""
+
+    def scaled(self, iterations: int, /) -> int:
+        """Return iterations of the whole run as the same share of the stage."""
+
+
+@dataclass(frozen=True)
+class Operand:
+    """Hold what the loop's variable is compared with.
+
+    Attributes:
+        node: the expression.
+        periodic: whether the variable is divided by it: `iteration % node`.
+        operator: of the comparison, with the variable on its left.
+        comparison: the whole comparison.
+    """
+
+    node: ast.expr
+    periodic: bool
+    operator: type[ast.cmpop]
+    comparison: ast.expr
+
+    @property
+    def text(self) -> str:
+        return ast.unparse(self.node)
+
+    @property
+    def option(self) -> tuple[str, str] | None:
+        """(variable, attribute) if it is an option such as `opt.iterations`; the attribute of a variable is empty."""
+        if isinstance(self.node, ast.Name):
+            return self.node.id, ""
+        if isinstance(self.node, ast.Attribute) and isinstance(self.node.value, ast.Name):
+            return self.node.value.id, self.node.attr
+        return None
+
+    @property
+    def name(self) -> str:
+        """Last part of an option's name; empty for a number."""
+        return "" if self.option is None else self.option[1] or self.option[0]
+
+    @property
+    def is_list(self) -> bool:
+        return self.operator in (ast.In, ast.NotIn)
+
+    @property
+    def listed(self) -> list[Operand]:
+        """Elements of a list that is written out."""
+        written = self.is_list and isinstance(self.node, (ast.List, ast.Tuple, ast.Set))
+        elements = self.node.elts if written else []  # type: ignore[attr-defined]  # as just checked
+        return [Operand(each, False, ast.Eq, self.comparison) for each in elements]
+
+    def value(self, variables: Mapping[str, Any]) -> Any:
+        """Return its value, None if that is known inside of the loop only."""
+        if self.option is not None:
+            found = variables.get(self.option[0])
+            return getattr(found, self.option[1], None) if self.option[1] else found
+        try:
+            return ast.literal_eval(self.node)
+        except ValueError:
+            return None
+
+    def number(self, variables: Mapping[str, Any]) -> int | None:
+        """Return its value if that is a whole number."""
+        value = self.value(variables)
+        if isinstance(value, float) and value.is_integer():
+            return int(value)
+        return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+@dataclass(frozen=True)
+class Event:
+    """Describe what a loop does under a condition on its variable.
+
+    Attributes:
+        test: the condition; of one with `or`, one of its alternatives.
+        operands: what the variable is compared with there.
+        around: the same of the conditions around it.
+        calls: names of the functions that are called if it holds.
+    """
+
+    test: ast.expr
+    operands: tuple[Operand, ...]
+    around: tuple[Operand, ...]
+    calls: tuple[str, ...]
+
+    @property
+    def period(self) -> Operand | None:
+        return next((each for each in self.operands if each.periodic), None)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is more than logging or the end of the loop."""
+        if all(each.name == "iterations" for each in self.operands):
+            return False
+        numbers = (each.number({}) or 0 for each in (*self.operands, *self.listed))
+        return bool(self.calls) or max(numbers) > LOGGING
+
+    @property
+    def bounds(self) -> tuple[Operand, ...]:
+        """Iterations at which it begins, ends or happens."""
+        return tuple(each for each in self.operands if not each.periodic and not each.is_list)
+
+    @property
+    def listed(self) -> tuple[Operand, ...]:
+        """Iterations in lists that are written out."""
+        return tuple(element for each in self.operands for element in each.listed)
+
+    def describe(self, variables: Mapping[str, Any]) -> str:
+        """Return one line: the condition, with the values of options that are known, and the functions it calls."""
+        known = {_place(each.node): each.value(variables) for each in self.operands if each.option is not None}
+        test = _Rewriter({place: value for place, value in known.items() if value is not None}, {}, {}, "").visit(
+            copy.deepcopy(self.test)
+        )
+        return f"line {self.test.lineno}: {ast.unparse(test)}" + f" ({', '.join(self.calls)})" * bool(self.calls)
+
+
+class Schedule:
+    """Hold the events of a training function.
+
+    Args:
+        function: its syntax tree.
+
+    Attributes:
+        events: in the order of the source; empty if no loop counts iterations.
+    """
+
+    def __init__(self, function: ast.FunctionDef) -> None:
+        self._function = function
+        loop = _iteration_loop(function)
+        self.events = [] if loop is None else list(_events(loop.body, _target(loop), ()))
+
+    def describe(self, variables: Mapping[str, Any] | None = None) -> list[str]:
+        """Return a line for each event that calls something; `variables` are those that the function sees, by name."""
+        ends = [[each.name == "iterations" for each in event.operands] for event in self.events]
+        return [
+            e.describe(variables or {}) for e, end in zip(self.events, ends, strict=True) if e.calls and not all(end)
+        ]
+
+    def for_stage(
+        self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: Window, keep: Collection[str] = ()
+    ) -> StageSchedule:
+        """Return what changes in a stage of its own length.
+
+        Late bounds keep their share of the iterations; so does the period of rare events between such bounds. Where a
+        rare event of `HARMFUL` functions would fall into the last tenth of the stage, it comes at that tenth's start.
+
+        Args:
+            whole: variables that the function sees in the whole run, by name: its arguments and globals.
+            stage: the same in the stage; options of `KEPT` are set already.
+            window: place of the stage.
+            keep: names of other options that stay.
+        """
+        changed = StageSchedule(self._function)
+        periods = {event.period.name for event in self.events if event.period is not None} - {""}
+        keep = {*keep, *KEPT, *periods}
+        late = window.total / RARE
+        for event in self.events:
+            found = [(bound, bound.number(whole)) for bound in (*event.bounds, *event.listed)]
+            bounds = [(bound, number) for bound, number in found if number is not None and number > late]
+            for bound, number in bounds:
+                if bound.name not in keep:
+                    changed.set(bound, number, window.scaled(number))
+            spread = any(bound.name not in keep or bound.name in SPREAD for bound, _ in bounds)
+            period = None if event.period is None else event.period.number(whole)
+            if event.period is None or period is None or period < late:
+                continue
+            if spread and event.period.name not in KEPT:
+                changed.set(event.period, period, max(1, window.scaled(period)))
+            if any(HARMFUL.search(name) for name in event.calls):
+                changed.keep_clear(event, {**whole, **stage}, window.scaled(window.total))
+        return changed
+
+
+@dataclass
+class StageSchedule:
+    """Hold what differs between a stage's call of a training function and the script's.
+
+    Attributes:
+        options: values by variable and attribute.
+        notes: every change in words.
+    """
+
+    _function: ast.FunctionDef
+    options: dict[tuple[str, str], int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    _numbers: dict[Place, int] = field(default_factory=dict)
+    _moved: dict[Place, int] = field(default_factory=dict)
+
+    def set(self, operand: Operand, before: int, after: int) -> None:
+        """Give an operand another value."""
+        if before == after or operand.option in self.options:
+            return
+        if operand.option is None:
+            self._numbers[_place(operand.node)] = after
+        else:
+            self.options[operand.option] = after
+        self.notes.append(f"{operand.text if operand.option else before} -> {after}")
+
+    def keep_clear(self, event: Event, variables: Mapping[str, Any], end: int) -> None:
+        """Move an event out of the last tenth of a stage that ends at iteration `end`."""
+
+        def now(operand: Operand) -> int | None:
+            if operand.option in self.options:
+                return self.options[operand.option]
+            return self._numbers.get(_place(operand.node), operand.number(variables))
+
+        assert event.period is not None
+        period, limit, start = now(event.period), end, end - end // RARE
+        for bound in (*event.bounds, *event.around):
+            value = None if bound.periodic or bound.is_list else now(bound)
+            if value is not None and bound.operator in (ast.Lt, ast.LtE):
+                limit = min(limit, value - (bound.operator is ast.Lt))
+        if period and limit // period * period > start:
+            self._moved[_place(event.period.comparison)] = start
+            self.notes.append(f"{', '.join(event.calls)} at {limit // period * period} -> {start}")
+
+    def arguments(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a function's arguments with the options that changed; objects that hold them are copied."""
+        result = dict(values)
+        for (variable, attribute), value in self.options.items():
+            if variable not in result:
+                continue
+            if not attribute:
+                result[variable] = value
+                continue
+            if result[variable] is values[variable]:
+                result[variable] = copy.copy(values[variable])
+            setattr(result[variable], attribute, value)
+        return result
+
+    def function(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a training function with the numbers that changed, compiled from the tree; the file stays as it is.
+
+        Args:
+            original: the function of the tree, whose globals are used.
+        """
+        arguments = {each.arg for each in ast.walk(self._function.args) if isinstance(each, ast.arg)}
+        elsewhere = {option: value for option, value in self.options.items() if option[0] not in arguments}
+        if not (self._numbers or self._moved or elsewhere):
+            return original
+        rewriter = _Rewriter(self._numbers, self._moved, elsewhere, _target_of(self._function))
+        tree = ast.Module([rewriter.visit(copy.deepcopy(self._function))], type_ignores=[])
+        original = inspect.unwrap(original)
+        code = original.__code__
+        made: dict[str, Any] = {}
+        flags = code.co_flags & FUTURE
+        compiled = compile(ast.fix_missing_locations(tree), code.co_filename, "exec", flags, dont_inherit=True)
+        exec(compiled, original.__globals__, made)
+        result: Callable[..., Any] = made[self._function.name]
+        return result
+
+
+class _Rewriter(ast.NodeTransformer):
+    """Replace numbers and options by numbers, and add the iteration of a moved event to its comparison."""
+
+    def __init__(
+        self,
+        numbers: Mapping[Place, Any],
+        moved: Mapping[Place, int],
+        options: Mapping[tuple[str, str], int],
+        variable: str,
+    ) -> None:
+        self._numbers, self._moved, self._options, self._variable = numbers, moved, options, variable
+
+    def visit(self, node: ast.AST) -> Any:
+        if not isinstance(node, ast.expr):
+            return self.generic_visit(node)
+        place = _place(node)
+        if place in self._numbers and not isinstance(node, ast.Compare):
+            return ast.copy_location(ast.Constant(self._numbers[place]), node)
+        option = Operand(node, False, ast.Eq, node).option
+        if option is not None and option in self._options and isinstance(getattr(node, "ctx", None), ast.Load):
+            return ast.copy_location(ast.Constant(self._options[option]), node)
+        made = cast("ast.expr", self.generic_visit(node))
+        if place in self._moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
+            at = self._moved[place]
+            texts = f"{self._variable} < {at}", f"{self._variable} == {at}"
+            before, then = (ast.parse(text, mode="eval").body for text in texts)
+            either = ast.BoolOp(ast.Or(), [ast.BoolOp(ast.And(), [made, before]), then])
+            return ast.copy_location(either, node)
+        return made
+
+
+def _place(node: ast.expr) -> Place:
+    return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
+
+
+def _iteration_loop(function: ast.FunctionDef) -> ast.For | None:
+    """Return the longest loop over a range."""
+    loops = [
+        node
+        for node in ast.walk(function)
+        if isinstance(node, ast.For) and isinstance(node.target, ast.Name) and "range" in _names(node.iter)
+    ]
+    return max(loops, key=lambda loop: sum(1 for _ in ast.walk(loop)), default=None)
+
+
+def _target(loop: ast.For) -> str:
+    assert isinstance(loop.target, ast.Name)
+    return loop.target.id
+
+
+def _target_of(function: ast.FunctionDef) -> str:
+    loop = _iteration_loop(function)
+    assert loop is not None, "without a loop nothing changes"
+    return _target(loop)
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+def _events(body: Iterable[ast.AST], variable: str, around: tuple[Operand, ...]) -> Iterator[Event]:
+    """Yield the events of statements."""
+    for node in body:
+        if isinstance(node, (ast.If, ast.While)):
+            calls = tuple(dict.fromkeys(_calls(node.body)))
+            alternatives = _alternatives(node.test)
+            for test in alternatives:
+                if operands := tuple(_operands(test, variable)):
+                    yield Event(test, operands, around, calls)
+            inside = tuple(_operands(node.test, variable)) if len(alternatives) == 1 else ()
+            yield from _events(node.body, variable, around + inside)
+            yield from _events(node.orelse, variable, around)
+        elif isinstance(node, (ast.stmt, ast.ExceptHandler, ast.match_case)) and hasattr(node, "body"):
+            yield from _events(ast.iter_child_nodes(node), variable, around)
+        elif operands := tuple(_operands(node, variable)):
+            yield from (Event(each.comparison, (each,), around, ()) for each in operands)
+
+
+def _alternatives(test: ast.expr) -> list[ast.expr]:
+    if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.Or):
+        return [each for value in test.values for each in _alternatives(value)]
+    return [test]
+
+
+def _operands(expression: ast.AST, variable: str) -> Iterator[Operand]:
+    """Yield what a variable is compared with in an expression."""
+    for node in ast.walk(expression):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            for left, operator, right in zip(sides, node.ops, sides[1:], strict=False):
+                kind = type(operator)
+                if variable in _names(left):
+                    yield _operand(left, right, kind, variable, node)
+                elif variable in _names(right) and kind not in (ast.In, ast.NotIn):
+                    yield _operand(right, left, FLIPPED.get(kind, kind), variable, node)
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not) and _divides(node.operand, variable):
+            yield _operand(node.operand, node.operand, ast.Eq, variable, node)
+
+
+def _operand(
+    side: ast.expr, other: ast.expr, operator: type[ast.cmpop], variable: str, comparison: ast.expr
+) -> Operand:
+    for node in ast.walk(side):
+        if isinstance(node, ast.BinOp) and _divides(node, variable):
+            return Operand(node.right, True, operator, comparison)
+    return Operand(other, False, operator, comparison)
+
+
+def _divides(node: ast.expr, variable: str) -> bool:
+    return isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod) and variable in _names(node.left)
+
+
+def _calls(body: Iterable[ast.stmt]) -> Iterator[str]:
+    """Yield the names of functions that statements call, and of methods of variables: `gaussians.prune`."""
+    for node in (each for statement in body for each in ast.walk(statement)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not hasattr(builtins, node.func.id):
+            yield node.func.id
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            owner = node.func.value
+            if isinstance(owner, ast.Name) and owner.id not in LIBRARIES and not owner.id.startswith("progress"):
+                yield node.func.attr

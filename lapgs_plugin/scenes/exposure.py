@@ -1,0 +1,117 @@
+"""Measure from the photos of a scene whether exposure and white balance change between them.
+
+Each sparse point is looked up in all photos that see it. A photo's gain is the factor by which its points are brighter
+than the same points in the other photos. Points hidden behind others are left out as far as nearer points tell; the
+rest of them spread widely, so that the mode of the differences is hardly affected. Gains are measured for the left and
+the right half of each photo separately: a change of exposure moves both halves alike, reflections and shadows do not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.scenes.scene import Scene, View
+
+POINTS = 4_000
+"""Most sparse points that are looked up."""
+SIDE = 250
+"""Pixels of the longer side of photos that are looked at: a pixel then covers what blur and pose errors blend."""
+CELLS, DEPTH_MARGIN = 30, 1.05
+"""Points further than the nearest one of their cell times the margin count as hidden; a photo has CELLS x CELLS."""
+DARKEST, BRIGHTEST = 0.04, 0.96
+"""Values outside are noise or clipped, and tell nothing about a gain."""
+LEAST_POINTS, LEAST_VIEWS = 40, 4
+"""Fewest visible points of half a photo, and fewest photos of a point, with which a gain is measured."""
+BANDWIDTHS = (0.5, 0.25, 0.15, 0.15)
+"""Of the steps towards a mode, in stops."""
+ROUNDS = 3
+"""How often points' colours and photos' gains are estimated in turn."""
+
+
+@dataclass(frozen=True)
+class MeasuredExposure:
+    """Hold how the exposure of a scene's training photos differs.
+
+    Attributes:
+        gains: (v, 3) base-2 logarithm of the gain of each photo and channel, with median 0 over photos; 0 where a photo
+            shows too few points.
+        spread: robust standard deviation, in stops, of the photos' gains, without what its two halves disagree on.
+    """
+
+    gains: Tensor  # (v, 3)
+    spread: float
+
+
+def measure_exposure(scene: Scene) -> MeasuredExposure:
+    """Measure how the exposure of a scene's training photos differs; a spread of 0 if too few points are visible."""
+    chosen = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:POINTS]
+    looked_up = [_colors_of(view, scene.points[chosen]) for view in scene.train]
+    colors, right = (torch.stack(each) for each in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)
+    usable = ((colors > DARKEST) & (colors < BRIGHTEST)).all(-1)  # (v, n)
+    often = usable.sum(0) >= LEAST_VIEWS
+    usable, right = usable[:, often], right[:, often]
+    colors = colors[:, often].clamp(DARKEST, BRIGHTEST)
+    brightness = colors.mean(-1).log2()
+    halves = [usable & side for side in (~right, right)]
+    known = torch.stack([half.sum(1) >= LEAST_POINTS for half in halves]).all(0)  # (v,)
+    gains = torch.zeros(len(scene.train), 3)
+    if int(known.sum()) < LEAST_VIEWS:
+        return MeasuredExposure(gains, 0.0)
+    whole = brightness.new_zeros(len(brightness))
+    for _ in range(ROUNDS):
+        points = _modes((brightness - whole[:, None]).T, usable.T)
+        whole = _modes(brightness - points, usable)
+        whole = whole - whole[known].median()
+    left, other = (_modes(brightness - points, half)[known] for half in halves)
+    for channel in range(3):
+        by_channel = colors[..., channel].log2()
+        points = _modes((by_channel - whole[:, None]).T, usable.T)
+        found = _modes(by_channel - points, usable)
+        gains[known, channel] = (found - found[known].median())[known]
+    agreed, disagreed = (_robust_deviation((left + sign * other) / 2) for sign in (1, -1))
+    return MeasuredExposure(gains, math.sqrt(max(0.0, agreed**2 - disagreed**2)))
+
+
+def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the colours (n, 3) of a photo at sparse points, 0 where it does not see them, and (n,) which are right."""
+    step = max(1, round(max(view.camera.width, view.camera.height) / SIDE))
+    small = torch.nn.functional.avg_pool2d(view.image[None], step) if step > 1 else view.image[None]
+    x, y, seen = _visible(view.camera, points)
+    if view.mask is not None:
+        row, column = (y * view.camera.height).long(), (x * view.camera.width).long()
+        inside = view.mask[0, row.clamp(0, view.camera.height - 1), column.clamp(0, view.camera.width - 1)]
+        seen = seen & inside
+    grid = torch.stack([2 * x - 1, 2 * y - 1], -1).nan_to_num()
+    colors = torch.nn.functional.grid_sample(small, grid[None, None], padding_mode="border", align_corners=False)
+    middle = x[seen].median() if bool(seen.any()) else x.new_zeros(())
+    return colors[0, :, 0].T * seen[:, None], x >= middle
+
+
+def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Project points: (n,) x and y in image widths and heights, and which of them no nearer one seems to hide."""
+    x, y, depth = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(-1)
+    x = (camera.fx * x / depth + camera.cx) / camera.width
+    y = (camera.fy * y / depth + camera.cy) / camera.height
+    inside = (depth > 0) & (x > 0) & (x < 1) & (y > 0) & (y < 1)
+    cell = torch.where(inside, (CELLS * y).floor() * CELLS + (CELLS * x).floor(), 0.0).long()
+    nearest = torch.full((CELLS * CELLS,), math.inf).scatter_reduce(0, cell[inside], depth[inside], "amin")
+    return x, y, inside & (depth <= nearest[cell] * DEPTH_MARGIN)
+
+
+def _modes(values: Tensor, usable: Tensor) -> Tensor:
+    """Return the mode of the usable values of each row by mean shift from the median; 0 for a row without any."""
+    mode = torch.where(usable, values, math.nan).nanmedian(dim=1).values.nan_to_num()
+    for bandwidth in BANDWIDTHS:
+        weights = torch.exp(-(((values - mode[:, None]) / bandwidth) ** 2)) * usable
+        mode = (weights * values).sum(1) / weights.sum(1).clamp_min(1e-6)
+    return mode
+
+
+def _robust_deviation(values: Tensor) -> float:
+    """Return the standard deviation that a normal distribution of the same median absolute deviation has."""
+    return 1.4826 * float((values - values.median()).abs().median())

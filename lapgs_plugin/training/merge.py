@@ -1,0 +1,184 @@
+"""Merge a run's levels into one ordinary field: fit a field to the images that the run composes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from scipy.spatial import cKDTree
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import render_image
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.progress import item_progress
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
+from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+
+ITERATIONS = 3000
+FAINT = 0.3
+"""Factor on the opacities of residuals in the first field: they refine the base, and do not cover it."""
+MEANS_RATE = 4e-5
+"""First learning rate of positions, a quarter of 3DGS's: they are nearly right."""
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The field that approximates a run.
+
+    Attributes:
+        field: an ordinary field.
+        kept: PSNR in dB of its images against the run's, mean over views that it was not fitted to.
+        views: number of these views.
+        photo_psnr: PSNR in dB of the run and of the field against the held-out photos, inside of masks; None without
+            held-out views.
+    """
+
+    field: GaussianField
+    kept: float
+    views: int
+    photo_psnr: tuple[float, float] | None
+
+
+def merge_levels(
+    archive: RunArchive, moved_to: Path | None = None, *, iterations: int = ITERATIONS, monitor: Monitor | None = None
+) -> Merged:
+    """Fit an ordinary field to a run's composed images of its training views.
+
+    Args:
+        archive: a complete run with residuals.
+        moved_to: the scene's folder now; None if it did not move.
+        iterations: number of views to fit.
+        monitor: shows progress.
+
+    Raises:
+        UserInputError: the run has no residuals, and needs no merging.
+        RunFolderError, SceneError: a field or the scene cannot be read.
+    """
+    manifest = archive.manifest
+    fields = {level: archive.field(level) for level in range(manifest.levels - 1, -1, -1)}
+    if not fields[0].signed:
+        raise UserInputError(
+            f"{archive.path()}: level 0 is an ordinary field already, which needs no --merge; leave it out"
+        )
+    with one_pool(), tempfile.TemporaryDirectory(prefix="lapgs-merge-") as scratch:
+        renderer, scene = run_renderer(archive), run_scene(archive, moved_to)
+        teacher = _composed(renderer, scene)
+        start = first_field(fields)
+        settings = _settings(manifest, start.sh_degree, iterations)
+        reference = replace(manifest.scene, eval=True)
+        placed = training_rasterizer(choose_rasterizer(AUTO), settings)
+        empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
+        with RunArchive.create(Path(scratch) / "run", empty) as fitted:
+            trainer = _Distillation(
+                scene=teacher,
+                settings=settings,
+                archive=fitted,
+                rasterizer=placed.rasterizer,
+                device=placed.device,
+                monitor=monitor or Monitor(),
+            )
+            trainer.start = start
+            trainer.run()
+            field = fitted.field(0)
+        return _measured(field, teacher, scene, placed)
+
+
+def first_field(fields: dict[int, GaussianField]) -> GaussianField:
+    """Return base and residuals as one ordinary field to start from.
+
+    Residuals keep their geometry, get a lower opacity, and add their colour to that of the nearest Gaussian of the
+    base.
+    """
+    base = fields[max(fields)]
+    degree = max(field.sh.shape[1] for field in fields.values())
+    tree = cKDTree(base.means.numpy())
+    parts = [replace(base, sh=_padded(base.sh, degree))]
+    for level in range(max(fields) - 1, -1, -1):
+        residual = fields[level]
+        nearest = torch.from_numpy(tree.query(residual.means.numpy())[1])
+        faint = torch.logit((FAINT * torch.sigmoid(residual.opacity_logits)).clamp(1e-4, 1 - 1e-4))
+        sh = _padded(residual.sh, degree) + _padded(base.sh[nearest], degree)
+        parts.append(replace(residual, opacity_logits=faint, sh=sh, signed=False))
+    return parts[0].with_parameters(
+        {name: torch.cat([part.parameters[name] for part in parts]) for name in parts[0].parameters}
+    )
+
+
+def _padded(sh: torch.Tensor, count: int) -> torch.Tensor:
+    """Return coefficients (n, k, 3) with zeros up to (n, count, 3)."""
+    return torch.cat([sh, sh.new_zeros(len(sh), count - sh.shape[1], 3)], dim=1)
+
+
+class _Distillation(Trainer):
+    """Train one field that starts from a given one."""
+
+    start: GaussianField
+
+    def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
+        rates, extent = self.settings.rates, self.scene.extent
+        return TrainableField.create(self.start.to(self.device), rates, extent, sparse=self.settings.sparse_adam)
+
+
+def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSettings:
+    return TrainSettings(
+        iterations=iterations,
+        levels=1,
+        sh_degree=sh_degree,
+        sh_every=1,
+        sh_rate_factor=1.0,
+        seed=manifest.seed,
+        learning_rates=LearningRates(means_first=MEANS_RATE),
+        densification=Densification(until=0, reset_every=0),
+        antialiased=bool(manifest.settings.get("antialiased", False)),
+    )
+
+
+def _composed(renderer: HierarchyRenderer, scene: Scene) -> Scene:
+    """Return the scene with the run's images; some training views are held out if none were."""
+    train, test = list(scene.train), list(scene.test)
+    if not test:
+        test = train[::HOLD_OUT_EVERY]
+        train = [view for index, view in enumerate(train) if index % HOLD_OUT_EVERY] or train
+
+    def rendered(views: Sequence[View], title: str) -> tuple[View, ...]:
+        with item_progress("views") as bar, torch.no_grad():
+            return tuple(
+                replace(view, image=renderer.images([view.camera], 0)[0].clamp(0, 1).cpu(), mask=None)
+                for view in bar.track(views, description=title)
+            )
+
+    return replace(scene, train=rendered(train, "Rendering views"), test=rendered(test, "Held-out views"))
+
+
+@torch.no_grad()
+def _measured(field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer) -> Merged:
+    on_device, photos = field.to(placed.device), {view.name: view for view in scene.test}
+    background = torch.tensor(scene.background, device=placed.device)
+    kept, against_photos = [], []
+    for view in teacher.test:
+        image = render_image(placed.rasterizer, on_device, view.camera, background).cpu()
+        kept.append(psnr(image, view.image))
+        if (photo := photos.get(view.name)) is not None:
+            run_and_field = (psnr(each, photo.image, photo.mask) for each in (view.image, image))
+            against_photos.append(tuple(run_and_field))
+    means = tuple(map(fmean, zip(*against_photos, strict=True)))
+    return Merged(field, fmean(kept), len(kept), (means[0], means[1]) if means else None)

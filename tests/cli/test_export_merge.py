@@ -1,0 +1,88 @@
+"""`lapgs export --merge`: an ordinary field that shows about what a run with residuals composes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.splat import splat_bytes
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.run import run_cameras, run_renderer
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.training.merge import FAINT, first_field
+from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
+from tests.cli.test_export import lapgs_export
+
+
+def _kept(run: Path, field: GaussianField) -> float:
+    """Mean PSNR of a field against the run's composed images of the held-out views."""
+    renderer, cameras = run_renderer(RunArchive.open(run)), run_cameras(RunArchive.open(run))[1].values()
+    background, values = torch.tensor(BACKGROUND), []
+    with torch.no_grad():
+        for camera in cameras:
+            image = CpuRasterizer()(field, camera, background=background).image
+            values.append(psnr(image, renderer.render(camera).composed[0].clamp(0, 1)))
+    return fmean(values)
+
+
+def test_the_merged_field_keeps_most_of_the_image(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+    output = lapgs_export(run, "--merge", "--iterations", 60)
+    assert files_in(run / "export") == {"merged.ply"}
+    merged = GaussianField.load_ply(run / "export" / "merged.ply")
+    assert not merged.signed
+    kept, views, photo, before = re.findall(
+        r"([0-9.]+) dB PSNR .* of (\d+) views .* photos ([0-9.]+) dB, where the run has ([0-9.]+)", output
+    )[0]
+    assert int(views) == 2
+    assert float(kept) == pytest.approx(_kept(run, merged), abs=0.01)
+    archive = RunArchive.open(run)
+    started = _kept(run, first_field({level: archive.field(level) for level in (1, 0)}))
+    assert float(kept) > started + 2  # seen 3.1
+    assert float(photo) == pytest.approx(float(before), abs=0.5)  # seen 0.02
+
+
+def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:
+    archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
+    base, residual = archive.field(1), archive.field(0)
+    field = first_field({1: base, 0: residual})
+    assert not field.signed
+    assert torch.equal(field.means, torch.cat([base.means, residual.means]))
+    assert torch.equal(field.sh[: len(base)], base.sh)
+    nearest = cdist(residual.means.numpy(), base.means.numpy()).argmin(axis=1)
+    expected = base.sh.numpy()[nearest] + residual.sh.numpy()
+    assert np.array_equal(field.sh[len(base) :].numpy(), expected)
+    opacities = torch.sigmoid(field.opacity_logits[len(base) :])
+    assert torch.allclose(opacities, FAINT * torch.sigmoid(residual.opacity_logits), atol=1e-5)
+
+
+def test_a_page_of_a_run_with_residuals(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), hold_out=False)
+    output = lapgs_export(run, "--merge", "--html", "--iterations", 4)
+    assert "of 2 views that it was not fitted to" in output
+    assert "photos" not in output, "none are held out"
+    assert files_in(run / "export") == {"scene.html"}
+    assert len(splat_bytes(RunArchive.open(run).field(1))) * 4 / 3 < (run / "export" / "scene.html").stat().st_size
+
+
+def test_runs_that_cannot_be_merged_are_one_line(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    nested = write_run(tmp_path / "nested", scene, nested=True)
+    with pytest.raises(UserInputError, match="level 0 is an ordinary field already, which needs no --merge"):
+        lapgs_export(nested, "--merge")
+    with pytest.raises(UserInputError, match="--iterations needs --merge"):
+        lapgs_export(nested, "--iterations", 10)
+    with pytest.raises(UserInputError, match="--level does not go with --merge"):
+        lapgs_export(nested, "--merge", "--level", 0)
+    assert not (nested / "export").exists()
+    with pytest.raises(RunFolderError, match="level 0 is not in this run"):
+        lapgs_export(write_run(tmp_path / "half", scene, finished=1), "--merge")

@@ -1,0 +1,209 @@
+"""Compensation of exposure: the op, the measure, the transforms of a run, and PSNR after a colour fit."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.ops.color_transform import transform_colors
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.exposure import measure_exposure
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, identities
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import ring_camera, ring_scene
+
+STOPS = (0.0, 0.9, -0.7, 0.4, -0.5, 0.2)
+
+
+def test_transform_and_its_gradients_are_the_closed_form() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image, by_out = (torch.randn(2, 3, 5, 7, generator=generator, dtype=torch.float64) for _ in range(2))
+    transform = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64)
+    leaves = image.clone().requires_grad_(), transform.clone().requires_grad_()
+    out = transform_colors(*leaves)
+    expected = np.einsum("bij,bjhw->bihw", transform[:, :, :3], image) + transform[:, :, 3, None, None].numpy()
+    np.testing.assert_allclose(out.detach(), expected, atol=1e-14)
+    by_image, by_transform = torch.autograd.grad(out, leaves, by_out)
+    np.testing.assert_allclose(by_image, np.einsum("bij,bihw->bjhw", transform[:, :, :3], by_out), atol=1e-14)
+    ones = torch.cat([image, torch.ones_like(image[:, :1])], dim=1)
+    np.testing.assert_allclose(by_transform, np.einsum("bihw,bjhw->bij", by_out, ones), atol=1e-13)
+    assert torch.autograd.gradcheck(transform_colors, leaves)
+    one = transform_colors(image[0], transform[0])
+    torch.testing.assert_close(one, out[0].detach(), atol=1e-14, rtol=0)
+
+
+def test_measure_finds_the_gains_of_photos() -> None:
+    scene = wall_scene(STOPS)
+    measured = measure_exposure(scene)
+    expected = torch.tensor(STOPS) - torch.tensor(STOPS).median()
+    torch.testing.assert_close(measured.gains, expected[:, None].repeat(1, 3), atol=0.03, rtol=0)  # worst seen 0.005
+    assert measured.spread > 0.4
+    alike = measure_exposure(wall_scene((0.0,) * 6))
+    assert alike.spread < 0.01
+    assert alike.gains.abs().max() < 0.03
+    assert DIFFERENT > 0.01
+
+
+def wall_scene(stops: tuple[float, ...]) -> Scene:
+    """A smoothly coloured plane z = 0 seen from cameras before it, rendered by intersecting rays with it."""
+    scene = ring_scene(train=len(stops))
+    cameras = [ring_camera(0.2 * index - 0.5) for index in range(len(stops))]
+    generator = torch.Generator().manual_seed(1)
+    points = torch.cat([2 * torch.rand(500, 2, generator=generator) - 1, torch.zeros(500, 1)], dim=1)
+
+    def color(points: Tensor) -> Tensor:
+        waves = torch.tensor([[2.0, 1.0], [-1.5, 2.0], [1.0, -2.5]])
+        return 0.25 + 0.1 * torch.sin(points[..., :2] @ waves.T)
+
+    views = []
+    for view, camera, stop in zip(scene.train, cameras, stops, strict=True):
+        rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+        rays = torch.stack([columns + 0.5 - camera.cx, rows + 0.5 - camera.cy, torch.full(rows.shape, camera.fx)], -1)
+        rays = rays @ camera.world_to_camera[:3, :3]  # to the world's axes
+        places = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
+        views.append(replace(view, camera=camera, image=(color(places) * 2**stop).permute(2, 0, 1).contiguous()))
+    return replace(scene, train=tuple(views), points=points, colors=color(points))
+
+
+def test_transforms_learn_the_gains_of_photos_and_their_mean_stays_the_identity() -> None:
+    gains = torch.tensor([[0.8, 1.0, 1.3], [1.0, 1.3, 0.9], [1.2, 0.7, 0.8]])
+    names, image = ["a", "b", "c"], random_image(0)
+    exposures = ViewExposures.create(names, identities(3), torch.device("cpu"), 0, 600)
+    start = exposures.transforms.detach().clone()
+    for iteration in range(1, 601):
+        view = (iteration - 1) % 3
+        (exposures.apply([names[view]], image) - gains[view, :, None, None] * image).abs().mean().backward()
+        exposures.after_step(iteration, 1)
+        assert iteration != 2 or (exposures.transforms == start).all()  # one step in each pass over the views
+    expected = torch.cat([torch.diag_embed(gains), torch.zeros(3, 3, 1)], dim=2)
+    torch.testing.assert_close(exposures.transforms, expected, atol=0.02, rtol=0)  # worst seen 4e-4
+    torch.testing.assert_close(exposures.transforms.mean(0), torch.eye(3, 4), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
+def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
+    scene = wall_scene(STOPS)
+    settings = TrainSettings(iterations=60, hierarchy=hierarchy, exposure="on", sh_degree=0)
+    whole = train(scene, settings, tmp_path / "whole")
+    archived = whole.exposure(0)
+    assert archived is not None
+    gains = torch.tensor([archived[view.name] for view in scene.train])[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
+    assert torch.corrcoef(torch.stack([gains.log2(), torch.tensor(STOPS)]))[0, 1] > 0.98
+    torch.testing.assert_close(
+        torch.tensor([*archived.values()]).mean(0), torch.eye(3, 4), atol=1e-5, rtol=0
+    )  # worst seen 1e-7
+    for stop_at in ((1, 20), (0, 10)):
+        folder = tmp_path / f"stopped_{stop_at[0]}"
+        with pytest.raises(TrainingStoppedError):
+            train(scene, settings, folder, stop_at)
+        assert train(scene, settings, folder, resume=True).exposure(0) == archived
+        for level in (0, 1):
+            mine, theirs = (RunArchive.open(path).field(level).means for path in (folder, tmp_path / "whole"))
+            assert (mine == theirs).all()
+
+
+def test_compensation_beats_none_where_exposure_changes_and_is_left_out_where_it_does_not(tmp_path: Path) -> None:
+    found = {}
+    for choice in ("on", "off"):
+        archive = train(wall_scene(STOPS), TrainSettings(iterations=200, exposure=choice, levels=1), tmp_path / choice)
+        assert (archive.exposure(0) is None) == (choice == "off")
+        found[choice] = archive.history()[-1]["loss"]
+    assert found["on"] < 0.8 * found["off"]  # worst seen 0.6 of it
+    archive = train(wall_scene((0.0,) * 6), TrainSettings(iterations=12), tmp_path / "auto")
+    assert archive.exposure(0) is None
+    archive = train(wall_scene(STOPS), TrainSettings(iterations=12), tmp_path / "changing")
+    assert archive.exposure(0) is not None
+
+
+def train(
+    scene: Scene, settings: TrainSettings, folder: Path, stop_at: tuple[int, int] | None = None, resume: bool = False
+) -> RunArchive:
+    """Train a run; `stop_at` is level and iteration at which a user stops it."""
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), kind="colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
+    archive = RunArchive.open(folder, resume=True) if resume else RunArchive.create(folder, manifest)
+    with archive:
+        trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(stop_at))
+        trainer.run(resume)
+    return archive
+
+
+class StopAt(Monitor):
+    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
+
+    def __init__(self, place: tuple[int, int] | None) -> None:
+        self._place = place
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == self._place:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
+    settings = TrainSettings(iterations=12, exposure="on", levels=1)
+    archive = train(ring_scene(), settings, tmp_path / "run")
+    path = archive.path("level_0", "exposure.json")
+    path.write_text(json.dumps({"view_1.png": [[1.0, 0.0]]}))
+    with pytest.raises(RunFolderError, match=r"exposure\.json.*train again with --overwrite"):
+        RunArchive.open(tmp_path / "run").exposure(0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"exposure": "yes"}, "--exposure yes: expected auto, on, off"),
+        ({"exposure": "on", "supervision": "gt_laplacian"}, "--exposure on with --supervision gt_laplacian"),
+        ({"exposure": "on", "protocol": "paper"}, "--exposure on with --protocol paper"),
+    ],
+)
+def test_contradicting_choices_are_refused(given: dict[str, str], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        TrainSettings(**given)  # type: ignore[arg-type]
+
+
+def random_image(seed: int) -> Tensor:
+    return torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(seed))
+
+
+def test_color_fit_is_least_squares_and_measured_on_the_other_half() -> None:
+    image, noise = 0.2 + 0.5 * random_image(0), 0.01 * random_image(1)
+    mix = torch.tensor([[0.7, 0.1, 0.0, 0.05], [0.0, 0.9, 0.05, 0.0], [0.1, 0.0, 0.6, 0.1]])
+    target = transform_colors(image, mix) + noise
+    design = np.concatenate([image.flatten(1).numpy(), np.ones((1, 600))]).T.astype(np.float64)
+    expected = np.linalg.lstsq(design, target.flatten(1).numpy().T.astype(np.float64), rcond=None)[0].T
+    np.testing.assert_allclose(fit_colors(image, target), expected, atol=2e-4)  # worst seen 3e-5, by the tiny weight
+    assert color_fitted_psnr(image, target) > psnr(image, target) + 15
+    spoiled = target.clone()
+    spoiled[..., 15:] = random_image(2)[..., 15:]  # the right half, which the fit does not see
+    right = transform_colors(image[..., 15:], fit_colors(image[..., :15], target[..., :15]).float())
+    assert color_fitted_psnr(image, spoiled) == pytest.approx(psnr(right, spoiled[..., 15:]), abs=1e-3)
+
+
+def test_color_fit_counts_pixels_inside_of_masks() -> None:
+    image, mask = random_image(0), torch.ones(1, 20, 30, dtype=torch.bool)
+    target = 0.5 * image
+    target[:, :10], mask[:, :10] = 1.0, False
+    assert color_fitted_psnr(image, target, mask) > 60 > color_fitted_psnr(image, target)
+
+
+def test_color_fit_of_one_color_stays_near_the_identity() -> None:
+    grey = torch.full((3, 4, 6), 0.5)
+    assert color_fitted_psnr(grey, grey) > 60
+    assert psnr(transform_colors(grey, fit_colors(grey, grey * 1.2).float()), grey * 1.2) > 60
+    empty = torch.zeros(1, 4, 6, dtype=torch.bool)
+    torch.testing.assert_close(fit_colors(grey, grey, empty), identities(1)[0].double())

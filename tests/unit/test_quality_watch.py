@@ -1,0 +1,171 @@
+"""Held-out views measured during stages: when, which, and when a run says that it gets worse."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+from torch import Tensor
+
+from lapgs_plugin.errors import TrainingStoppedError, UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.quality import FALL, SAMPLES_OF_A_STAGE, QualityWatch, set_aside, spread_views
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.trainer import Trainer, make_plan
+from tests.training_scene import ring_scene
+
+
+def test_two_worse_measurements_in_a_row_with_a_falling_loss_are_a_fall() -> None:
+    watch = QualityWatch()
+    measured = [(1, 20.0, 0.2), (1, 22.0, 0.1), (0, 20.0, 0.3), (0, 19.0, 0.2), (0, 18.0, 0.1), (0, 17.0, 0.05)]
+    assert [watch.falls(*each) for each in measured] == [False] * 4 + [True, False]  # a level's first is never judged
+    assert watch.best == 22.0
+
+
+@pytest.mark.parametrize(
+    "then",
+    [
+        [(22.0 - FALL + 0.01, 0.09), (22.0 - FALL + 0.01, 0.08)],  # about as good
+        [(19.0, 0.12), (18.0, 0.13)],  # the loss rises as well: training, not overfitting, went wrong
+        [(9.0, 0.09), (22.0, 0.08), (9.0, 0.07)],  # passing
+    ],
+)
+def test_no_fall(then: list[tuple[float, float]]) -> None:
+    watch = QualityWatch()
+    assert not any(watch.falls(0, *each) for each in [(22.0, 0.1), *then])
+
+
+def test_samples_are_spread_and_avoid_resets() -> None:
+    settings = TrainSettings(iterations=7000)
+    stage = Stage(1, (100, 100), 3500, signed=False)
+    schedule = StageSchedule.create(settings, stage, views=8)
+    assert schedule.reset_every == 700
+    assert schedule.sampled(5) == {700 - 8, 1400 - 8, 2100, 2800, 3500}  # densification ends at 1750
+    done, ends = 0, []
+    while done < 3500:
+        done += schedule.views_of_step(done)
+        ends.append(done)
+    for sample in (692, 1392):
+        assert min(end for end in ends if end >= sample) % 700 != 0  # measured before the reset, not after it
+
+
+def train(
+    scene: Scene, settings: TrainSettings, folder: Path, monitor: Monitor, *hooks: StageHook, resume: bool = False
+) -> RunArchive:
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), kind="colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
+    with RunArchive.open(folder, resume=True) if resume else RunArchive.create(folder, manifest) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer(), user_hooks=hooks, monitor=monitor).run(resume)
+    return archive
+
+
+def test_a_run_measures_some_held_out_views_during_its_stages(tmp_path: Path) -> None:
+    scene, settings = ring_scene(train=5, test=3), TrainSettings(iterations=40, sh_degree=0)
+    archive = train(scene, settings, tmp_path / "run", Monitor())
+    history = archive.history()
+    sampled = [entry for entry in history if "sampled_psnr" in entry]
+    assert [entry["iteration"] for entry in sampled] == 2 * [4, 8, 12, 16, 20]
+    ends = [entry for entry in history if "psnr" in entry]
+    assert [entry["iteration"] for entry in ends] == [20, 20]
+    for entry in ends:  # so few views that some are all
+        assert entry["sampled_psnr"] == pytest.approx(entry["psnr"])
+
+
+class StopAt(Monitor):
+    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
+
+    def __init__(self, place: tuple[int, int]) -> None:
+        self._place = place
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == self._place:
+            signal.raise_signal(signal.SIGINT)
+
+
+class Said(Monitor):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = iter([30.0 - step for step in range(100)])
+    monkeypatch.setattr(Trainer, "_psnr", lambda *_: (next(values),) * 2)
+    scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
+    monitor = Said()
+    train(scene, settings, tmp_path / "run", monitor)
+    (line,) = monitor.lines
+    assert line.startswith("level 0, iteration ")
+    assert "held-out PSNR fell to 2" in line
+    assert "--exposure on" in line
+
+
+class Names(StageHook):
+    def __init__(self) -> None:
+        self.seen: set[str] = set()
+
+    def before_render(self, context: StageContext) -> None:
+        self.seen.add(context.view)
+
+
+def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By invented measurements the base is best at its fourth sample, the residual, in joint training, at its ninth."""
+    scene = ring_scene(train=12, test=0)
+    settings = TrainSettings(iterations=80, sh_degree=0, keep="best", exposure="on", joint=0.5)
+    aside = [view.name for view in set_aside(scene.train)]
+    assert len(aside) == 2
+    fields: dict[tuple[int, int], Tensor] = {}
+    along: dict[tuple[int, int], Tensor] = {}
+
+    def invented(_: Trainer, run: StageRun, view: View) -> tuple[float, float]:
+        assert view.name in aside
+        assert run.exposures is not None
+        place = run.stage.level, run.progress.iteration
+        fields[place] = run.model.field.means.detach().clone()
+        if run.joint is not None:
+            along[place] = run.joint.fields[1].means.clone()
+        return 0.0, 20.0 + (place in {(1, 16), (0, 36)})
+
+    monkeypatch.setattr(Trainer, "_psnr", invented)
+    names, monitor = Names(), Said()
+    whole = train(scene, settings, tmp_path / "whole", monitor, names)
+    assert names.seen == {view.name for view in scene.train} - set(aside)
+    assert (whole.field(1).means == along[0, 36]).all()
+    assert (whole.field(0).means == fields[0, 36]).all()
+    assert sum("1.00 dB better than the last one on 2 training views" in line for line in monitor.lines) == 2
+    exposure = whole.exposure(0)
+    assert exposure is not None
+    assert set(exposure) == names.seen
+    for level, iteration in ((1, 20), (0, 38)):
+        folder = tmp_path / f"stopped_{level}"
+        with pytest.raises(TrainingStoppedError):
+            train(scene, settings, folder, StopAt((level, iteration)))
+        again = train(scene, settings, folder, Monitor(), resume=True)
+        assert [(again.field(each).means == whole.field(each).means).all() for each in (1, 0)] == [True, True]
+        assert again.exposure(0) == exposure
+
+
+def test_keep_best_needs_views_to_set_aside() -> None:
+    with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 6, expected at least 12"):
+        make_plan((56, 40), TrainSettings(keep="best"), 6)
+    with pytest.raises(UserInputError, match="--keep first: expected last or best"):
+        TrainSettings(keep="first")
+
+
+def test_spread_views_are_the_same_and_evenly_spread() -> None:
+    assert spread_views(range(100), 4) == [12, 37, 62, 87]
+    assert spread_views(range(3), 8) == [0, 1, 2]
+    assert SAMPLES_OF_A_STAGE >= 3  # two in a row, and a first

@@ -1,0 +1,149 @@
+"""Test what is found in training functions and changed in them, by calling the functions."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
+
+from lapgs_plugin.checkouts.schedule import Schedule
+
+LOOP = """
+def training(opt, args, testing_iterations, seen, unused=None):
+    first_iter = 0
+    for each in testing_iterations:
+        pass
+    for iteration in range(first_iter + 1, opt.iterations + 1):
+        if iteration % 1000 == 0:
+            seen.oneupSHdegree(iteration)
+        if iteration in testing_iterations:
+            seen.report(iteration)
+        if iteration % 10 == 0:
+            print(end="")
+        if iteration < opt.densify_until_iter:
+            if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                seen.densify(iteration)
+            if iteration % opt.opacity_reset_interval == 0 or (opt.white and iteration == opt.densify_from_iter):
+                seen.reset_opacity(iteration)
+        if iteration % 3000 == 0 and 15_000 < iteration < 30_000:
+            seen.prune_late(iteration)
+        if (iteration >= opt.prune_from) and (iteration < opt.prune_until) and not iteration % opt.prune_interval:
+            seen.prune_hard(iteration)
+        if iteration % opt.culling == 0:
+            seen.simplify(iteration)
+        if iteration == 15_500 or iteration in [18_000, 500]:
+            seen.unlock(iteration)
+        if iteration == GLOBAL.late:
+            seen.once(iteration)
+        if iteration == opt.iterations:
+            seen.close(iteration)
+"""
+
+OPT = {
+    "iterations": 30_000, "densify_until_iter": 15_000, "densify_from_iter": 500, "densification_interval": 100,
+    "opacity_reset_interval": 3000, "white": False, "prune_from": 6000, "prune_until": 30_000, "prune_interval": 3000,
+    "culling": 5000,
+}  # fmt: skip
+
+
+class Seen:
+    """Note the iterations at which each method is called."""
+
+    def __init__(self) -> None:
+        self.at: dict[str, list[int]] = {}
+
+    def __getattr__(self, name: str) -> Callable[[int], None]:
+        return self.at.setdefault(name, []).append
+
+
+class Window:
+    """A stage of `iterations` of 30,000."""
+
+    total = 30_000
+
+    def __init__(self, iterations: int) -> None:
+        self._iterations = iterations
+
+    def scaled(self, iterations: int) -> int:
+        return round(Fraction(iterations * self._iterations, self.total))
+
+
+def trained(stage: int | None, **opt: Any) -> tuple[dict[str, list[int]], list[str]]:
+    """Run the loop, as it is or for a stage of so many iterations; return calls by name, and what was changed."""
+    tree = ast.parse(LOOP)
+    namespace: dict[str, Any] = {"GLOBAL": SimpleNamespace(late=20_000)}
+    exec(compile(tree, "train.py", "exec"), namespace)
+    function, seen = namespace["training"], Seen()
+    own = SimpleNamespace(**{**OPT, **opt})
+    values = {"opt": own, "args": None, "testing_iterations": [7], "seen": seen, "unused": None}
+    if stage is None:
+        function(**values)
+        return seen.at, []
+    definition = tree.body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    window = Window(stage)
+    of_stage = SimpleNamespace(
+        **{**vars(own), "iterations": stage, "densify_until_iter": window.scaled(own.densify_until_iter)}
+    )
+    changed = Schedule(definition).for_stage({**namespace, **values}, {**values, "opt": of_stage}, window)
+    changed.function(function)(**changed.arguments({**values, "opt": of_stage}))
+    assert (vars(own), namespace["GLOBAL"].late) == ({**OPT, **opt}, 20_000), "the script's own options stay"
+    assert namespace["training"] is function
+    return seen.at, changed.notes
+
+
+def test_late_events_keep_their_share_and_all_else_its_count() -> None:
+    whole, _ = trained(None)
+    half, notes = trained(15_000)
+    for name in ("prune_late", "prune_hard", "once"):
+        assert half[name] == [i // 2 for i in whole[name]], name
+        assert len(half[name]) > 0
+    assert half["unlock"] == [500, 7750, 9000], "an early iteration is warm-up"
+    assert half["oneupSHdegree"] == list(range(1000, 15_001, 1000))
+    assert half["densify"] == list(range(600, 7500, 100))
+    assert half["reset_opacity"] == [3000, 6000]
+    assert half["report"] == [7], "lists are mapped by the adapter"
+    assert half["close"] == [15_000]
+    assert {"3000 -> 1500", "15500 -> 7750", "opt.prune_interval -> 1500", "GLOBAL.late -> 10000"} <= set(notes)
+
+
+def test_a_rare_harmful_event_leaves_the_last_tenth_of_a_stage_alone() -> None:
+    """A period of 5000 would simplify in the last iteration of a stage of 15,000, not in the last tenth of 16,800."""
+    moved, notes = trained(15_000)
+    assert moved["simplify"] == [5000, 10_000, 13_500]
+    assert "simplify at 15000 -> 13500" in notes
+    kept, notes = trained(16_800)
+    assert kept["simplify"] == [5000, 10_000, 15_000]
+    assert not any("simplify" in note for note in notes)
+    # Hard pruning every 3000 until the end, and every 1500 until the end of half as many iterations, ends before both.
+    assert moved["prune_hard"][-1] == 13_500
+
+
+def test_a_stage_as_long_as_the_run_changes_nothing_but_its_last_tenth() -> None:
+    as_it_is, _ = trained(None)
+    whole, notes = trained(30_000)
+    assert notes == ["simplify at 30000 -> 27000"]
+    assert whole == {**as_it_is, "simplify": [*range(5000, 30_000, 5000), 27_000]}
+
+
+def test_events_are_listed_with_the_values_of_their_options() -> None:
+    definition = ast.parse(LOOP).body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    lines = Schedule(definition).describe({"opt": SimpleNamespace(**OPT), "testing_iterations": [7]})
+    assert lines[:5] == [
+        "line 7: iteration % 1000 == 0 (oneupSHdegree)",
+        "line 9: iteration in [7] (report)",
+        "line 13: iteration < 15000 (densify, reset_opacity)",
+        "line 14: iteration > 500 and iteration % 100 == 0 (densify)",
+        "line 16: iteration % 3000 == 0 (reset_opacity)",
+    ]
+    assert "line 26: iteration == GLOBAL.late (once)" in lines
+    assert not any("print" in line or "close" in line for line in lines)
+
+
+def test_functions_without_a_loop_have_no_events() -> None:
+    definition = ast.parse("def training(opt):\n    while opt.more():\n        opt.step()\n").body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    assert Schedule(definition).events == []
