@@ -23,20 +23,22 @@ if TYPE_CHECKING:
 
 MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
 """Factor on the sizes, and opacity, of a base field that starts from points: as MCMC's authors start it."""
-MCMC_REGULARIZATION = 0.01
-"""Weight of the mean opacity and of the mean standard deviation in the loss."""
 
 
 class DensityControl:
     """Edit the field of one stage between iterations. Every method but `after_step` may be left as it is.
+
+    Args:
+        opacity_weight, scale_weight: of the mean opacity and the mean standard deviation in the loss.
 
     Attributes:
         state: statistics it keeps between iterations, for checkpoints: tensors, numbers, or None where there are no
             sums over Gaussians, (n,), yet.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:
         self.state: dict[str, Any] = {}
+        self._opacity_weight, self._scale_weight = opacity_weight, scale_weight
 
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether `after_step` of that iteration needs more of a render than its image."""
@@ -76,8 +78,13 @@ class DensityControl:
         raise NotImplementedError
 
     def regularization(self, field: GaussianField) -> Tensor | None:
-        """Return a term of the loss, or None."""
-        return None
+        """Return a term of the loss that makes unneeded Gaussians transparent and small; None if its weights are 0."""
+        terms = []
+        if self._opacity_weight:
+            terms.append(self._opacity_weight * torch.sigmoid(field.opacity_logits).mean())
+        if self._scale_weight:
+            terms.append(self._scale_weight * torch.exp(field.log_scales).mean())
+        return sum(terms[1:], terms[0]) if terms else None
 
 
 class Densifier(DensityControl):
@@ -90,6 +97,7 @@ class Densifier(DensityControl):
     """
 
     def __init__(self, schedule: StageSchedule, options: Default, extent: float) -> None:
+        super().__init__(options.opacity_weight, options.scale_weight)
         self._schedule = schedule
         self._strategy = DefaultStrategy(
             grow_grad2d=options.grow_grad2d,
@@ -173,6 +181,7 @@ class McmcDensifier(DensityControl):
     """
 
     def __init__(self, schedule: StageSchedule, options: Mcmc) -> None:
+        super().__init__(options.opacity_weight, options.scale_weight)
         self._schedule = schedule
         self._strategy = MCMCStrategy(
             cap_max=options.cap_max,
@@ -193,11 +202,6 @@ class McmcDensifier(DensityControl):
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
         return iteration < self._schedule.densify_until and self._schedule.refines(iteration)
-
-    def regularization(self, field: GaussianField) -> Tensor | None:
-        """Return a term that makes unneeded Gaussians transparent and small."""
-        opacity, deviation = torch.sigmoid(field.opacity_logits).mean(), torch.exp(field.log_scales).mean()
-        return MCMC_REGULARIZATION * (opacity + deviation)
 
 
 def mcmc_start(field: GaussianField) -> GaussianField:

@@ -80,7 +80,39 @@ class Strategy:
 
 
 @dataclass(frozen=True)
-class Default(Strategy):
+class Regularized(Strategy):
+    """Add the mean opacity and the mean standard deviation of Gaussians to the loss."""
+
+    default_weight: ClassVar[float] = 0.0
+
+    opacity_regularization: float | None = option(
+        None,
+        "Weight of the mean opacity in the loss; it makes Gaussians that are not needed transparent, and fewer. "
+        "Default: 0, and 0.01 with --strategy mcmc.",
+        panel=PANEL,
+        least=0.0,
+    )
+    scale_regularization: float | None = option(
+        None,
+        "Weight of the mean standard deviation of Gaussians in the loss, in world units. Default: 0, and 0.01 with "
+        "--strategy mcmc.",
+        panel=PANEL,
+        least=0.0,
+    )
+
+    @property
+    def opacity_weight(self) -> float:
+        """Weight of the mean opacity in the loss."""
+        return self.default_weight if self.opacity_regularization is None else self.opacity_regularization
+
+    @property
+    def scale_weight(self) -> float:
+        """Weight of the mean standard deviation in the loss."""
+        return self.default_weight if self.scale_regularization is None else self.scale_regularization
+
+
+@dataclass(frozen=True)
+class Default(Regularized):
     """Clone and split by screen-space gradients, prune by opacity and size: 3DGS's heuristics, by gsplat."""
 
     grow_grad2d: float | None = option(
@@ -157,10 +189,11 @@ class Multiview(Default):
 
 
 @dataclass(frozen=True)
-class Mcmc(Strategy):
+class Mcmc(Regularized):
     """Move transparent Gaussians to opaque ones and add some up to a limit (Kheradmand et al. 2024), by gsplat."""
 
     densify_until: ClassVar[int] = 25_000
+    default_weight: ClassVar[float] = 0.01
     needs_gsplat: ClassVar[bool] = True
     unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
 

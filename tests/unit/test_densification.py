@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -15,7 +16,7 @@ from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.strategies import Default
+from lapgs_plugin.training.strategies import Default, Mcmc, Multiview, Regularized
 from tests.training_scene import blob_field, ring_camera
 
 EXTENT = 2.0
@@ -64,3 +65,32 @@ def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
     assert len(fields[0]) == len(fields[1]) != 200
     for name, value in fields[0].params.items():
         assert torch.equal(value, fields[1].params[name]), name
+
+
+@pytest.mark.parametrize(
+    ("options", "opacity", "scale"),
+    [
+        (Default(), 0.0, 0.0),
+        (Default(opacity_regularization=0.02), 0.02, 0.0),
+        (Multiview(scale_regularization=0.5), 0.0, 0.5),
+        (Mcmc(), 0.01, 0.01),
+        (Mcmc(opacity_regularization=0.0), 0.0, 0.01),
+    ],
+)
+def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, opacity: float, scale: float) -> None:
+    field = blob_field(7)
+    field.opacity_logits.requires_grad_()
+    settings = TrainSettings(iterations=100)
+    (stage,) = StagePlan.create((64, 48), 100, 1)
+    control = options.of_stage(1.0, base=False).density_control(StageSchedule.create(settings, stage), EXTENT)
+    term = control.regularization(field)
+    if opacity == scale == 0.0:
+        assert term is None
+        return
+    assert term is not None
+    opacities, sizes = 1 / (1 + np.exp(-field.opacity_logits.detach().numpy())), np.exp(field.log_scales.numpy())
+    assert float(term.detach()) == pytest.approx(opacity * opacities.mean() + scale * sizes.mean(), rel=1e-6)
+    if opacity:
+        (gradient,) = torch.autograd.grad(term, field.opacity_logits)
+        expected = opacity * opacities * (1 - opacities) / len(field)
+        np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-5)

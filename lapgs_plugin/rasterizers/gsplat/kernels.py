@@ -238,7 +238,8 @@ def _gradient_kernel(
     channel = tl.arange(0, 4)[None, :]
     here, in_channel = rows < n, (rows < n) & (channel < 3)
     of_opacity = tl.zeros((block, 1), tl.float32)
-    for camera in range(cameras):
+    camera = 0
+    while camera < cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
         visible = (tl.load(radii + 2 * seen, here, 0) > 0) & (tl.load(radii + 2 * seen + 1, here, 0) > 0)
         x, y, z, inverse = _view_directions(means, centre + 3 * camera, rows, visible)
@@ -268,6 +269,7 @@ def _gradient_kernel(
             tl.store(mean + 2, tl.load(mean + 2, visible, 0.0) + (in_z - radial * z) * inverse, visible)
         of_opacity += tl.load(by_opacity + seen, here, 0.0)
         tl.debug_barrier()  # the next camera's threads read values that others of this block wrote
+        camera += 1
     there = 3 * rows + channel
     tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
     opacity = tl.load(opacities + rows, here, 0.0)
