@@ -31,6 +31,7 @@ from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
+from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
@@ -128,7 +129,9 @@ class HierarchyDriver:
                 self._options.kind,
             )
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
-            path = dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
+            if self._options.dry_run:
+                dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
+            path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:

@@ -69,8 +69,8 @@ class DryRun:
         self._call = call
         self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
 
-    def run(self, folder: Path, residuals: bool) -> ColorPath:
-        """Return how the checkout's rasterizer evaluates signed colour.
+    def run(self, folder: Path, residuals: bool) -> None:
+        """Try one iteration of the script's loop, and all that a run does with its model.
 
         Args:
             folder: receives what the checkout writes.
@@ -82,19 +82,27 @@ class DryRun:
         with _undisturbed(self._context.device), _silent_writer(self._adapter.train):
             stage = _DryStage(self._context, self._scratch_call(folder), self._scene, self._view)
             self._iterate(stage)
-            gaussians = stage.gaussians
-            works = NESTED_WORKS if residuals else OFF
-            view = self._view(next(iter(self._cameras.values())))
-            image = self._render(view, gaussians)
-            with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
-                field = self._adapter.export_field(gaussians, signed=False)
+            view = self._view(self._scene.train[0])
+            image = self._render(view, stage.gaussians)
             if residuals:
-                self._require_three_axes(gaussians)
-                with self._step("a model made from a finished field", "to render it again", works):
-                    again = self._render(view, self._adapter.model_of(stage.call, field))
-                    assert again.shape == image.shape
+                self._require_three_axes(stage.gaussians)
+            with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
+                field = self._adapter.export_field(stage.gaussians, signed=False)
+            if residuals:
+                with self._step("a model made from a finished field", "one that renders", NESTED_WORKS):
+                    self._render(view, self._adapter.model_of(stage.call, field))
             self._evaluate(view, image)
-            path = self._color_path(view, gaussians) if residuals else ColorPath.NATIVE
+
+    def color_path(self) -> ColorPath:
+        """Return how the checkout's rasterizer evaluates signed colour, which is found out by rendering.
+
+        Raises:
+            UserInputError: it cannot; the line says what failed, where, and what works.
+        """
+        with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
+            gaussians = self._adapter.new_model(self._call)
+            gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            path = self._color_path(self._view(self._scene.train[0]), gaussians)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
         return path
@@ -168,8 +176,7 @@ class DryRun:
         try:
             gaussians._features_dc = torch.nn.Parameter(signs.expand_as(kept[0]).clone())
             gaussians._features_rest = torch.nn.Parameter(torch.zeros_like(rest))
-            with self._step("signed colour", "an image with negative values", NESTED_WORKS):
-                expected = self._colored(view, gaussians, ColorPath.PRECOMPUTED)
+            expected = self._colored(view, gaussians, ColorPath.PRECOMPUTED)
             if rest.shape[1] < NATIVE_COEFFICIENTS:
                 return ColorPath.PRECOMPUTED
             found = self._colored(view, gaussians, ColorPath.NATIVE)

@@ -94,7 +94,7 @@ class Term(StageHook):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path, tmp_path: Path) -> None:
-    """The first gradients after the dry run are equal with a hook's term and with that term added to the loop's L1."""
+    """The first gradients are equal with a hook's term and with that term added to the loop's L1."""
     gradients = {}
     for how in ("hook", "loop"):
         folder = tmp_path / how
@@ -112,7 +112,7 @@ def test_a_hooks_term_trains_as_if_the_loop_had_added_it(name: str, scene: Path,
                 # The loop gives its L1 a weight of 0.8.
                 adapter.train.l1_loss = lambda image, photo, l1=l1_loss: l1(image, photo) + 100 / 0.8 * image.mean()
             drive(adapter, levels=1, hooks=(Term(),) if how == "hook" else ())
-    for a, b in zip(gradients["hook"][1], gradients["loop"][1], strict=True):
+    for a, b in zip(gradients["hook"][0], gradients["loop"][0], strict=True):
         assert a.abs().max() > 0
         assert (a - b).abs().max() < 1e-5 * b.abs().max()  # 2.1e-7 seen: rounding of the sums
 

@@ -71,7 +71,7 @@ def blender(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any) -> list[Any]:
-    """Collect the settings of every call of the checkout's rasterizer in a run after its dry run."""
+    """Collect the settings of every call of the checkout's rasterizer in the stages of a run."""
     found = []
     with captured(folder, []), loaded(stub, scene, folder, *more) as adapter:
         renderer = sys.modules["gaussian_renderer"]
@@ -227,9 +227,8 @@ def test_exposures_survive_a_stop(hierarchy: str, scene: Path, tmp_path: Path) -
     with pytest.raises(KeyboardInterrupt):
         run(resume=False)
     run(resume=True)
-    # Each process begins with a dry run, which sets up a model of its own.
-    assert torch.equal(started[3], trained[1].detach())
-    assert (started[3] - torch.eye(3, 4)).abs().max() > 0.01, "they were trained"
+    assert torch.equal(started[1], trained[0].detach())
+    assert (started[1] - torch.eye(3, 4)).abs().max() > 0.01, "they were trained"
 
 
 @pytest.mark.parametrize("name", ["taming", "graphdeco"])
@@ -283,6 +282,6 @@ def test_a_viewer_sees_a_residual_around_grey(scene: Path, tmp_path: Path) -> No
         gui.receive = lambda: (viewer, True, False, False, False, 1.0)
         gui.send = lambda pixels, verify: sent.append(np.frombuffer(pixels, np.uint8).reshape(15, 20, 3))
         drive_residuals(adapter)
-    assert len(sent) == 2 + 30, "of the dry run, which ends in its second iteration, and of the run"
-    assert sent[2].std() > 10, "the base, as it is"
-    assert (sent[12] == 127).all(), "a residual that is still empty"
+    assert len(sent) == 30
+    assert sent[0].std() > 10, "the base, as it is"
+    assert (sent[10] == 127).all(), "a residual that is still empty"

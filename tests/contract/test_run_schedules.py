@@ -216,7 +216,7 @@ def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Pa
 
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         drive(adapter, **THIRDS)
-        thresholds = adapter.info.densify_thresholds
+        thresholds = adapter.densify_thresholds(Namespace(**seen[30]))
     given = {name: value for name, value in seen[31].items() if name not in thresholds}
     assert {name: value for name, value in seen[30].items() if name not in thresholds} == given
     assert given["iterations"] == 90

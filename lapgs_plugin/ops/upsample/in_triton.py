@@ -94,37 +94,39 @@ class _Taps(NamedTuple):
 
 
 def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    """Do `upsample_add` for float32 images on a CUDA device, with any strides."""
-    rows, columns = (_up(pyramid.grid, side, fine.device) for side in fine.shape[-2:])
-    out = torch.empty_like(fine)
-    _filter(coarse, rows, columns, out, fine)
+    """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
+    size = fine.shape[-2], fine.shape[-1]
+    out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """Do `upsample` for a float32 image on a CUDA device, with any strides."""
-    out: Tensor = _Upsampled.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+    out: Tensor = _Upsampled.apply(coarse, None, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 class _Upsampled(torch.autograd.Function):
-    """Map (coarse, grid, size) to Up(coarse); the gradient applies the transpose of Up."""
+    """Map (coarse, fine or None, grid, size) to Up(coarse) + fine; the gradient applies the transpose of Up."""
 
     @staticmethod
-    def forward(ctx: Any, coarse: Tensor, grid: str, size: tuple[int, int]) -> Tensor:
+    def forward(ctx: Any, coarse: Tensor, fine: Tensor | None, grid: str, size: tuple[int, int]) -> Tensor:
         ctx.grid, ctx.size, ctx.shape = grid, size, coarse.shape
-        out = coarse.new_empty(*coarse.shape[:-2], *size)
+        out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
         rows, columns = (_up(grid, side, coarse.device) for side in size)
-        _filter(coarse, rows, columns, out)
+        _filter(coarse, rows, columns, out, fine)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        by_fine = gradient if ctx.needs_input_grad[1] else None
+        if not ctx.needs_input_grad[0]:
+            return None, by_fine, None, None
         out = gradient.new_empty(ctx.shape)
         rows, columns = (_up_transposed(ctx.grid, side, gradient.device) for side in ctx.size)
         _filter(gradient, rows, columns, out)
-        return out, None, None
+        return out, by_fine, None, None
 
 
 def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None) -> None:
