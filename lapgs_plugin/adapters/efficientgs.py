@@ -13,12 +13,6 @@ from lapgs_plugin.checkouts.attachment import Replacement
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
 
-PRUNING = {"p4": "p6"}
-"""Its ways to prune at fixed iterations, and those that give the same iterations, counted from the last densification.
-
-Both prune at 15,000, 18,000 and 21,000 where densification ends at 15,000, as it does by default.
-"""
-
 
 class Adapter(generic.Adapter):
     """Drive an EfficientGS checkout.
@@ -34,6 +28,7 @@ class Adapter(generic.Adapter):
         stand_in="efficientgs",
         own_files=("scene/renderer.py", "train.py"),
         fork_of=("graphdeco",),
+        unscaled=("oneupSHdegree_from_iter",),
     )
 
     @classmethod
@@ -47,7 +42,6 @@ class Adapter(generic.Adapter):
         changed = super().stage_call(call, window, model_path)
         opt = changed.opt
         opt.oneupSHdegree_from_iter = 0 if window.start > 0 else window.scaled(opt.oneupSHdegree_from_iter)
-        opt.prune_way = PRUNING.get(opt.prune_way, opt.prune_way)
         if window.start > 0:
             opt.use_sparse_shs = False
         return changed

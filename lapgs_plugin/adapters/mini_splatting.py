@@ -36,6 +36,7 @@ class Adapter(generic.Adapter):
         stand_in="mini-splatting",
         own_files=("ms/train.py",),
         fork_of=("graphdeco",),
+        unscaled=SIMPLIFICATIONS,
     )
 
     @classmethod

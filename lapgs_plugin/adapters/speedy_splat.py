@@ -7,19 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow
 from lapgs_plugin.checkouts.attachment import Replacement
-
-PRUNING = ("prune_from_iter", "prune_until_iter", "prune_interval")
-"""Options of its schedule of pruning."""
 
 
 class Adapter(generic.Adapter):
-    """Drive a Speedy-Splat checkout.
-
-    The schedule of pruning is scaled to a stage of its own. Its last pruning leaves half an interval to recover: a
-    field is archived after the stage's last iteration.
-    """
+    """Drive a Speedy-Splat checkout, whose scores must not reach finished fields that are trained jointly."""
 
     info = BackboneInfo(
         name="speedy_splat",
@@ -34,14 +27,6 @@ class Adapter(generic.Adapter):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         return all((folder / name).is_file() for name in ("train.py", *cls.info.own_files))
-
-    def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
-        changed = super().stage_call(call, window, model_path)
-        opt, iterations = changed.opt, window.stage.iterations
-        for name in PRUNING:
-            setattr(opt, name, max(1, window.scaled(getattr(opt, name))))
-        opt.prune_until_iter = min(opt.prune_until_iter, iterations - opt.prune_interval // 2)
-        return changed
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         return [
