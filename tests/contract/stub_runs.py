@@ -100,7 +100,7 @@ FORKS = {
             "efficient",
             "efficientgs",
             (
-                *("--oneupSHdegree_from_iter", 62, "--oneupSHdegree_interval", 10, "--use_sparse_shs"),
+                *("--oneupSHdegree_from_iter", 62, "--oneupSHdegree_interval", 3, "--use_sparse_shs"),
                 *("--prune_by_max_weight", "--prune_way", "p4"),
             ),
         ),

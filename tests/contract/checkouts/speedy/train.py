@@ -64,7 +64,6 @@ def training(
             progress_bar.note(iteration, loss)
             if iteration in saving_iterations:
                 scene.save(iteration)
-            prunes = opt.prune_from_iter <= iteration < opt.prune_until_iter and iteration % opt.prune_interval == 0
             if iteration < opt.densify_until_iter:
                 gaussians.max_radii2D[visibility_filter] = torch.max(
                     gaussians.max_radii2D[visibility_filter], radii[visibility_filter]
@@ -73,14 +72,23 @@ def training(
                 if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     size_threshold = 20 if iteration > opt.opacity_reset_interval else None
                     gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, size_threshold)
-                if prunes:
+                if (
+                    (iteration >= opt.prune_from_iter)
+                    and (iteration < opt.prune_until_iter)
+                    and (iteration % opt.prune_interval == 0)
+                ):
                     prune(scene, gaussians, pipe, background, opt.densify_prune_ratio)
                 if iteration % opt.opacity_reset_interval == 0:
                     gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
-            if iteration >= opt.densify_until_iter and prunes:
+            if (
+                (iteration >= opt.densify_until_iter)
+                and (iteration >= opt.prune_from_iter)
+                and (iteration < opt.prune_until_iter)
+                and (iteration % opt.prune_interval == 0)
+            ):
                 prune(scene, gaussians, pipe, background, opt.after_densify_prune_ratio)
             if iteration in testing_iterations:
                 scene_metrics(iteration, "test", scene.getTestCameras(), scene, render, (pipe, background))
