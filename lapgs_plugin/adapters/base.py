@@ -1,7 +1,8 @@
 """Describe a backbone of the 3DGS family to the runner, which drives all of them and knows none by name.
 
 An adapter says how a checkout is recognised, which of its symbols are replaced besides the common ones, how a stage's
-arguments differ from the run's, and how a field gets in and out of its model.
+arguments differ from the run's, and how a field gets in and out of its model. Everything that can be found out from the
+checkout itself is in its profile.
 
 Imports no torch before a method needs it, so that checkouts are recognised quickly.
 """
@@ -13,13 +14,15 @@ import inspect
 import logging
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage
@@ -65,6 +68,22 @@ GROUPS = {
 }
 """The same attributes by the names of their parameter groups in the family's optimizers."""
 
+ROLES = {
+    "dataset": ("source_path",),
+    "opt": ("iterations", "densify_until_iter", "position_lr_init"),
+    "pipe": ("convert_SHs_python", "compute_cov3D_python", "debug"),
+}
+"""Arguments of `training` by role, each with attributes of which it has one; the first such argument has the role."""
+
+CHECKPOINTS = ("checkpoint", "start_checkpoint")
+"""Parameters of `training` for a checkpoint to start from."""
+
+FLAT_AXES = 2
+"""Number of scales of flat Gaussians."""
+
+FLAT_SCALE = -14.0
+"""Logarithm of the third scale of Gaussians that have two: thinner than a millionth of the scene's unit."""
+
 
 @dataclass(frozen=True)
 class BackboneInfo:
@@ -75,9 +94,9 @@ class BackboneInfo:
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
         stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU.
-        density_control: methods of its GaussianModel that add, remove or reset Gaussians.
-        color_rates: its options that are learning rates of SH coefficients.
-        densify_thresholds: its options that are thresholds on screen-space gradients for densification.
+        color_rates: its options that are learning rates of SH coefficients; empty finds them by their names.
+        densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
+            them by their names.
         own_files: files of its checkout that tell it from other code bases, relative to the checkout's root.
         fork_of: names of backbones that may recognise its checkout, too, because it has files of theirs.
         density_scores: functions of its script or utilities whose scores density control uses.
@@ -91,9 +110,8 @@ class BackboneInfo:
     title: str
     rasterizer: str
     stand_in: str
-    density_control: tuple[str, ...]
-    color_rates: tuple[str, ...]
-    densify_thresholds: tuple[str, ...]
+    color_rates: tuple[str, ...] = ()
+    densify_thresholds: tuple[str, ...] = ()
     own_files: tuple[str, ...] = ()
     fork_of: tuple[str, ...] = ()
     density_scores: tuple[str, ...] = ()
@@ -122,33 +140,67 @@ class BackboneInfo:
 
 @dataclass(frozen=True)
 class TrainingCall:
-    """Hold a call of the script's `training` with its arguments by parameter name."""
+    """Hold a call of the script's `training` with its arguments by parameter name.
+
+    Attributes:
+        function: the script's `training`.
+        values: its arguments.
+        roles: parameter of each role of `ROLES` that some argument has.
+    """
 
     function: Callable[..., Any]
     values: Mapping[str, Any]
+    roles: Mapping[str, str]
 
     @classmethod
     def bind(cls, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> TrainingCall:
-        """Return the call `function(*args, **kwargs)`, defaults included."""
+        """Return the call `function(*args, **kwargs)`, defaults included.
+
+        Raises:
+            UserInputError: no argument says which scene, or for how many iterations.
+        """
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
-        return cls(function, dict(bound.arguments))
+        values = dict(bound.arguments)
+        found = {
+            role: next((name for name, value in values.items() if any(hasattr(value, a) for a in attributes)), None)
+            for role, attributes in ROLES.items()
+        }
+        for role in ("dataset", "opt"):
+            if found[role] is None:
+                raise UserInputError(
+                    f"{function.__name__}({', '.join(values)}) of the script got no argument with "
+                    f"{ROLES[role][0]}, expected one as {role} has in 3DGS; `lapgs run --off` runs the script as it is"
+                )
+        return cls(function, values, {role: name for role, name in found.items() if name is not None})
 
     @property
     def dataset(self) -> Any:
-        return self.values["dataset"]
+        return self.values[self.roles["dataset"]]
 
     @property
     def opt(self) -> Any:
-        return self.values["opt"]
+        return self.values[self.roles["opt"]]
 
     @property
     def pipe(self) -> Any:
-        return self.values["pipe"]
+        """Options of the pipeline, without attributes if the script has none."""
+        return self.values[self.roles["pipe"]] if "pipe" in self.roles else SimpleNamespace()
+
+    @property
+    def checkpoint(self) -> Any:
+        """Checkpoint to start from, if the script takes one."""
+        return next((self.values[name] for name in CHECKPOINTS if name in self.values), None)
+
+    @property
+    def white_background(self) -> bool:
+        return bool(getattr(self.dataset, "white_background", False))
 
     def changed(self, **values: Any) -> TrainingCall:
-        """Return the call with other values of some arguments."""
-        return replace(self, values={**self.values, **values})
+        """Return the call with other values of some arguments, by role or parameter; absent ones are left out."""
+        named = {self.roles.get(name, name): value for name, value in values.items()}
+        known = {name: value for name, value in named.items() if name in self.values}
+        return replace(self, values={**self.values, **known})
 
     def run(self) -> None:
         """Make the call."""
@@ -196,12 +248,33 @@ class BackboneAdapter(ABC):
     def __init__(self, script: Script) -> None:
         self.script = script
 
+    @cached_property
+    def profile(self) -> Profile:
+        """What was found in the checkout; to be asked for before any of its symbols is replaced."""
+        return Profile(self.script)
+
+    @property
+    def root(self) -> Path:
+        """Folder of the checkout."""
+        return self.profile.source.root
+
+    @property
+    def rasterizer(self) -> str:
+        """Module that the training loop renders with."""
+        found = self.profile.rasterizers
+        return found[0].use.module if found else self.info.rasterizer
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        """Return whether `folder` is the root of a checkout of this backbone."""
+        return cls.info.recognises(folder)
+
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
         """Return the variant of `reference_raster.standins` for a checkout's rasterizer.
 
         Args:
-            checkout: the checkout's folder.
+            checkout: root of the checkout.
             arguments: arguments of its script.
         """
         return cls.info.stand_in
@@ -229,19 +302,15 @@ class BackboneAdapter(ABC):
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
         """Return the settings of the rasterizer that change images, to render the run later."""
 
-    @abstractmethod
-    def passes_dc_apart(self, call: TrainingCall) -> bool:
-        """Return whether the checkout's render passes the first SH coefficient (DC) as an argument of its own."""
-
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         """Refuse options of this call that a hierarchy cannot honour.
 
         Raises:
             UserInputError: there is one; the line says why, and what to do.
         """
-        if call.values.get("checkpoint"):
+        if call.checkpoint:
             raise UserInputError(
-                f"--start_checkpoint {call.values['checkpoint']}: a checkpoint holds one field, not a hierarchy; "
+                f"--start_checkpoint {call.checkpoint}: a checkpoint holds one field, not a hierarchy; "
                 "continue a run of ours with `lapgs run --resume`, or train with `lapgs run --off`"
             )
         adds = levels > 1 and hierarchy is Hierarchy.LAPLACIAN
@@ -250,39 +319,57 @@ class BackboneAdapter(ABC):
                 "--random_background: residual stages build on images rendered over one background; "
                 "leave it out, or train with --levels 1 or --hierarchy nested"
             )
-        model = sys.modules[self.train.GaussianModel.__module__]
+        model = sys.modules[self.profile.model.__module__]
         if getattr(call.opt, "optimizer_type", "default") == "sparse_adam" and not hasattr(model, SPARSE_ADAM):
             raise UserInputError(
                 f"--optimizer_type sparse_adam: {model.__name__} found no {SPARSE_ADAM} to import; install a "
                 "rasterizer that has it, as the checkout's README says, or leave the option out"
             )
-        if call.pipe.convert_SHs_python and self.passes_dc_apart(call):
+        if getattr(call.pipe, "convert_SHs_python", False) and self._passes_dc_apart(call):
             raise UserInputError(
                 "--convert_SHs_python: this checkout's render passes on SH that it has not read with that option, and "
                 "fails without lapgs too; leave it out"
             )
 
+    def _passes_dc_apart(self, call: TrainingCall) -> bool:
+        """Return whether the checkout's render passes the first SH coefficient (DC) as an input of its own."""
+        if not any("dc" in rasterizer.use.inputs for rasterizer in self.profile.rasterizers[:1]):
+            return False
+        asked = self.profile.loop_argument("separate_sh", call.values)
+        return bool(getattr(call.pipe, "separate_sh", True) if asked is None else asked)
+
+    def densify_thresholds(self, opt: Any) -> list[str]:
+        """Return the names of options that are thresholds on screen-space gradients for densification."""
+        return list(self.info.densify_thresholds or _options(opt, "grad", "thresh"))
+
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
-        dataset, opt, pipe = copy.copy(call.dataset), copy.copy(call.opt), copy.copy(call.pipe)
+        copies = {role: copy.copy(call.values[name]) for role, name in call.roles.items()}
+        dataset, opt, pipe = copies["dataset"], copies["opt"], copies.get("pipe", SimpleNamespace())
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
-        opt.densify_until_iter = window.scaled(opt.densify_until_iter)
-        opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
-        for name in self.info.densify_thresholds:
+        if hasattr(opt, "densify_until_iter"):
+            opt.densify_until_iter = window.scaled(opt.densify_until_iter)
+        if hasattr(opt, "position_lr_max_steps"):
+            opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
+        for name in self.densify_thresholds(opt):
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
             dataset.white_background = False
             # The checkout's own conversion of SH in Python has no signed colour.
             pipe.convert_SHs_python = False
-            for name in self.info.color_rates:
+            # A residual's opacity says where detail is missing, not where surfaces are.
+            for name in _options(opt, "depth", "weight"):
+                setattr(opt, name, 0.0)
+            for name in self.info.color_rates or _options(opt, "feature", "_lr"):
                 setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
-        values: dict[str, Any] = {"dataset": dataset, "opt": opt, "pipe": pipe, "checkpoint": None}
-        for name in ("testing_iterations", "saving_iterations", "checkpoint_iterations"):
-            values[name] = window.local(call.values[name])
-        debug_from = call.values["debug_from"]
-        pipe.debug = pipe.debug or 0 <= debug_from < window.start
+        values: dict[str, Any] = {**copies, **dict.fromkeys(CHECKPOINTS)}
+        for name, value in call.values.items():
+            if name.endswith("iterations") and isinstance(value, (list, tuple)):
+                values[name] = window.local(value)
+        debug_from = call.values.get("debug_from", -1)
+        pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
         return call.changed(**values)
 
@@ -294,10 +381,10 @@ class BackboneAdapter(ABC):
         """
         return []
 
-    def level_view(  # noqa: B027 - most backbones have nothing else in a view
+    def level_view(  # noqa: B027 - most backbones have nothing of their own in a view
         self, view: Any, original: Any, size: tuple[int, int], signed: bool
     ) -> None:
-        """Bring everything of a view but its image to a level's size.
+        """Bring attributes of a view to a level's size that `make_level_view` does not know.
 
         Args:
             view: a copy of `original` with the level's width and height, to be changed.
@@ -326,7 +413,7 @@ class BackboneAdapter(ABC):
 
     def new_model(self, call: TrainingCall) -> Any:
         """Return a GaussianModel without Gaussians, made as the script makes it."""
-        return self.train.GaussianModel(call.dataset.sh_degree, *self.model_options(call))
+        return self.profile.make_model(call.values)
 
     def model_of(self, call: TrainingCall, field: GaussianField) -> Any:
         """Return a GaussianModel of a field for rendering; its optimizer is not set up."""
@@ -344,22 +431,20 @@ class BackboneAdapter(ABC):
             signed: whether a residual is trained.
             image: returns the level's image (3, height, width).
         """
-        from lapgs_plugin.checkouts.level_views import make_level_view
+        from lapgs_plugin.checkouts.level_views import make_level_view, without_depth
 
         view = make_level_view(camera, size, image)
+        if signed:
+            without_depth(view)
         self.level_view(view, camera, size, signed)
         return view
-
-    def model_options(self, call: TrainingCall) -> tuple[Any, ...]:
-        """Return the arguments of the script's GaussianModel after the SH degree."""
-        return (call.opt.optimizer_type,)
 
     def export_field(self, gaussians: Any, signed: bool) -> GaussianField:
         """Return the model's parameters as `snapshot` does, and warn of opacities that a PLY cannot hold."""
         import torch
 
         with torch.no_grad():
-            if gaussians.opacity_activation is not torch.sigmoid:
+            if _activation(gaussians) is not torch.sigmoid:
                 opacity = gaussians.get_opacity
                 if cut := int((opacity > LARGEST_OPACITY).sum()):
                     logger.warning(
@@ -376,14 +461,14 @@ class BackboneAdapter(ABC):
         from lapgs_plugin.fields.gaussian_field import GaussianField
 
         with torch.no_grad():
-            if gaussians.opacity_activation is torch.sigmoid:
+            if _activation(gaussians) is torch.sigmoid:
                 logits = gaussians._opacity
             else:
                 logits = torch.logit(gaussians.get_opacity.clamp(1e-6, LARGEST_OPACITY))
             return GaussianField(
                 means=gaussians._xyz.detach().clone(),
                 quaternions=gaussians._rotation.detach().clone(),
-                log_scales=gaussians._scaling.detach().clone(),
+                log_scales=_three_axes(gaussians._scaling.detach().clone()),
                 opacity_logits=logits.detach().clone().squeeze(-1),
                 sh=torch.cat([gaussians._features_dc, gaussians._features_rest], dim=1),
                 signed=signed,
@@ -400,8 +485,10 @@ class BackboneAdapter(ABC):
         import torch
 
         for name in attributes:
-            value = PARAMETERS[name](field).detach().clone().contiguous()
-            setattr(gaussians, name, torch.nn.Parameter(value))
+            value = PARAMETERS[name](field).detach().clone()
+            if name == "_scaling" and bool((value[:, FLAT_AXES:] == FLAT_SCALE).all()):
+                value = value[:, :FLAT_AXES]
+            setattr(gaussians, name, torch.nn.Parameter(value.contiguous()))
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
@@ -412,3 +499,26 @@ class BackboneAdapter(ABC):
         """Return the optimizers that step Gaussians."""
         found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
         return [optimizer for optimizer in found if optimizer is not None]
+
+
+def _options(opt: Any, *words: str) -> Iterator[str]:
+    """Yield the names of numeric options that contain all the words."""
+    for name, value in vars(opt).items():
+        if isinstance(value, (int, float)) and all(word in name for word in words):
+            yield name
+
+
+def _activation(gaussians: Any) -> Any:
+    """Return the function from stored opacities to opacities."""
+    import torch
+
+    return getattr(gaussians, "opacity_activation", torch.sigmoid)
+
+
+def _three_axes(log_scales: Tensor) -> Tensor:
+    """Return logarithms of scales (n, 3), given those of flat Gaussians (n, 2) or of others."""
+    if log_scales.shape[1] != FLAT_AXES:
+        return log_scales
+    import torch
+
+    return torch.nn.functional.pad(log_scales, (0, 1), value=FLAT_SCALE)

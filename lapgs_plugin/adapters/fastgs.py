@@ -6,17 +6,16 @@ as in the paper authors' release.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, TrainingCall
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from lapgs_plugin.fields.rasterizer import Semantics
 
 
-class Adapter(BackboneAdapter):
+class Adapter(generic.Adapter):
     """Drive a FastGS checkout.
 
     Its score functions get composed images and the level's ground truth, because both are replaced below them.
@@ -27,10 +26,7 @@ class Adapter(BackboneAdapter):
         title="FastGS",
         rasterizer="diff_gaussian_rasterization_fastgs",
         stand_in="fastgs",
-        density_control=("densify_and_prune_fastgs", "reset_opacity", "final_prune_fastgs"),
         density_scores=("compute_gaussian_score_fastgs",),
-        color_rates=("lowfeature_lr", "highfeature_lr"),
-        densify_thresholds=("grad_thresh", "grad_abs_thresh"),
         own_files=("utils/fast_utils.py",),
         fork_of=("taming",),
         raster_defaults={"mult": 0.5},
@@ -46,12 +42,3 @@ class Adapter(BackboneAdapter):
             note="tiles by the ellipse alpha = 1/255 (mult = 1), not by three sigma; gradients of needles are right to "
             "a few hundredths",
         )
-
-    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
-        self.train.render_fastgs(view, gaussians, call.pipe, background, call.opt.mult)
-
-    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        return {"mult": call.opt.mult}
-
-    def passes_dc_apart(self, call: TrainingCall) -> bool:
-        return True

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from lapgs_plugin import adapters
 from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.generic import Adapter as GenericAdapter
+from lapgs_plugin.adapters.generic import readable_source
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.registry import Registry
 
@@ -17,7 +19,9 @@ GROUP = "lapgs_plugin.backbones"
 """Entry point group whose members are subclasses of `BackboneAdapter`; an entry's name is the adapter's `info.name`."""
 
 OWN = tuple(
-    module.name for module in pkgutil.iter_modules(adapters.__path__) if module.name not in ("base", "registry")
+    module.name
+    for module in pkgutil.iter_modules(adapters.__path__)
+    if module.name not in ("base", "generic", "registry")
 )
 """Names of the backbones in this package: `adapters/<name>.py` defines `Adapter`."""
 
@@ -29,6 +33,10 @@ BACKBONES: Registry[type[BackboneAdapter]] = Registry(
     classes=True,
 )
 """Backbones by name."""
+
+
+GENERIC = GenericAdapter.info.name
+"""Name of the adapter of checkouts that no backbone recognises, for `--backbone`."""
 
 
 def all_adapters() -> tuple[type[BackboneAdapter], ...]:
@@ -48,7 +56,7 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
 
 
 def recognise(folder: Path) -> type[BackboneAdapter] | None:
-    """Return the adapter of the checkout whose root is `folder`, None if no backbone recognises it.
+    """Return the adapter of the checkout whose root is `folder`, None if it has no training script of 3DGS.
 
     A fork has the files of the code that it was forked from. So of several backbones that recognise a folder, one loses
     against those that ask for all of its files and more, and against those that say that they are forks of it.
@@ -56,7 +64,9 @@ def recognise(folder: Path) -> type[BackboneAdapter] | None:
     Raises:
         UserInputError: several are left, or an installed package's cannot be loaded.
     """
-    found = [each for each in all_adapters() if each.info.recognises(folder)]
+    found = [each for each in all_adapters() if each.recognises(folder)]
+    if not found and readable_source(folder) is not None:
+        return GenericAdapter
     left = [each for each in found if not any(other.info.is_fork_of(each.info) for other in found)]
     if len(left) > 1:
         names = " and ".join(each.info.name for each in left)
@@ -68,16 +78,15 @@ def adapter_class(folder: Path, name: str | None = None) -> type[BackboneAdapter
     """Return the adapter called `name`, or the one that recognises the checkout whose root is `folder`.
 
     Raises:
-        UserInputError: no backbone recognises the checkout, or none is called that.
+        UserInputError: it is no checkout, or no backbone is called that.
     """
     if name is not None:
-        return BACKBONES[name]
+        return GenericAdapter if name == GENERIC else BACKBONES[name]
     found = recognise(folder)
     if found is None:
-        known = "; ".join(f"{each.info.title}: {', '.join(each.info.files)}" for each in all_adapters())
         raise UserInputError(
-            f"{folder} is not the root of a checkout that `lapgs run` knows, by the files that it has ({known}); name "
-            "its backbone with --backbone, or use `lapgs train` without a checkout"
+            f"{folder} is not the root of a 3DGS checkout: none of its train*.py imports a class of Gaussians; "
+            "expected a checkout, whose train.py `lapgs run` is given; `lapgs train` trains without one"
         )
     return found
 

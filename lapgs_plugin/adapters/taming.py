@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneAdapter, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneInfo, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
@@ -29,7 +30,7 @@ LOW_LOGIT = -1.0
 training prunes), and opacities are hardly below 0."""
 
 
-class Adapter(BackboneAdapter):
+class Adapter(generic.Adapter):
     """Drive a Taming-3DGS checkout.
 
     Both modes of its budget, one of which counts from a stage's first Gaussians, become a final count for each stage.
@@ -40,10 +41,7 @@ class Adapter(BackboneAdapter):
         title="Taming-3DGS",
         rasterizer="diff_gaussian_rasterization",
         stand_in="taming",
-        density_control=("densify_with_score", "reset_opacity"),
         density_scores=("compute_gaussian_score",),
-        color_rates=("feature_lr", "shfeature_lr"),
-        densify_thresholds=("densify_grad_threshold",),
         own_files=("utils/taming_utils.py",),
         unscaled=("ho_iteration",),
     )
@@ -57,15 +55,9 @@ class Adapter(BackboneAdapter):
         # Half way through training it replaces the sigmoid by the absolute value, and saves the value before that.
         return torch.logit(stored.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
 
-    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
-        self.train.render(view, gaussians, call.pipe, background)
-
-    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        return {}
-
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"
-        model = self.train.GaussianModel
+        model = self.profile.model
         return [
             Replacement(
                 sys.modules["utils.taming_utils"],
@@ -82,9 +74,6 @@ class Adapter(BackboneAdapter):
                 for name in ("densify_and_clone_taming", "densify_and_split_taming")
             ),
         ]
-
-    def passes_dc_apart(self, call: TrainingCall) -> bool:
-        return bool(call.pipe.separate_sh)
 
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         super().refuse(call, levels, hierarchy)

@@ -40,6 +40,12 @@ class Replacement:
         return f"{place}.{self.name}"
 
 
+def of_class(kind: type, name: str, make: Callable[[Any], Any], consumer: str) -> list[Replacement]:
+    """Return the replacement of a method where a class or its nearest base defines it, if there is one."""
+    owner = next((each for each in kind.__mro__ if name in vars(each)), None)
+    return [] if owner is None else [Replacement(owner, name, make, None, consumer)]
+
+
 class Attachment:
     """Replace symbols inside a `with` block. All are verified before the first is replaced, and restored at the end.
 

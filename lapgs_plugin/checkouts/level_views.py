@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
 from typing import Any, SupportsIndex
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runs.image_store import eight_bit_levels
 from lapgs_plugin.scenes.masks import ALPHA, NONE, find_masks, read_mask, resolve_masks
+
+KEY = "lapgs_key"
+"""Attribute of cameras, and of all copies of them, with the key of the image."""
+
+SCALED = {
+    **dict.fromkeys(("image_width", "width", "img_width", "w", "focal", "focal_length", "focal_x", "fx", "cx"), 0),
+    **dict.fromkeys(("image_height", "height", "img_height", "h", "focal_y", "fy", "cy"), 1),
+}
+"""Numbers of cameras in pixels by lower-case name, each with its axis: 0 is horizontal."""
+
+INTRINSICS = {"K", "intrinsic", "intrinsics", "camera_matrix"}
+"""Matrices of cameras in pixels."""
+
+DEPTH_MAPS = {"invdepthmap", "depth_mask"}
+"""Maps of cameras by which depth is supervised."""
 
 
 @dataclass(frozen=True)
@@ -57,30 +75,41 @@ class SceneImages:
 
     def __init__(self) -> None:
         self._images: dict[str, FullSizeImage] = {}
-        self._keys: dict[int, str] = {}
+        self._making = False
         self.masks: dict[str, Tensor] = {}
-        self._cameras: list[Any] = []  # objects that live keep their ids, which `_keys` has
 
-    def adopting(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a replacement of the checkout's Camera class that takes the image out of every camera it makes."""
+    def adopting(self, original: Callable[..., None]) -> Callable[..., None]:
+        """Return a replacement of a camera class's `__init__` that takes the image out of every camera it makes."""
+        signature = inspect.signature(original)
 
-        def make_camera(*args: Any, **kwargs: Any) -> Any:
-            # Avoids a copy of the image to the GPU and back.
-            camera = original(*args, **{**kwargs, "data_device": "cpu"})
-            channels = len(camera.original_image)
-            if channels != 3:
-                raise UserInputError(
-                    f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
-                    "scene's images as RGB"
-                )
-            key = f"{len(self._images):05d}-{camera.image_name}"
-            self._images[key] = FullSizeImage.of(camera.original_image)
-            del camera.original_image
-            self._keys[id(camera)] = key
-            self._cameras.append(camera)
-            return camera
+        @wraps(original)
+        def make(camera: Any, *args: Any, **kwargs: Any) -> None:
+            bound = signature.bind(camera, *args, **kwargs)
+            if "data_device" in signature.parameters:
+                bound.arguments["data_device"] = "cpu"  # avoids a copy of the image to the GPU and back
+            outermost = not self._making
+            self._making = True
+            try:
+                original(*bound.args, **bound.kwargs)
+            finally:
+                self._making = not outermost
+            if outermost:  # a derived class calls this one before it is ready
+                self._adopt(camera)
 
-        return make_camera
+        return make
+
+    def _adopt(self, camera: Any) -> None:
+        image = getattr(camera, "original_image", None)
+        channels = len(image) if isinstance(image, Tensor) and image.ndim == 3 else 0
+        if not isinstance(image, Tensor) or channels != 3:
+            raise UserInputError(
+                f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
+                "scene's images as RGB"
+            )
+        key = f"{len(self._images):05d}-{camera.image_name}"
+        self._images[key] = FullSizeImage.of(image)
+        del camera.original_image
+        setattr(camera, KEY, key)
 
     def read_masks(self, scene: Path, setting: str) -> None:
         """Read the mask of every image; `setting` is a value of --masks.
@@ -110,14 +139,14 @@ class SceneImages:
         Raises:
             UserInputError: the camera was not made by the replaced class.
         """
-        try:
-            return self._keys[id(camera)]
-        except KeyError:
+        key = view_key(camera)
+        if key is None:
             raise UserInputError(
-                f"camera {getattr(camera, 'image_name', '?')} of the checkout was not made by "
-                "utils.camera_utils.Camera, expected of every camera of the scene; this checkout loads scenes "
+                f"camera {getattr(camera, 'image_name', '?')} of the checkout was made without "
+                f"{type(camera).__name__}.__init__, expected of every camera of the scene; this checkout loads scenes "
                 "in another way: use `lapgs run --off`"
-            ) from None
+            )
+        return key
 
     def __getitem__(self, key: str) -> FullSizeImage:
         return self._images[key]
@@ -133,19 +162,68 @@ def view_name(key: str) -> str:
     return key.partition("-")[2]
 
 
+def view_key(value: Any) -> str | None:
+    """Return the key of a camera of the scene or of a copy of it at any level; None for any other object."""
+    key = getattr(value, KEY, None)
+    return key if isinstance(key, str) else None
+
+
 def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tensor]) -> Any:
     """Return a copy of a camera with another size, whose `original_image` is loaded on every access.
 
+    Attributes that depend on the size follow it: focal lengths, centres, sizes, and maps with a value for each pixel.
+    The copy shares all others.
+
     Args:
-        camera: the checkout's camera; the copy shares all attributes but the size.
+        camera: the checkout's camera.
         size: (width, height).
         image: returns the image (3, height, width).
     """
     view = copy.copy(camera)
     view.__class__ = _level_class(type(camera))
+    full = int(camera.image_width), int(camera.image_height)
+    for name, value in list(vars(camera).items()):
+        at_level = _at_level(name, value, full, size)
+        if at_level is not value:
+            setattr(view, name, at_level)
     view.image_width, view.image_height = size
     view.lapgs_image = image
     return view
+
+
+def without_depth(view: Any) -> None:
+    """Take the maps away by which a loop supervises depth."""
+    for name in DEPTH_MAPS & vars(view).keys():
+        setattr(view, name, None)
+    if hasattr(view, "depth_reliable"):
+        view.depth_reliable = False
+
+
+def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int]) -> Any:
+    """Return an attribute of a camera at another size, the same object if it does not depend on the size."""
+    if isinstance(value, np.ndarray) and value.shape[-2:] == full[::-1]:
+        return _shrunk(torch.from_numpy(value), size).numpy()
+    if isinstance(value, (Tensor, np.ndarray)) and name in INTRINSICS and value.shape[-2:] in ((3, 3), (4, 4)):
+        scaled: Any = copy.deepcopy(value)
+        for row in range(2):
+            scaled[..., row, :] = scaled[..., row, :] * size[row] / full[row]
+        return scaled
+    if isinstance(value, Tensor) and value.shape[-2:] == full[::-1] and value.ndim > 1:
+        opaque = name == "alpha_mask" and bool((value == 1).all())
+        return None if opaque else _shrunk(value, size)  # without a mask loops save a pass over the image
+    if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
+        return type(value)(size if tuple(value) == full else size[::-1])
+    if isinstance(value, (int, float)) and name.lower() in SCALED:
+        axis = SCALED[name.lower()]
+        return type(value)(value * size[axis] / full[axis]) if value != full[axis] else size[axis]
+    return value
+
+
+def _shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool."""
+    flat = image.reshape(-1, 1, *image.shape[-2:]).float()
+    result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])
+    return result >= 0.5 if image.dtype == torch.bool else result
 
 
 class PrefetchingViews(list[Any]):
@@ -185,6 +263,13 @@ _LEVEL_CLASSES: dict[type, type] = {}
 
 def _level_class(kind: type) -> type:
     if kind not in _LEVEL_CLASSES:
-        read = property(lambda view: view.lapgs_image(), doc="(3, h, w) the level's ground truth, float32.")
-        _LEVEL_CLASSES[kind] = type(f"Level{kind.__name__}", (kind,), {"original_image": read})
+        image = property(
+            lambda view: view.lapgs_image(), _keep_image, doc="(3, h, w) the level's ground truth, float32."
+        )
+        _LEVEL_CLASSES[kind] = type(f"Level{kind.__name__}", (kind,), {"original_image": image})
     return _LEVEL_CLASSES[kind]
+
+
+def _keep_image(view: Any, image: Tensor) -> None:
+    """Keep the image that a checkout sets, which some move to the GPU once and for all."""
+    view.lapgs_image = lambda: image

@@ -192,7 +192,8 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     )
     console.print(
         f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR on the right halves of the views, after a colour fit on "
-        "their left halves: compare this where exposure or white balance change from photo to photo",
+        "their left halves: compare this where exposure or white balance change from photo to photo"
+        + (", as in this run, whose renders have the mean exposure" if metrics["exposure_compensated"] else ""),
         highlight=False,
     )
     if (peak := metrics["peak_memory_bytes"]) is not None:

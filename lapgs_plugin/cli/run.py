@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,8 +79,6 @@ def run(
     """
     import logging
 
-    import torch
-
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script, require_script
     from lapgs_plugin.runner.driver import HierarchyDriver
@@ -95,29 +93,22 @@ def run(
         raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
     if measuring.gpu_busy and off and not record:
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
-    if device not in ("auto", "cuda", "cpu"):
-        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise UserInputError(
-            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
-        )
-    chosen = device if device != "auto" else "cuda" if available else "cpu"
+    chosen = _chosen_device(device)
     if measuring.gpu_busy:
         require_cuda(chosen)
-    checkout, words = require_script(script).parent, arguments or []
-    watcher = context.with_resource(watching(view, view_port, checkout.absolute().name, chosen))
+    path, words = require_script(script), arguments or []
+    watcher = context.with_resource(watching(view, view_port, path.parent.name, chosen))
     plain = off and not record
-    # On a GPU a script that runs as it is needs no adapter.
-    recognised = not plain or chosen == "cpu" or backbone is not None
-    kind: type[BackboneAdapter] | None = adapter_class(checkout, backbone) if recognised else None
+    kind, root = _recognised(path, backbone, needed=not plain)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
-    on_device = cuda_on_cpu(kind.stand_in_for(checkout, words)) if kind and chosen == "cpu" else nullcontext()
+    on_device: AbstractContextManager[None] = nullcontext()
+    if chosen == "cpu":
+        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, words))
     try:
         with on_device, loaded_script(script, words) as loaded:
             if kind is None or plain:
@@ -145,3 +136,30 @@ def run(
         if line is None:
             raise
         raise line from error
+
+
+def _chosen_device(device: str) -> str:
+    """Return "cuda" or "cpu" for a value of --device."""
+    import torch
+
+    if device not in ("auto", "cuda", "cpu"):
+        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise UserInputError(
+            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
+        )
+    return device if device != "auto" else "cuda" if available else "cpu"
+
+
+def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:
+    """Return the adapter of a script's checkout, None for another script if none is needed, and the checkout's root."""
+    from lapgs_plugin.checkouts.source import CheckoutSource
+
+    try:
+        root = CheckoutSource.read(script).root
+        return adapter_class(root, backbone), root
+    except UserInputError:
+        if needed or backbone is not None:
+            raise
+        return None, script.parent

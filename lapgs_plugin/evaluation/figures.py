@@ -127,6 +127,7 @@ def evaluate_run(
         "lpips_missing": dict(distances.missing),
         "fps": speed.fps,
         "masked": any(view.mask is not None for view in views),
+        "exposure_compensated": archive.exposure(archive.available_levels[-1]) is not None,
     }
     archive.write_metrics(metrics)
     return metrics
@@ -177,6 +178,8 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         fitted_psnr: mean PSNR after a colour fit, see `color_fitted_psnr`; absent in older files.
         lpips_missing: by variant, why it could not be measured; added by `evaluate_run`.
         fps: frames a second of the composed image, the median over some views; added by `evaluate_run`.
+        exposure_compensated: whether the run learned colour transforms of its photos, so that its renders have
+            their mean exposure; added by `evaluate_run`, absent in older files.
         masked: whether pixels outside of masks were left out; added by `evaluate_run`, absent in older files.
         split, num_views: the measured views, "test" or "train", and their number.
         train_seconds and other figures of training: see `training_figures`.

@@ -152,7 +152,8 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         *(*LAPGS, "train", str(scene), "--out", str(folder), "--overwrite", "--eval"),
         *("--iterations", str(spec.iterations), "--resolution", spec.resolution, "--images", spec.images),
         *("--seed", str(spec.seed), "--rasterizer", spec.rasterizer),
-        *_as_options({**spec.options, **levels}),
+        # Backbones compensate no exposure, and tables compare views as they are.
+        *_as_options({"exposure": "off", **spec.options, **levels}),
     )
 
 

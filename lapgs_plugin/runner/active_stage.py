@@ -223,7 +223,6 @@ class ActiveStage:
     def _prune(self, gaussians: Any) -> None:
         self._context.parts.breakdown.mark("densification")
         prune_least_visible(self._views, gaussians, self._options.prune, self._run.color_path)
-        self.densified(gaussians)
         self._context.parts.breakdown.mark("other")
 
     def _train_jointly(self, gaussians: Any) -> None:

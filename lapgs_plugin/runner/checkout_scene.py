@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,27 +20,32 @@ class CheckoutScene:
     others: tuple[Any, ...]  # arguments of `create_from_pcd` after the points
 
     @classmethod
-    def load(
-        cls, make_scene: Callable[..., Any], call: TrainingCall, adapter: BackboneAdapter, folder: Path
-    ) -> CheckoutScene:
-        """Make the checkout's Scene without a model.
+    def load(cls, call: TrainingCall, adapter: BackboneAdapter, folder: Path) -> CheckoutScene:
+        """Make the checkout's Scene without a model, with the arguments that the script gives.
 
         Args:
-            make_scene: the checkout's Scene class.
             call: the script's call of `training`.
             adapter: adapter of the checkout.
             folder: receives the files that the Scene writes beside a model.
 
         Raises:
-            UserInputError: the Scene initialised no model from points.
+            UserInputError: the Scene initialised no model from points, or has cameras at several resolutions.
         """
         model = _PointRecorder()
-        scene = make_scene(_with_attributes(call.dataset, model_path=str(folder)), model)
+        own = call.changed(dataset=_with_attributes(call.dataset, model_path=str(folder)))
+        scene = adapter.profile.make_scene(own.values, model)
         if not hasattr(model, "points"):
             raise UserInputError(
-                f"the Scene of {adapter.script.checkout} initialised no model with create_from_pcd, expected of "
+                f"the Scene of {adapter.root} initialised no model with create_from_pcd, expected of "
                 f"{adapter.info.title}; choose another --backbone, or train with `lapgs run --off`"
             )
+        for name in ("train_cameras", "test_cameras"):
+            scales = getattr(scene, name, None)
+            if not isinstance(scales, dict) or len(scales) != 1:
+                raise UserInputError(
+                    f"the Scene of {adapter.root} has {name} at scales {list(scales or ())}, expected one scale: "
+                    "levels have sizes of their own; `lapgs run --off` runs the script as it is"
+                )
         return cls(scene, model.points, model.others)
 
     @property
@@ -60,8 +64,8 @@ class CheckoutScene:
             self.scene,
             gaussians=gaussians,
             model_path=model_path,
-            train_cameras={1.0: train},
-            test_cameras={1.0: test},
+            train_cameras=dict.fromkeys(self.scene.train_cameras, train),
+            test_cameras=dict.fromkeys(self.scene.test_cameras, test),
         )
 
 

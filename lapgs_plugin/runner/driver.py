@@ -31,11 +31,11 @@ from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.rasterizers.extensions import CudaExtension
-from lapgs_plugin.rasterizers.signed_color import ColorPath, SignedColorRasterizer
+from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.dry_run import DryRun
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
@@ -117,9 +117,8 @@ class HierarchyDriver:
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite)
-        path = self._color_path()
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
-            scene = CheckoutScene.load(self._replacements.scene_class, call, self._adapter, Path(scratch))
+            scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._context.images.read_masks(Path(call.dataset.source_path), self._options.masks)
             self._adapter.first_points(len(scene.points.points))
             plan = StagePlan.create(
@@ -129,6 +128,10 @@ class HierarchyDriver:
                 self._options.shares,
                 self._options.kind,
             )
+            dry_run = DryRun(self._context, call, scene, plan, self._activate)
+            if self._options.dry_run:
+                dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
+            path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:
@@ -203,15 +206,8 @@ class HierarchyDriver:
         """Whether no field is a residual, so that one call of the script's `training` trains all levels."""
         return self._options.levels == 1 or self._options.nested
 
-    def _activate(self, stage: ActiveStage | None) -> None:
+    def _activate(self, stage: Any) -> None:
         self._active = stage
-
-    def _color_path(self) -> ColorPath:
-        """Return how the installed rasterizer evaluates signed colour, which is found out by rendering."""
-        extension = CudaExtension(self._adapter.info.rasterizer, self._context.device)
-        if self._signs_nothing:
-            return ColorPath.NATIVE
-        return SignedColorRasterizer(extension, checkout=self._adapter.script.checkout).path
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.

@@ -2,39 +2,35 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
-from types import ModuleType
-
 from lapgs_plugin.adapters.registry import known_extensions
+from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
-SETTINGS = "GaussianRasterizationSettings"
 
-
-def require_matching_rasterizer(renderer: ModuleType, rasterizer: str, title: str) -> None:
-    """Compare the settings that a checkout's `render` passes with those that the rasterizer takes.
+def require_matching_rasterizer(profile: Profile, title: str) -> None:
+    """Compare the settings that a checkout's renderers pass with those that their rasterizers take.
 
     Args:
-        renderer: the checkout's `gaussian_renderer`; nothing is compared if it does not have the settings.
-        rasterizer: name of the rasterizer's module.
+        profile: the checkout's.
         title: title of the backbone.
 
     Raises:
-        UserInputError: the rasterizer belongs to another code base.
+        UserInputError: an installed rasterizer belongs to another code base.
     """
-    settings = vars(renderer).get(SETTINGS)
-    passed = _passed_settings(renderer)
-    if settings is None or not passed:
-        return
-    unknown = passed - set(settings._fields)
-    wanting = set(settings._fields) - set(settings._field_defaults) - passed
-    if unknown or wanting:
-        found = [f"takes no {name}" for name in sorted(unknown)] + [f"wants {name}" for name in sorted(wanting)]
-        raise UserInputError(
-            f"the installed {rasterizer} is not the one of {title}: it {' and '.join(found)}, expected what "
-            f"{renderer.__file__} passes; install the checkout's own, as its README says, in an environment of its own"
-        )
+    for rasterizer in profile.rasterizers:
+        use, named = rasterizer.use, (vars(rasterizer.module)[name] for name in rasterizer.settings)
+        for settings in named:
+            fields, defaults = getattr(settings, "_fields", None), getattr(settings, "_field_defaults", {})
+            if fields is None or not use.settings:
+                continue
+            unknown, wanting = use.settings - set(fields), set(fields) - set(defaults) - use.settings
+            if unknown or wanting:
+                found = [f"takes no {name}" for name in sorted(unknown)] + [f"wants {name}" for name in sorted(wanting)]
+                raise UserInputError(
+                    f"the installed {use.module} is not the one of {title}: it {' and '.join(found)}, expected what "
+                    f"{use.where.rpartition(':')[0]} passes; install the checkout's own, as its README says, in an "
+                    "environment of its own"
+                )
 
 
 def explain_import_error(error: ImportError, script: str) -> MissingExtraError | None:
@@ -47,10 +43,3 @@ def explain_import_error(error: ImportError, script: str) -> MissingExtraError |
                 "install it as the checkout's README says, or run on CPU stand-ins with `lapgs run --device cpu`"
             )
     return None
-
-
-def _passed_settings(renderer: ModuleType) -> set[str]:
-    """Return the keywords of the calls that make settings."""
-    calls = [node for node in ast.walk(ast.parse(inspect.getsource(renderer))) if isinstance(node, ast.Call)]
-    makers = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == SETTINGS]
-    return {keyword.arg for call in makers for keyword in call.keywords if keyword.arg is not None}

@@ -3,21 +3,19 @@
 In the order of an iteration, each call and the part that begins with it:
 
     update_learning_rate                     other             before the rasterizer: views, targets, logging
-    GaussianRasterizationSettings            forward           the first call of every render
+    settings of the rasterizer               forward           the first call of every render
     return of the rasterizer                 loss              composition, exposure, the loop's own loss
     Tensor.backward                          backward
     density control and its scores           densification     including renders without gradients
     step of any optimizer                    optimizer
 
-`other` begins after each of the last three. Without `--breakdown` none of these symbols is replaced.
+`other` begins after each of the last three. Without `--breakdown` nothing is measured.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -25,7 +23,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.runner.rasterizer_wrapper import WrappedRasterizer
+from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 
 
@@ -48,23 +46,17 @@ class IterationParts:
         """Start the measurement of another stage."""
         self.breakdown = breakdown_on(self._device) if self._measures else Breakdown()
 
-    def inner_replacements(self, renderer: ModuleType) -> list[Replacement]:
-        """Return replacements in `render`; they come before those that compose, whose time then counts as loss."""
-        if not self._measures:
-            return []
-        consumer = "render(), to tell rendering from composition"
-        return [
-            Replacement(renderer, "GaussianRasterizationSettings", self._settings, None, consumer),
-            Replacement(renderer, "GaussianRasterizer", self._rasterizer, None, consumer),
-        ]
+    def mark_render(self, part: str) -> None:
+        """Mark the beginning of a part of a render with gradients: "forward", or "loss" when it has rasterized."""
+        if torch.is_grad_enabled():
+            self.breakdown.mark(part)
 
-    def outer_replacements(self, train: ModuleType, info: BackboneInfo) -> list[Replacement]:
-        """Return replacements in the training loop; they come after all others, whose time they include."""
+    def replacements(self, profile: Profile, info: BackboneInfo) -> list[Replacement]:
+        """Return replacements in the training loop, whose time includes that of all others: they come last."""
         if not self._measures:
             return []
-        utilities = [module for name, module in sys.modules.items() if name.startswith("utils.")]
-        scores = [(m, name) for name in info.density_scores for m in (train, *utilities) if name in vars(m)]
-        control = [(train.GaussianModel, name) for name in info.density_control]
+        scores = [(module, name) for name in info.density_scores for module in profile.modules if name in vars(module)]
+        control = [(profile.model, name) for name in profile.density_control]
         consumer = "training() when it densifies and prunes"
         return [
             Replacement(torch.Tensor, "backward", self._backward, ("self",), "training() after its loss"),
@@ -84,26 +76,6 @@ class IterationParts:
         finally:
             before.remove()
             after.remove()
-
-    def _settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def make_settings(*args: Any, **kwargs: Any) -> Any:
-            if torch.is_grad_enabled():
-                self.breakdown.mark("forward")
-            return original(*args, **kwargs)
-
-        return make_settings
-
-    def _rasterizer(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def make_rasterizer(raster_settings: Any) -> Any:
-            return WrappedRasterizer(original(raster_settings=raster_settings), self._render)
-
-        return make_rasterizer
-
-    def _render(self, rasterizer: Any, inputs: dict[str, Any]) -> Any:
-        rendered = rasterizer(**inputs)
-        if torch.is_grad_enabled():
-            self.breakdown.mark("loss")
-        return rendered
 
     def _backward(self, original: Callable[..., None]) -> Callable[..., None]:
         def backward(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> None:

@@ -61,14 +61,15 @@ class JointLevels:
         self._context, self._run, self._images = context, run, images
         self._pyramid = Pyramid(context.options.grid)
         self._cameras = {images.key(camera): camera for camera in images.cameras}
-        views = {id(camera.world_view_transform): key for key, camera in self._cameras.items()}
-        self._fields = [self._load(one, views) for one in finished]
+        self._fields = [self._load(one) for one in finished]
 
-    def _load(self, finished: FinishedStage, views: dict[int, str]) -> _JointField:
+    def _load(self, finished: FinishedStage) -> _JointField:
         adapter, device, call = self._context.adapter, self._context.device, finished.call
         gaussians = adapter.model_of(call, self._run.archive.field(finished.stage.level).to(device))
-        rendering = StageRendering(signed=finished.stage.signed, path=self._run.color_path, views=views, capture=True)
-        background = torch.full((3,), float(call.dataset.white_background), device=device)
+        rendering = StageRendering(
+            signed=finished.stage.signed, path=self._run.color_path, views=self._cameras, capture=True
+        )
+        background = torch.full((3,), float(call.white_background), device=device)
         return _JointField(finished, gaussians, rendering, background)
 
     def follow(self, gaussians: Any, residual_color_rate: float) -> None:

@@ -24,7 +24,7 @@ def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: Trainin
             path=str(Path(dataset.source_path).absolute()),
             resolution=f"3dgs:{dataset.resolution}",
             eval=bool(dataset.eval),
-            background=(1.0, 1.0, 1.0) if dataset.white_background else (0.0, 0.0, 0.0),
+            background=(1.0, 1.0, 1.0) if call.white_background else (0.0, 0.0, 0.0),
             kind="colmap" if (Path(dataset.source_path) / "sparse").exists() else "transforms",
             images=dataset.images or "images",
             masks=resolve_masks(Path(dataset.source_path), settings.masks),
@@ -34,12 +34,12 @@ def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: Trainin
         supervision=settings.supervision,
         inherit=settings.resolved()["inherit"],
         sh_degree=dataset.sh_degree,
-        rasterizer=adapter.info.rasterizer,
+        rasterizer=adapter.rasterizer,
         seed=settings.seed,
         settings={
             "backbone": {
                 "name": adapter.info.name,
-                "checkout": str(adapter.script.checkout),
+                "checkout": str(adapter.root),
                 "arguments": sys.argv[1:],
             },
             RASTER_SETTINGS: adapter.raster_settings(call),

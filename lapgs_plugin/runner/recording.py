@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import time
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
-from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.checkouts.attachment import Attachment, Replacement, of_class
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
@@ -71,18 +71,16 @@ class BareRunRecorder:
         logger.info("recorded: %s", path)
 
     def _replacements(self) -> list[Replacement]:
-        train = self._adapter.train
+        profile = self._adapter.profile
         return [
-            Replacement(train, "training", self._make_training, ("dataset", "opt", "pipe"), "the main block"),
-            Replacement(train, "Scene", self._make_scene, ("args", "gaussians"), "training()"),
-            Replacement(
-                train.GaussianModel,
-                "update_learning_rate",
-                self._make_update_learning_rate,
-                ("self", "iteration"),
-                "training() at the start of every iteration",
+            Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
+            *(
+                Replacement(owner, name, self._make_scene, None, "training()")
+                for owner, name in profile.holders(profile.scene)
+                if owner is profile.script.module
             ),
-            Replacement(train.Scene, "save", self._make_save, ("self", "iteration"), "training() at --save_iterations"),
+            *of_class(profile.model, "update_learning_rate", self._make_update_learning_rate, "every iteration"),
+            *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -106,24 +104,26 @@ class BareRunRecorder:
 
         return make_scene
 
-    def _make_update_learning_rate(self, original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
-        def update_learning_rate(gaussians: Any, iteration: int) -> Any:
-            self._iteration_begins(len(gaussians._xyz), iteration)
-            return original(gaussians, iteration)
+    def _make_update_learning_rate(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            self._iteration_begins(len(gaussians._xyz))
+            return original(gaussians, *args, **kwargs)
 
         return update_learning_rate
 
-    def _make_save(self, original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
-        def save(scene: Any, iteration: int) -> Any:
+    def _make_save(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def save(scene: Any, *args: Any, **kwargs: Any) -> Any:
             self._synchronize()
             start = time.perf_counter()
-            result = original(scene, iteration)
+            result = original(scene, *args, **kwargs)
             self._saving += time.perf_counter() - start
             return result
 
         return save
 
-    def _iteration_begins(self, count: int, iteration: int) -> None:
+    def _iteration_begins(self, count: int) -> None:
         if self._began is None:
             self._synchronize()
             if self._device == "cuda":
@@ -136,9 +136,9 @@ class BareRunRecorder:
         self._summed += count
         self._peak = max(self._peak, count)
         assert self._call is not None, "training() makes iterations"
-        if iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
+        if self._iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
             elapsed = self._elapsed(self._began)
-            self._timeline.append({"iteration": iteration, "elapsed": elapsed, "num_gaussians": count})
+            self._timeline.append({"iteration": self._iteration, "elapsed": elapsed, "num_gaussians": count})
 
     def _profile(self) -> None:
         """Start or end a profile if it is due; its time does not count."""
@@ -172,11 +172,11 @@ class BareRunRecorder:
         """Return means of PSNR in dB and SSIM over the held-out views, empty without any."""
         assert self._call is not None, "called after training"
         cameras = list(self._scene.getTestCameras())
-        background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
+        background = torch.full((3,), float(self._call.white_background), device=self._device)
         wrapper = RasterizerWrapper()
         wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
-        renderer = sys.modules["gaussian_renderer"]
-        with Attachment([Replacement(renderer, "GaussianRasterizer", wrapper.rasterizer, None, "render()")]):
+        found = wrapper.entries(self._adapter.profile)
+        with Attachment([Replacement(owner, name, make, None, "render()") for owner, name, make in found]):
             return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
 
     def _rendered(

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Callable
-from types import ModuleType
+from functools import wraps
 from typing import Any
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.attachment import Replacement, of_class
+from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
 
-OPACITY_RESET = "reset_opacity"
-"""Method of the family's GaussianModel that is density control and can be skipped by itself."""
 SIZE_LIMIT = "max_screen_size"
 """Parameter of the family's density control: with None it removes no Gaussian for its size."""
 
@@ -29,11 +27,7 @@ class StageReplacements:
         running: returns the running stage, None between stages.
         train: called in place of the script's `training`.
 
-    Attributes:
-        scene_class: the checkout's own Scene, once its name is replaced.
     """
-
-    scene_class: Callable[..., Any]
 
     def __init__(
         self,
@@ -42,24 +36,29 @@ class StageReplacements:
         train: Callable[[TrainingCall], None],
     ) -> None:
         self._context, self._running, self._train = context, running, train
+        self._controlling = False  # whether a method of density control is running
 
     def all(self) -> list[Replacement]:
         """Return the replacements in the order in which they are made.
 
         Raises:
-            UserInputError: the checkout lacks a symbol, or another rasterizer than its own is installed.
+            UserInputError: this is no 3DGS checkout, or another rasterizer than its own is installed.
         """
-        adapter, parts = self._context.adapter, self._context.parts
-        renderer, loader = self._imported("gaussian_renderer"), self._imported("utils.camera_utils")
-        require_matching_rasterizer(renderer, adapter.info.rasterizer, adapter.info.title)
+        adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
+        self._context.wrapper.mark = parts.mark_render
+        require_matching_rasterizer(profile, adapter.info.title)
         return [
-            *self._in_training(),
-            Replacement(loader, "Camera", self._context.images.adopting, None, "the scene's loader, for every image"),
-            *parts.inner_replacements(renderer),
-            *self._in_rendering(renderer),
-            *self._in_model(),
+            *self._in_training(profile),
+            *(
+                Replacement(
+                    camera, "__init__", self._context.images.adopting, None, "the scene's loader, for every image"
+                )
+                for camera in profile.cameras
+            ),
+            *self._in_rendering(profile),
+            *self._in_model(profile),
             *adapter.replacements(self._window),
-            *parts.outer_replacements(adapter.train, adapter.info),
+            *parts.replacements(profile, adapter.info),
         ]
 
     def _window(self) -> StageWindow | None:
@@ -67,111 +66,118 @@ class StageReplacements:
         stage = self._running()
         return None if stage is None or stage.keeps_schedule else stage.window
 
-    def _imported(self, name: str) -> ModuleType:
-        """Return a module that the script has imported."""
-        if name not in sys.modules:
-            self._refuse(f"does not import {name}")
-        return sys.modules[name]
-
-    def _refuse(self, problem: str) -> None:
-        adapter = self._context.adapter
-        raise UserInputError(
-            f"{adapter.script.path} {problem}, expected of {adapter.info.title}; choose another --backbone, or train "
-            "with `lapgs run --off`"
-        )
-
-    def _in_training(self) -> list[Replacement]:
-        train = self._context.adapter.train
-        for name in ("GaussianModel", "Scene"):
-            if not hasattr(train, name):
-                self._refuse(f"has no {name}")
+    def _in_training(self, profile: Profile) -> list[Replacement]:
+        scenes = [name for owner, name in profile.holders(profile.scene) if owner is profile.script.module]
+        saves = [Replacement(profile.scene, "save", self._make_save, None, "training() at --save_iterations")]
         return [
-            Replacement(train, "training", self._make_training, ("dataset", "opt", "pipe"), "the main block"),
-            Replacement(train, "Scene", self._make_scene, ("args", "gaussians"), "training()"),
-            Replacement(train.Scene, "save", self._make_save, ("self", "iteration"), "training() at --save_iterations"),
+            Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
+            *(Replacement(profile.script.module, name, self._make_scene, None, "training()") for name in scenes),
+            *(saves if "save" in vars(profile.scene) else ()),
         ]
 
-    def _in_rendering(self, renderer: ModuleType) -> list[Replacement]:
-        consumer = "render(), and through it the training loop, score functions and reports"
+    def _in_rendering(self, profile: Profile) -> list[Replacement]:
+        consumer = "the training loop, score functions and reports"
         wrapper = self._context.wrapper
-        return [
-            Replacement(renderer, "GaussianRasterizationSettings", wrapper.settings, None, consumer),
-            Replacement(renderer, "GaussianRasterizer", wrapper.rasterizer, None, consumer),
-        ]
+        made = [(function, wrapper.renderer) for function in profile.renderers]
+        found = [(owner, name, make) for value, make in made for owner, name in profile.holders(value)]
+        for rasterizer in profile.rasterizers:
+            for name in rasterizer.settings:
+                found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]
+        found += wrapper.entries(profile)
+        return [Replacement(owner, name, make, None, consumer) for owner, name, make in found]
 
-    def _in_model(self) -> list[Replacement]:
-        model = self._context.adapter.train.GaussianModel
-        start, after_densifying = "training() at the start of every iteration", self._then(ActiveStage.densified)
-        prepare = self._then(ActiveStage.optimizers_made)
-        control = dict.fromkeys(self._context.adapter.info.density_control, after_densifying)
+    def _in_model(self, profile: Profile) -> list[Replacement]:
+        start = "training() at the start of every iteration"
+        control = dict.fromkeys(profile.density_control, self._make_density_control)
         if not self._context.options.prune_by_size:
-            limited = [name for name in control if SIZE_LIMIT in inspect.signature(getattr(model, name)).parameters]
+            methods = {name: inspect.signature(getattr(profile.model, name)) for name in control}
+            limited = [name for name, signature in methods.items() if SIZE_LIMIT in signature.parameters]
             if not limited:
                 raise UserInputError(
                     f"--no-prune-by-size: densification of {self._context.adapter.info.title} has no {SIZE_LIMIT} to "
                     "leave out; leave the option out"
                 )
             for name in limited:
-                control[name] = lambda original: after_densifying(_without_size_limit(original))
+                control[name] = lambda original: self._make_density_control(_without_size_limit(original))
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
         return [
-            Replacement(model, "update_learning_rate", self._before_iteration, ("self", "iteration"), start),
-            Replacement(model, "training_setup", prepare, ("self", "training_args"), "training()"),
-            *(Replacement(model, name, make, ("self",), "training()") for name, make in control.items()),
+            *of_class(profile.model, "update_learning_rate", self._before_iteration, start),
+            *of_class(profile.model, "training_setup", self._make_training_setup, "training()"),
+            *(each for name, make in control.items() for each in of_class(profile.model, name, make, "training()")),
         ]
 
     def _make_training(self, original: Callable[..., None]) -> Callable[..., None]:
+        @wraps(original)
         def training(*args: Any, **kwargs: Any) -> None:
             self._train(TrainingCall.bind(original, args, kwargs))
 
         return training
 
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        self.scene_class = original
-
-        def make_scene(args: Any, gaussians: Any, *rest: Any, **kwargs: Any) -> Any:
+        def make_scene(*args: Any, **kwargs: Any) -> Any:
             stage = self._running()
             assert stage is not None, "training() makes its scene inside a stage"
+            model = self._context.adapter.profile.model
+            gaussians = next((value for value in (*args, *kwargs.values()) if isinstance(value, model)), None)
+            assert gaussians is not None, "training() makes its scene with a model"
             return stage.scene_for(gaussians)
 
         return make_scene
 
-    def _make_save(self, original: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
-        def save(scene: Any, iteration: int) -> None:
+    def _make_save(self, original: Callable[..., None]) -> Callable[..., None]:
+        @wraps(original)
+        def save(scene: Any, *args: Any, **kwargs: Any) -> None:
             if (stage := self._running()) is None:
-                original(scene, iteration)
+                original(scene, *args, **kwargs)
                 return
             with stage.record.outside("saving"):
-                original(scene, iteration)
+                original(scene, *args, **kwargs)
 
         return save
 
     def _before_iteration(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def update_learning_rate(gaussians: Any, iteration: int) -> Any:
+        """Begin an iteration at each call, whatever its argument: some loops do not pass the iteration."""
+
+        @wraps(original)
+        def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             if (stage := self._running()) is not None:
                 stage.iteration_begins(gaussians)
-            return original(gaussians, iteration)
+            return original(gaussians, *args, **kwargs)
 
         return update_learning_rate
 
-    def _then(self, react: Callable[[ActiveStage, Any], None]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-        """Return a maker of replacements that call `react(stage, gaussians)` after a method of the model."""
+    def _make_training_setup(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            result = original(gaussians, *args, **kwargs)
+            # Some loops set their optimizers up again within a stage: these start anew there, too.
+            if (stage := self._running()) is not None and stage.record.iteration == 0:
+                stage.optimizers_made(gaussians)
+            return result
 
-        def make(original: Callable[..., Any]) -> Callable[..., Any]:
-            def method(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+        return training_setup
+
+    def _make_density_control(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Announce that density control is done after the outermost of its methods, which call one another."""
+
+        @wraps(original)
+        def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            outermost, self._controlling = not self._controlling, True
+            try:
                 result = original(gaussians, *args, **kwargs)
-                if (stage := self._running()) is not None:
-                    react(stage, gaussians)
-                return result
+            finally:
+                self._controlling = not outermost
+            if outermost and (stage := self._running()) is not None:
+                stage.densified(gaussians)
+            return result
 
-            return method
-
-        return make
+        return control
 
     def _make_opacity_reset(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        control = self._then(ActiveStage.densified)(original)
+        control = self._make_density_control(original)
 
+        @wraps(original)
         def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             stage = self._running()
             if stage is None or stage.resets_opacities:
@@ -185,6 +191,7 @@ def _without_size_limit(original: Callable[..., Any]) -> Callable[..., Any]:
     """Return a density control method that removes no Gaussian for its size."""
     signature = inspect.signature(original)
 
+    @wraps(original)
     def method(*args: Any, **kwargs: Any) -> Any:
         bound = signature.bind(*args, **kwargs)
         bound.arguments[SIZE_LIMIT] = None

@@ -13,6 +13,9 @@ from lapgs_plugin.options import option
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
 """Settings that the manifest has fields of its own for."""
 
+NOT_IN_MANIFEST = ("dry_run",)
+"""Settings that change no result."""
+
 
 @dataclass(frozen=True)
 class RunSettings(HierarchySettings):
@@ -37,6 +40,12 @@ class RunSettings(HierarchySettings):
         names=("--fused-adam/--no-fused-adam",),
     )
 
+    dry_run: bool = option(
+        True,
+        "Try one iteration of the checkout, and all that the run does with its model, before the first stage.",
+        names=("--dry-run/--no-dry-run",),
+    )
+
     masks: str = option(
         "auto",
         "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
@@ -50,4 +59,4 @@ class RunSettings(HierarchySettings):
 
     def for_manifest(self) -> dict[str, Any]:
         """Return what the manifest has under "settings"."""
-        return {name: value for name, value in self.resolved().items() if name not in IN_MANIFEST}
+        return {name: value for name, value in self.resolved().items() if name not in (*IN_MANIFEST, *NOT_IN_MANIFEST)}

@@ -118,7 +118,7 @@ class SingleCall:
         return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
 
     def _begin(self, stage: NestedStage) -> None:
-        for name in self._context.adapter.info.densify_thresholds:
+        for name in self._context.adapter.densify_thresholds(self._opt):
             setattr(self._call.opt, name, getattr(self._opt, name) * stage.window.threshold_factor)
         self._activate(stage)
         stage.load_images()
@@ -148,7 +148,7 @@ class SingleCall:
         the archive; so the checkout's way to restore them, which differs between forks, is left out.
         """
         adapter = self._context.adapter
-        model = adapter.train.GaussianModel
+        model = adapter.profile.model
         if CHECKPOINT not in self._call.values or "restore" not in vars(model):
             raise UserInputError(
                 f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues "

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
@@ -52,10 +52,10 @@ class StageModel:
 
     def prepare_optimizers(self, gaussians: Any) -> None:
         """Give the checkout's new optimizers inherited state and the rate of SH, and fuse their steps on a GPU."""
-        for optimizer in self._adapter.optimizers(gaussians):
-            for group in optimizer.param_groups:
-                if group.get("name") == SH_REST:
-                    group["lr"] *= self._options.sh_rate
+        optimizers = list(self._adapter.optimizers(gaussians))
+        if self._options.sh_rate != 1.0:
+            _scale_sh_rate(optimizers, self._options.sh_rate)
+        for optimizer in optimizers:
             if self._before is not None:
                 self._inherit_moments(optimizer, self._before.moments)
             if self._options.fused_adam and self._device.type == "cuda":
@@ -104,6 +104,17 @@ class StageModel:
                 optimizer.state[group["params"][0]] = {
                     name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
                 }
+
+
+def _scale_sh_rate(optimizers: Sequence[torch.optim.Optimizer], factor: float) -> None:
+    groups = [group for optimizer in optimizers for group in optimizer.param_groups if group.get("name") == SH_REST]
+    if not groups:
+        raise UserInputError(
+            f"--sh-rate {factor:g}: the checkout's optimizers have no parameter group {SH_REST}; leave it "
+            "out, and give its script the learning rate"
+        )
+    for group in groups:
+        group["lr"] *= factor
 
 
 def _fuse_steps(optimizer: torch.optim.Optimizer) -> None:

@@ -51,7 +51,7 @@ class StageViews:
         self.rendering = StageRendering(
             signed=stage.signed,
             path=run.color_path,
-            views={id(camera.world_view_transform): self.images.key(camera) for camera in self.images.cameras},
+            views={self.images.key(camera): camera for camera in self.images.cameras},
             targets=self.images.targets,
             accumulated=self.images.accumulated,
             coarse=self.images.coarse,
@@ -141,7 +141,7 @@ class StageViews:
     def _composed(self, gaussians: Any, camera: Any) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
         rendering = replace(self.rendering, composed=self.images.keys, capture=True)
-        background = torch.full((3,), float(self._call.dataset.white_background), device=self._device)
+        background = torch.full((3,), float(self._call.white_background), device=self._device)
         return self._context.render(rendering, self._call, self._view(camera), gaussians, background)
 
     def _full_size(self, gaussians: Any, camera: Any) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
+from functools import partial
 from typing import Any, cast
 
 from torch import Tensor
@@ -20,7 +21,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.composition import compose
-from lapgs_plugin.ops.upsample import upsample
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.training.model import TrainableField
 
 
@@ -45,29 +46,32 @@ class JointFields:
 
     def predict(self, name: str) -> Tensor:
         """(3, h, w) Up of what the fields make of a view, at the size of the level below them, with gradients."""
-        return self._predict(
-            [name], lambda field, cameras, background: render_image(self.rasterizer, field, cameras[0], background)
-        )
+        return self._upsampled([name])
 
     def predict_batch(self, names: Sequence[str]) -> Tensor:
         """(b, 3, h, w) `predict` of two views or more of one size, each field's in one set of launches."""
-        rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
+        return self._upsampled(names)
 
-        def render(field: GaussianField, cameras: Sequence[Camera], background: Tensor) -> Tensor:
-            return rasterizer.render_batch(field, cameras, background=background, describes=False).image
+    def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Return what adds `predict` of a view, or `predict_batch` of several, to an image of that shape."""
+        return partial(upsample_add, self.pyramid, self._composed(names))
 
-        return self._predict(names, render)
-
-    def _predict(
-        self, names: Sequence[str], render: Callable[[GaussianField, Sequence[Camera], Tensor], Tensor]
-    ) -> Tensor:
-        def render_level(level: int, model: TrainableField) -> Tensor:
-            cameras = [self._camera(name, level) for name in names]
-            return render(model.field, cameras, self.background.new_zeros(3) if model.signed else self.background)
-
-        renders = ((level, render_level(level, model)) for level, model in self.models.items())
+    def _upsampled(self, names: Sequence[str]) -> Tensor:
         camera = self._camera(names[0], min(self.models) - 1)
-        return upsample(self.pyramid, compose(self.pyramid, renders).image, (camera.height, camera.width))
+        return upsample(self.pyramid, self._composed(names), (camera.height, camera.width))
+
+    def _composed(self, names: Sequence[str]) -> Tensor:
+        """Return what the fields make of a view or of several, at their own finest level."""
+
+        def render(level: int, model: TrainableField) -> Tensor:
+            cameras = [self._camera(name, level) for name in names]
+            background = self.background.new_zeros(3) if model.signed else self.background
+            if len(cameras) == 1:
+                return render_image(self.rasterizer, model.field, cameras[0], background)
+            rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
+            return rasterizer.render_batch(model.field, cameras, background=background, describes=False).image
+
+        return compose(self.pyramid, ((level, render(level, model)) for level, model in self.models.items())).image
 
     def _camera(self, name: str, level: int) -> Camera:
         """A view's camera, always the same object: a rasterizer may know it by that."""

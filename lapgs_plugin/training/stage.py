@@ -331,11 +331,10 @@ class StageRun:
     def _plain_losses(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
         """Return what computes the mean loss of some views, in a list, from their renders."""
         target = self.images.targets.get_stored(names)
-        compose: Callable[[Tensor], Tensor]
-        if self.joint is None and self.accumulated is not None:
-            compose = self.accumulated.adder(names)
-        else:
-            compose = partial(add_prediction, accumulated=self._prediction(names))
+        if self.joint is not None:
+            self.breakdown.mark("forward")
+        below = self.joint or self.accumulated
+        compose = partial(add_prediction, accumulated=None) if below is None else below.adder(names)
 
         def losses(rendered: Tensor) -> list[Tensor]:
             return [photometric_loss(self._exposed(names, compose(rendered)), target, self.settings.ssim_weight)]

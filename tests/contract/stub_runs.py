@@ -171,6 +171,8 @@ def drive(
     **options: Any,
 ) -> None:
     options.setdefault("hierarchy", "nested")
+    # Tests that watch a checkout's methods would see the dry run's iteration; `test_run_dry` has tests of it.
+    options.setdefault("dry_run", False)
     if options["hierarchy"] == "laplacian" and options.get("levels", 2) == 2:
         options = {**THIRDS, **options}
     driver = HierarchyDriver(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.adapters.fastgs import late_pruning_due
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import PRESETS
 from lapgs_plugin.hierarchy.plan import StagePlan
@@ -88,12 +88,24 @@ def test_each_stage_of_a_checkout_gets_what_the_release_gives_it(
     }
 
 
-def test_every_stage_resets_prunes_late_and_starts_as_in_the_release() -> None:
+def test_every_stage_resets_prunes_late_and_starts_as_in_the_release(scene: Path, tmp_path: Path) -> None:
     paper = RunSettings(protocol="paper")
     assert (paper.residual_resets, paper.joint_share, paper.prune) == (True, 0.0, 0.0)
     assert (paper.inherit_mode, paper.inherit_ratio) == ("xyz", 1.0)  # --inherit_state only_xyz --inherit_ratio 1.0
-    for iterations, due in zip(SCHEDULE["iterations"], LATE_PRUNING, strict=True):
-        assert [i for i in range(1, int(iterations) + 1) if late_pruning_due(i, int(iterations))] == due
+    with loaded(STUBS["fastgs"], scene, tmp_path) as adapter:
+        tree = adapter.script.function("training")
+        assert tree is not None
+        schedule, call = Schedule(tree), published_call("fastgs", adapter)
+    for stage, due in zip(
+        StagePlan.create((1600, 1066), TOTAL, 2, paper.shares, paper.kind), LATE_PRUNING, strict=True
+    ):
+        notes = schedule.for_stage(call.values, call.values, StageWindow(stage, 0, TOTAL, 2, 1.0, 1.0)).notes
+        numbers = {int(before): int(after) for before, after in (note.split(" -> ") for note in notes)}
+        assert [
+            i
+            for i in range(1, stage.iterations + 1)
+            if i % numbers[3_000] == 0 and numbers[15_000] < i < numbers[30_000]
+        ] == due
 
 
 def test_each_stage_of_our_own_trainer_gets_what_the_release_gives_it() -> None:
@@ -147,6 +159,21 @@ def test_a_densification_that_knows_no_size_has_none_to_leave_out(scene: Path, t
         adapter.train.GaussianModel.densify_and_prune = lambda self, radii: None
         with pytest.raises(UserInputError, match="--no-prune-by-size: densification of graphdeco 3DGS has no max_scr"):
             drive(adapter, hierarchy="laplacian", prune_by_size=False, **THIRDS)
+
+
+def test_a_rate_of_sh_needs_the_familys_parameter_group(scene: Path, tmp_path: Path) -> None:
+    with loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
+        model = adapter.train.GaussianModel
+        setup = model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            setup(self, training_args)
+            for group in self.optimizer.param_groups:
+                group["name"] = group["name"].replace("f_rest", "sh")
+
+        model.training_setup = training_setup
+        with pytest.raises(UserInputError, match="--sh-rate 2: the checkout's optimizers have no parameter gr"):
+            drive(adapter, hierarchy="laplacian", sh_rate=2.0, **THIRDS)
 
 
 def test_a_rate_of_sh_is_a_positive_factor() -> None:

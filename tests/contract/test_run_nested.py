@@ -126,7 +126,7 @@ def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[s
         if name not in made:
             folder = tmp_path_factory.mktemp(name) / "run"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(driver, "SignedColorRasterizer", unasked)
+                patch.setattr(driver.DryRun, "color_path", unasked)
                 seen = run_watched(name, scene, folder, *WHITE)
             made[name] = RunArchive.open(folder), seen
         return made[name]

@@ -33,7 +33,8 @@ SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 
 def files(folder: Path) -> dict[str, bytes]:
     """Return the files' contents by name, with the folder's own name replaced."""
-    found = sorted(path for path in folder.rglob("*") if path.is_file())
+    # The name of TensorBoard's log, if it is installed, is another one each time.
+    found = sorted(path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
     name = str(folder).encode()
     return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
 

@@ -42,9 +42,6 @@ class TinyAdapter(BackboneAdapter):
         title="TinyGS",
         rasterizer="diff_gaussian_rasterization",
         stand_in="graphdeco-aa",
-        density_control=("densify_and_prune", "reset_opacity"),
-        color_rates=("feature_lr",),
-        densify_thresholds=("densify_grad_threshold",),
         own_files=("utils/tiny_utils.py",),
     )
 
@@ -53,9 +50,6 @@ class TinyAdapter(BackboneAdapter):
 
     def raster_settings(self, call):
         return {"antialiasing": call.pipe.antialiasing}
-
-    def passes_dc_apart(self, call):
-        return False
 
     def level_view(self, view, original, size, signed):
         view.alpha_mask = None

@@ -40,7 +40,9 @@ def record(name: str, scene: Path, folder: Path) -> Result:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    found = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != BARE_RECORD)
+    # The name of TensorBoard's log, if it is installed, is another one each time.
+    own = (path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
+    found = sorted(path for path in own if path.name != BARE_RECORD)
     name = str(folder).encode()
     return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
 

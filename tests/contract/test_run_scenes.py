@@ -71,14 +71,15 @@ def blender(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any) -> list[Any]:
-    """Collect the settings of every call of the checkout's rasterizer in a run."""
+    """Collect the settings of every call of the checkout's rasterizer in the stages of a run."""
     found = []
     with captured(folder, []), loaded(stub, scene, folder, *more) as adapter:
         renderer = sys.modules["gaussian_renderer"]
         original = renderer.GaussianRasterizer
 
         def spy(raster_settings: Any) -> Any:
-            found.append(raster_settings)
+            if (folder / "manifest.json").exists():
+                found.append(raster_settings)
             return original(raster_settings=raster_settings)
 
         renderer.GaussianRasterizer = spy

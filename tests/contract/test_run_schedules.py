@@ -63,7 +63,7 @@ def test_schedules_are_scaled_to_the_stage(name: str, scene: Path, tmp_path: Pat
         name for name in vars(call.opt) if name.endswith(("grad_threshold", "grad_thresh", "grad_abs_thresh"))
     ]
     assert thresholds
-    for threshold in adapter.info.densify_thresholds:
+    for threshold in adapter.densify_thresholds(call.opt):
         assert threshold in thresholds
         whole = getattr(call.opt, threshold)
         assert getattr(base.opt, threshold) == pytest.approx(1.5 * whole), "its images are halved once"
@@ -216,7 +216,7 @@ def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Pa
 
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         drive(adapter, **THIRDS)
-        thresholds = adapter.info.densify_thresholds
+        thresholds = adapter.densify_thresholds(Namespace(**seen[30]))
     given = {name: value for name, value in seen[31].items() if name not in thresholds}
     assert {name: value for name, value in seen[30].items() if name not in thresholds} == given
     assert given["iterations"] == 90

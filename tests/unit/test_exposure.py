@@ -16,16 +16,16 @@ from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputE
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.color_transform import transform_colors
-from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, identities
+from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.trainer import Trainer
-from tests.training_scene import ring_camera, ring_scene
+from tests.training_scene import blob_field, ring_camera, ring_scene
 
 STOPS = (0.0, 0.9, -0.7, 0.4, -0.5, 0.2)
 
@@ -57,6 +57,8 @@ def test_measure_finds_the_gains_of_photos() -> None:
     assert alike.spread < 0.01
     assert alike.gains.abs().max() < 0.03
     assert DIFFERENT > 0.01
+    grey = replace(scene, colors=torch.full_like(scene.points, 0.5))  # as those that a scene without points gets
+    assert measure_exposure(grey).spread == 0
 
 
 def wall_scene(stops: tuple[float, ...]) -> Scene:
@@ -207,3 +209,31 @@ def test_color_fit_of_one_color_stays_near_the_identity() -> None:
     assert psnr(transform_colors(grey, fit_colors(grey, grey * 1.2).float()), grey * 1.2) > 60
     empty = torch.zeros(1, 4, 6, dtype=torch.bool)
     torch.testing.assert_close(fit_colors(grey, grey, empty), identities(1)[0].double())
+
+
+def test_gradients_reach_the_field_through_the_transform() -> None:
+    """Finite differences in float64, through the oracle, of a view's loss by colours, opacities and the transform."""
+    field = blob_field(6).to(dtype=torch.float64)
+    camera = ring_camera(0.3, 12, 8).to(dtype=torch.float64)
+    target = random_image(3)[:, :8, :12].double()
+    transform = torch.tensor([[0.7, 0.1, 0.0, 0.05], [0.0, 1.2, 0.05, 0.0], [0.1, 0.0, 0.9, 0.1]], dtype=torch.float64)
+
+    def loss(sh: Tensor, logits: Tensor, transform: Tensor) -> Tensor:
+        shown = replace(field, sh=sh, opacity_logits=logits)
+        image = OracleRasterizer()(shown, camera, background=torch.zeros(3, dtype=torch.float64)).image
+        return (transform_colors(image, transform) - target).square().mean()
+
+    leaves = [each.clone().requires_grad_() for each in (field.sh, field.opacity_logits, transform)]
+    assert torch.autograd.gradcheck(loss, leaves, check_undefined_grad=False, fast_mode=True)
+
+
+def test_several_views_are_transformed_as_each_is() -> None:
+    names, images = ["a", "b", "c"], torch.stack([random_image(seed) for seed in (0, 1)])
+    exposures = ViewExposures.create(names, from_gains(0.3 * random_image(2)[0, :3, :3]), torch.device("cpu"), 0, 1)
+    together = exposures.apply(["c", "a"], images)
+    (by_all,) = torch.autograd.grad(together.square().mean(), exposures.transforms)
+    each = [exposures.apply([name], image) for name, image in zip(["c", "a"], images, strict=True)]
+    (by_each,) = torch.autograd.grad(torch.stack(each).square().mean(), exposures.transforms)
+    torch.testing.assert_close(together, torch.stack(each), atol=1e-6, rtol=0)
+    torch.testing.assert_close(by_all, by_each, atol=1e-6, rtol=0)
+    assert by_all[1].abs().max() == 0

@@ -89,7 +89,7 @@ def test_own_entries_may_be_instances_or_be_loaded_when_they_are_looked_up() -> 
 
 def test_every_file_beside_the_registry_is_a_backbone() -> None:
     folder = Path(backbones.__file__).parent
-    assert set(OWN) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base", "registry"}
+    assert set(OWN) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base", "generic", "registry"}
     assert [adapter.info.name for adapter in all_adapters()] == list(BACKBONES)
 
 

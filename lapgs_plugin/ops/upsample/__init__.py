@@ -6,8 +6,6 @@ are `Pyramid.up_taps`. Our versions apply them in one pass over the images; PyTo
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -18,42 +16,31 @@ LARGEST_DIFFERENCE = 1e-4
 """Largest difference from PyTorch's operations, of values of about 1, that counts as rounding."""
 
 
-def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: bool = False) -> Tensor:
     """Return Up(coarse) + fine, equal to `pyramid.up(coarse) + fine` up to rounding, with its gradient.
 
     Args:
         coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images; float16 is taken, too.
         fine: (c, h, w) or (b, c, h, w), on the same device.
+        clamped: clamp the sum to [0, 1], to show it; without gradient.
     """
     size = fine.shape[-2], fine.shape[-1]
     require_half(coarse, size)
-    if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
-        if coarse.requires_grad or not triton_works(fine):
-            return upsample(pyramid, coarse.to(fine.dtype), size) + fine
-        added: Tensor = _Added.apply(fine, coarse, pyramid)  # type: ignore[no-untyped-call]  # torch's
-        return added
-    if _fits_numba(fine):
-        from lapgs_plugin.ops.upsample.in_numba import upsample_add_cpu
-
-        return upsample_add_cpu(pyramid, coarse.to(fine.dtype), fine)
     if triton_works(fine):
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
         with torch.cuda.device(fine.device):  # Triton launches on the current one
-            return upsample_add_triton(pyramid, coarse, fine)
-    return pyramid.up(coarse.to(fine.dtype), size) + fine
+            return upsample_add_triton(pyramid, coarse, fine, clamped)
+    if clamped:
+        return upsample_add(pyramid, coarse, fine).clamp_(0.0, 1.0)
+    coarse = coarse.to(fine.dtype)
+    if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
+        return upsample(pyramid, coarse, size) + fine
+    if _fits_numba(fine):
+        from lapgs_plugin.ops.upsample.in_numba import upsample_add_cpu
 
-
-class _Added(torch.autograd.Function):
-    """Map (fine, coarse, pyramid) to Up(coarse) + fine, for a coarse image without gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, fine: Tensor, coarse: Tensor, pyramid: Pyramid) -> Tensor:
-        return upsample_add(pyramid, coarse, fine)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return gradient, None, None
+        return upsample_add_cpu(pyramid, coarse, fine)
+    return pyramid.up(coarse, size) + fine
 
 
 def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:

@@ -44,7 +44,7 @@ def _kernel(
     source_image: int, source_plane: int, source_row: int, source_column: int,
     added_image: int, added_plane: int, added_row: int, added_column: int,
     out_image: int, out_plane: int, out_row: int, out_column: int,
-    adds: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
+    adds: tl.constexpr, clamps: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
     taps_down: tl.constexpr, taps_across: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Filter some rows of a strip of `block` columns and colours; *_image, *_plane, *_row, *_column are strides.
@@ -82,6 +82,8 @@ def _kernel(
             total += tl.load(added + row.to(tl.int64) * added_row, inside, 0.0)
         for tap in tl.static_range(taps_down):
             total += tl.load(row_weights + row * taps_down + tap) * kept[tap]
+        if clamps:  # NaN stays
+            total = tl.where(total < 0.0, 0.0, tl.where(total > 1.0, 1.0, total))
         tl.store(out + row.to(tl.int64) * out_row, total, inside)
         row += 1
 
@@ -93,42 +95,50 @@ class _Taps(NamedTuple):
     weights: Tensor
 
 
-def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    """Do `upsample_add` for float32 images on a CUDA device, with any strides."""
-    rows, columns = (_up(pyramid.grid, side, fine.device) for side in fine.shape[-2:])
-    out = torch.empty_like(fine)
-    _filter(coarse, rows, columns, out, fine)
+def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False) -> Tensor:
+    """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
+    size = fine.shape[-2], fine.shape[-1]
+    if clamped:
+        image, (rows, columns) = torch.empty_like(fine), (_up(pyramid.grid, side, fine.device) for side in size)
+        _filter(coarse, rows, columns, image, fine, clamps=True)
+        return image
+    out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """Do `upsample` for a float32 image on a CUDA device, with any strides."""
-    out: Tensor = _Upsampled.apply(coarse, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+    out: Tensor = _Upsampled.apply(coarse, None, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 class _Upsampled(torch.autograd.Function):
-    """Map (coarse, grid, size) to Up(coarse); the gradient applies the transpose of Up."""
+    """Map (coarse, fine or None, grid, size) to Up(coarse) + fine; the gradient applies the transpose of Up."""
 
     @staticmethod
-    def forward(ctx: Any, coarse: Tensor, grid: str, size: tuple[int, int]) -> Tensor:
+    def forward(ctx: Any, coarse: Tensor, fine: Tensor | None, grid: str, size: tuple[int, int]) -> Tensor:
         ctx.grid, ctx.size, ctx.shape = grid, size, coarse.shape
-        out = coarse.new_empty(*coarse.shape[:-2], *size)
+        out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
         rows, columns = (_up(grid, side, coarse.device) for side in size)
-        _filter(coarse, rows, columns, out)
+        _filter(coarse, rows, columns, out, fine)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        by_fine = gradient if ctx.needs_input_grad[1] else None
+        if not ctx.needs_input_grad[0]:
+            return None, by_fine, None, None
         out = gradient.new_empty(ctx.shape)
         rows, columns = (_up_transposed(ctx.grid, side, gradient.device) for side in ctx.size)
         _filter(gradient, rows, columns, out)
-        return out, None, None
+        return out, by_fine, None, None
 
 
-def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None) -> None:
-    """Write weighted sums of `source`, plus `added` if given, to `out`."""
+def _filter(
+    source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None, *, clamps: bool = False
+) -> None:
+    """Write weighted sums of `source`, plus `added` if given, to `out`; clamped to [0, 1] if asked for."""
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
     b, planes, height, width = images[2].shape
@@ -139,7 +149,7 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
     launch(
         *images, *rows, *columns, height, width, count,
         *(stride for image in images for stride in image.stride()),
-        adds=added is not None, planes=planes, interleaved=images[2].stride(1) == 1,
+        adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
         taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
     )  # fmt: skip
 

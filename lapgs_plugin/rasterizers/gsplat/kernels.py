@@ -148,12 +148,12 @@ def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _view_directions(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.tensor) -> tl.tensor:
-    """Return unit directions x, y, z from the camera's centre, and one over the distances."""
+    """Return unit directions x, y, z from the camera's centre."""
     x = tl.load(means + 3 * rows, there, 1.0) - tl.load(centre)
     y = tl.load(means + 3 * rows + 1, there, 1.0) - tl.load(centre + 1)
     z = tl.load(means + 3 * rows + 2, there, 1.0) - tl.load(centre + 2)
     inverse = 1.0 / tl.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
+    return x * inverse, y * inverse, z * inverse
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -162,7 +162,7 @@ def _block_colors(
     active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return colours (g, 4) of a block; the last channel is meaningless."""
-    x, y, z, _ = _view_directions(means, centre, rows, visible)
+    x, y, z = _view_directions(means, centre, rows, visible)
     color = tl.zeros((block, 4), tl.float32)
     for k in tl.static_range(coefficients):
         wanted = visible & (channel < 3) & (k < active)
@@ -227,50 +227,80 @@ def _stack_kernel(
     tl.store(all_depths + placed, tl.load(depths + rows, here, 0.0), here)
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _all_of_basis(
+    derivative: tl.constexpr, k: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, coefficients: tl.constexpr
+) -> tl.tensor:
+    """Return all spherical harmonics (k, g, 1), or with `derivative` 1 to 3 their derivatives by x, y or z."""
+    # k is the same in all threads, so that the compiler decides the comparisons.
+    found = tl.zeros_like(k + x[None])
+    for i in tl.static_range(coefficients):
+        if derivative == 0:
+            found = tl.where(k == i, _basis(i, x, y, z)[None], found)
+        if derivative == 1:
+            found = tl.where(k == i, _basis_x(i, x, y, z)[None], found)
+        if derivative == 2:
+            found = tl.where(k == i, _basis_y(i, x, y, z)[None], found)
+        if derivative == 3:
+            found = tl.where(k == i, _basis_z(i, x, y, z)[None], found)
+    return found
+
+
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _gradient_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
     scales: tl.tensor, opacities: tl.tensor,
     by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor, by_sh: tl.tensor,
-    n: tl.tensor, cameras: int, active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
+    n: tl.tensor, cameras: int, active: int, signed: int,
+    coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
+    # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers. Every
+    # load is of neighbouring channels, because Triton would spread Gaussians alone over threads in another way.
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
     here, in_channel = rows < n, (rows < n) & (channel < 3)
+    k = tl.arange(0, padded)[:, None, None]
+    in_sh = (rows[None] * coefficients + k) * 3 + channel[None]  # (k, g, 4)
+    given = in_channel[None] & (k < coefficients)
+    sums = tl.zeros((padded, block, 4), tl.float32)
+    coefficient = tl.zeros_like(sums)
+    for i in tl.static_range(coefficients):  # one by one, which keeps them in the thread
+        one = tl.load(sh + (rows * coefficients + i) * 3 + channel, in_channel & (i < active), 0.0)
+        coefficient = tl.where(k == i, one[None], coefficient)
     of_opacity = tl.zeros((block, 1), tl.float32)
+    of_x, of_y, of_z = tl.zeros_like(of_opacity), tl.zeros_like(of_opacity), tl.zeros_like(of_opacity)
+    mean = tl.load(means + 3 * rows + channel, in_channel, 0.0)
     camera = 0
     while camera < cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
-        visible = (tl.load(radii + 2 * seen, here, 0) > 0) & (tl.load(radii + 2 * seen + 1, here, 0) > 0)
-        x, y, z, inverse = _view_directions(means, centre + 3 * camera, rows, visible)
-        flow = tl.load(by_color + 3 * seen + channel, visible & (channel < 3), 0.0)  # (g, 4)
-        color = tl.load(colors + 3 * seen + channel, visible & (channel < 3), 0.0)
+        visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
+        away = mean - tl.load(centre + 3 * camera + channel, channel < 3, 0.0)
+        away = tl.where(in_channel & visible, away, 1.0)  # (g, 4), the last without meaning
+        inverse = tl.rsqrt(tl.sum(tl.where(channel < 3, away * away, 0.0), 1))[:, None]
+        x = tl.sum(tl.where(channel == 0, away, 0.0), 1)[:, None] * inverse
+        y = tl.sum(tl.where(channel == 1, away, 0.0), 1)[:, None] * inverse
+        z = tl.sum(tl.where(channel == 2, away, 0.0), 1)[:, None] * inverse
+        flow = tl.load(by_color + 3 * seen + channel, in_channel & visible, 0.0)  # (g, 4)
+        color = tl.load(colors + 3 * seen + channel, in_channel & visible, 0.0)
         flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
-        along_x, along_y, along_z = tl.zeros_like(flow), tl.zeros_like(flow), tl.zeros_like(flow)
-        first = camera == 0
-        for k in tl.static_range(coefficients):
-            there = (rows * coefficients + k) * 3 + channel
-            used = tl.where(k < active, flow, 0.0)
-            # Sum of the previous cameras; the first camera writes every row, later ones those that are visible.
-            before = tl.load(by_sh + there, visible & (channel < 3) & (camera > 0), 0.0)
-            tl.store(by_sh + there, before + _basis(k, x, y, z) * used, in_channel & (visible | first))
-            weighted = used * tl.load(sh + there, visible & (channel < 3) & (k < active), 0.0)
-            along_x += _basis_x(k, x, y, z) * weighted
-            along_y += _basis_y(k, x, y, z) * weighted
-            along_z += _basis_z(k, x, y, z) * weighted
+        sums += _all_of_basis(0, k, x, y, z, coefficients) * flow[None]
         if coefficients > 1:
-            in_x = tl.sum(along_x, 1)[:, None]
-            in_y = tl.sum(along_y, 1)[:, None]
-            in_z = tl.sum(along_z, 1)[:, None]
+            weighted = coefficient * flow[None]
+            in_x = tl.sum(tl.sum(_all_of_basis(1, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
+            in_y = tl.sum(tl.sum(_all_of_basis(2, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
+            in_z = tl.sum(tl.sum(_all_of_basis(3, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
             radial = in_x * x + in_y * y + in_z * z  # moving along the direction does not change it
-            mean = by_mean + 3 * rows
-            tl.store(mean, tl.load(mean, visible, 0.0) + (in_x - radial * x) * inverse, visible)
-            tl.store(mean + 1, tl.load(mean + 1, visible, 0.0) + (in_y - radial * y) * inverse, visible)
-            tl.store(mean + 2, tl.load(mean + 2, visible, 0.0) + (in_z - radial * z) * inverse, visible)
+            of_x += (in_x - radial * x) * inverse
+            of_y += (in_y - radial * y) * inverse
+            of_z += (in_z - radial * z) * inverse
         of_opacity += tl.load(by_opacity + seen, here, 0.0)
-        tl.debug_barrier()  # the next camera's threads read values that others of this block wrote
         camera += 1
+    tl.store(by_sh + in_sh, tl.where(k < active, sums, 0.0), given)
+    tl.debug_barrier()  # all threads have read what is written now
     there = 3 * rows + channel
+    if coefficients > 1:
+        moved = tl.where(channel == 0, of_x, tl.where(channel == 1, of_y, of_z))
+        tl.store(by_mean + there, tl.load(by_mean + there, in_channel) + moved, in_channel)
     tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
     opacity = tl.load(opacities + rows, here, 0.0)
     tl.store(by_opacity + rows, of_opacity * opacity * (1.0 - opacity), here)
@@ -358,19 +388,27 @@ def finish_gradients(
         by_scale: (n, 3) gradient summed over cameras; becomes that by logarithms.
         by_opacity: (c, n) of each camera; the first row becomes the sum by logits.
     """
-    by_sh = torch.empty_like(sh)
+    by_sh, coefficients = torch.empty_like(sh), sh.shape[1]
     _launch(
         _gradient_kernel,
         len(means),
         (means, centre, sh, radii, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity, by_sh),
         (len(radii), (degree + 1) ** 2, int(signed)),
-        coefficients=sh.shape[1],
+        block=BLOCK // 4,  # one channel of a Gaussian for each thread
+        coefficients=coefficients,
+        padded=triton.next_power_of_2(coefficients),
     )
     return by_sh
 
 
 def _launch(
-    kernel: Any, n: int, given: tuple[Tensor, ...], numbers: tuple[int, ...] = (), programs: int = 1, **constants: int
+    kernel: Any,
+    n: int,
+    given: tuple[Tensor, ...],
+    numbers: tuple[int, ...] = (),
+    programs: int = 1,
+    block: int = BLOCK,
+    **constants: int,
 ) -> None:
     """Start a kernel with `programs` programs for each block of Gaussians."""
-    kernel[(triton.cdiv(n, BLOCK) * programs,)](*given, n, *numbers, block=BLOCK, **constants)
+    kernel[(triton.cdiv(n, block) * programs,)](*given, n, *numbers, block=block, **constants)

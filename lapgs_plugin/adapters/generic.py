@@ -1,0 +1,83 @@
+"""Drive any checkout of the 3DGS family, from what its profile says.
+
+Other adapters derive from this one and say only what is particular about their backbone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, TrainingCall
+from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+OF_A_CALL = {
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
+    "scale_modifier", "prefiltered", "debug", "lambda_dssim",
+}  # fmt: skip
+"""Settings of rasterizers that are no property of a run."""
+
+
+class Adapter(BackboneAdapter):
+    """Drive a checkout that no other adapter recognises."""
+
+    info = BackboneInfo(
+        name="generic", title="3DGS, a checkout of its own", rasterizer="diff_gaussian_rasterization", stand_in=""
+    )
+
+    @classmethod
+    def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
+        """Return the stand-in that offers what the checkout imports, and takes what it passes.
+
+        Raises:
+            MissingExtraError: there is none; the line names the rasterizer, and the place where it is imported.
+        """
+        from lapgs_plugin.reference_raster.standins import variant_for
+
+        found = cls.info.stand_in or variant_for(checkout)
+        if found:
+            return found
+        source = readable_source(checkout)
+        assert source is not None, "recognised by it"
+        raise MissingExtraError(
+            f"no CPU stand-in for {', '.join(source.rasterizer_modules) or 'a rasterizer'}, which "
+            f"{', '.join(use.where for use in source.rasterizers) or 'the checkout'} imports, with the settings and "
+            "inputs that the checkout passes; it needs a CUDA device"
+        )
+
+    def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
+        # Exposure is left out: images are taken before it is applied.
+        self.profile.render(call.values, view, gaussians, background, use_trained_exp=False)
+
+    def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
+        """Return settings that options of the script have by name, such as antialiasing."""
+        names = {name for use in self.profile.source.rasterizers for name in use.settings} - OF_A_CALL
+        values = {
+            name: getattr(of, name) for of in (call.dataset, call.opt, call.pipe) for name in names if hasattr(of, name)
+        }
+        return {name: value for name, value in sorted(values.items()) if isinstance(value, (bool, int, float))}
+
+    def carried_over(self, gaussians: Any) -> dict[str, Any]:
+        """Return the exposures, which belong to the photos and not to a level."""
+        if not hasattr(gaussians, "_exposure"):
+            return {}
+        import torch
+
+        return {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
+
+
+def readable_source(folder: Path) -> CheckoutSource | None:
+    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+    for script in training_scripts(folder):
+        try:
+            source = CheckoutSource.read(script)
+        except UserInputError:
+            continue
+        if source.root == folder.absolute():
+            return source
+    return None

@@ -1,0 +1,317 @@
+"""Find the objects of a checkout whose definitions have been executed: its classes, its renderers, its rasterizers.
+
+They are found by what they do, and replaced wherever the checkout holds them, by identity. So names may differ.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass
+from types import FunctionType, ModuleType
+from typing import Any
+
+from lapgs_plugin.checkouts.script import Script
+from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource, RasterizerUse
+from lapgs_plugin.errors import UserInputError
+
+SCENE_ROLES = ("getTrainCameras", "getTestCameras")
+"""Methods by which the class of a scene is recognised."""
+
+CAMERA_ROLES = {"world_view_transform", "image_name"}
+"""Attributes that a camera with an image sets when it is made; a viewer's cameras have no image."""
+
+COUNT_CHANGES = ("prune_points", "densification_postfix")
+"""Methods of every model of the family through which Gaussians are removed and added."""
+
+OPACITY_RESET = "reset_opacity"
+"""Method of the family's models that is density control and can be skipped by itself."""
+
+BACKGROUND_WORDS = {"bg", "background"}
+
+
+@dataclass(frozen=True)
+class BoundRasterizer:
+    """Hold the objects of a rasterizer that a checkout uses.
+
+    Attributes:
+        use: how it uses them.
+        module: the rasterizer's module.
+        settings: names of its settings' classes in the module.
+        entries: names of its classes and functions that render.
+    """
+
+    use: RasterizerUse
+    module: ModuleType
+    settings: tuple[str, ...]
+    entries: tuple[str, ...]
+
+
+class Profile:
+    """Describe a loaded checkout.
+
+    Args:
+        script: its training script, whose definitions have been executed, and none of whose symbols are replaced.
+
+    Attributes:
+        source: what its sources say.
+        model: class of the Gaussians.
+        scene: class of the scene, which has the cameras.
+        cameras: classes of cameras that have an image.
+        training: the script's function that trains.
+        renderers: functions that rasterize. A view is recognised when one of them is called with it.
+        rasterizers: those that can be imported, that of the training loop first.
+        density_control: methods of the model that add, remove or reset Gaussians, directly or through others.
+
+    Raises:
+        UserInputError: it is no 3DGS checkout; the line says what is missing and where it was expected.
+        ImportError: the rasterizer of the training loop cannot be imported.
+    """
+
+    def __init__(self, script: Script) -> None:
+        self.script = script
+        self.source = CheckoutSource.read(script.path)
+        self.model = self._find_model()
+        self.scene = self._find_scene()
+        self.cameras = tuple(self._find_cameras())
+        self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
+        self.renderers = tuple(self._find_renderers())
+        self.density_control = tuple(sorted(_changing(self.model)))
+        self._model_call = self._first_call(self._script_names(self.model))
+        self._scene_call = self._first_call(self._script_names(self.scene))
+        self._loop_call = self._first_call({n for f in self.renderers for n in (*self._script_names(f), f.__name__)})
+        self.loop_renderer = self._find_loop_renderer()
+        self.rasterizers = tuple(self._find_rasterizers())
+
+    @property
+    def modules(self) -> list[ModuleType]:
+        """Modules of the checkout that are imported, the script first."""
+        packages = {name.partition(".")[0] for name in self.source.modules} - {"__main__"}
+        others = [module for name, module in sys.modules.items() if name.partition(".")[0] in packages]
+        return [self.script.module, *(module for module in others if isinstance(module, ModuleType))]
+
+    def holders(self, value: Any) -> list[tuple[ModuleType, str]]:
+        """Return modules of the checkout, each with a name, that hold an object."""
+        return [(module, name) for module in self.modules for name, held in vars(module).items() if held is value]
+
+    def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
+        """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
+        use = rasterizer.use
+        found = self.holders(vars(rasterizer.module)[name])
+        if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
+            found.append((rasterizer.module, name))
+        holder = self.script.module if use.holder == "__main__" else sys.modules[use.holder]
+        if name in vars(holder) and (holder, name) not in found:  # something that wraps it
+            found.append((holder, name))
+        return found
+
+    def make_model(self, values: Mapping[str, Any]) -> Any:
+        """Return a model, made with the arguments that the script gives.
+
+        Args:
+            values: arguments of the training function by parameter name.
+        """
+        return self._call(self.model, self._model_call, values, {})
+
+    def make_scene(self, values: Mapping[str, Any], model: Any) -> Any:
+        """Return a scene, made with the arguments that the script gives.
+
+        Args:
+            values: arguments of the training function by parameter name.
+            model: takes the place of the Gaussians.
+        """
+        if self._scene_call is None:
+            raise UserInputError(
+                f"{self._training_place}() makes no {self.scene.__name__}, expected a scene of its own; {OTHERWISE}"
+            )
+        return self._call(self.scene, self._scene_call, {**values, self._model_variable: model}, {})
+
+    def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **given: Any) -> Any:
+        """Render a view as the training loop does, and return what its function returns.
+
+        Arguments that depend on the loop's state, such as the size of a photo, have their defaults.
+
+        Args:
+            values: arguments of the training function by parameter name.
+            view: the camera.
+            model: the Gaussians.
+            background: (3,) behind them.
+            given: arguments to pass whatever the loop passes; those that the function does not take are left out.
+
+        Raises:
+            UserInputError: the loop calls no function that rasterizes, or one that needs more than can be known here.
+        """
+        renderer = self.loop_renderer
+        if renderer is None:
+            names = ", ".join(function.__name__ for function in self.renderers) or "no function of the checkout"
+            raise UserInputError(
+                f"{self._training_place}() calls no function that rasterizes ({names} does), expected a call that "
+                f"renders a view; {OTHERWISE}"
+            )
+        first, second, *others = _parameters(renderer)
+        named = {name: background for name in others if BACKGROUND_WORDS & set(name.split("_"))}
+        named |= {first: view, second: model} | {name: value for name, value in given.items() if name in others}
+        # Looked up at each call: it may be replaced meanwhile.
+        function = vars(sys.modules[renderer.__module__])[renderer.__name__]
+        return self._call(function, self._loop_call, values, named)
+
+    def loop_argument(self, name: str, values: Mapping[str, Any]) -> Any:
+        """Return the value of a keyword in the loop's call that renders; None if there is none, or it is unknown here.
+
+        Args:
+            name: the keyword.
+            values: arguments of the training function by parameter name.
+        """
+        words = [] if self._loop_call is None else self._loop_call.keywords
+        try:
+            return next((self._evaluated(word.value, values) for word in words if word.arg == name), None)
+        except Exception:  # it depends on the state of the loop
+            return None
+
+    @property
+    def _training_place(self) -> str:
+        return f"{self.source.place(self.source.training)}: {self.source.training.name}"
+
+    def _find_model(self) -> type:
+        name, where = self.source.model
+        for found in self._classes():
+            if found.__name__ == name and all(hasattr(found, role) for role in MODEL_ROLES):
+                return found
+        raise UserInputError(
+            f"{name} in {where} has no {' and '.join(MODEL_ROLES)}, expected of the class of the Gaussians; {OTHERWISE}"
+        )
+
+    def _find_scene(self) -> type:
+        for found in self._classes():
+            if all(hasattr(found, role) for role in SCENE_ROLES):
+                return found
+        raise UserInputError(
+            f"{self.script.path} imports no class with {' and '.join(SCENE_ROLES)}, expected of a scene; {OTHERWISE}"
+        )
+
+    def _find_cameras(self) -> Iterator[type]:
+        for found in self._classes():
+            if "__init__" in vars(found) and _names(vars(found)["__init__"]) >= CAMERA_ROLES:
+                yield found
+
+    def _find_renderers(self) -> Iterator[FunctionType]:
+        for use in self.source.rasterizers:
+            holder = self.script.module if use.holder == "__main__" else sys.modules.get(use.holder)
+            for name in use.functions:
+                if isinstance(function := getattr(holder, name, None), FunctionType):
+                    yield function
+
+    def _find_loop_renderer(self) -> FunctionType | None:
+        """Return the function that the training loop renders with."""
+        if self._loop_call is None:
+            return None
+        name = _called_name(self._loop_call)
+        held = vars(self.script.module).get(name)
+        return next((found for found in self.renderers if found is held or found.__name__ == name), None)
+
+    def _find_rasterizers(self) -> Iterator[BoundRasterizer]:
+        name = None if self.loop_renderer is None else self.loop_renderer.__name__
+        for use in sorted(self.source.rasterizers, key=lambda use: name not in use.functions):
+            try:
+                module = importlib.import_module(use.module)
+            except ImportError:
+                if not use.inside or name in use.functions:
+                    raise
+                continue  # imported in a function that the loop does not call
+            there = [name for name in use.names if hasattr(module, name)]
+            settings = tuple(name for name in there if "setting" in name.lower())
+            yield BoundRasterizer(use, module, settings, tuple(name for name in there if name not in settings))
+
+    def _classes(self) -> Iterator[type]:
+        """Yield classes of the checkout."""
+        modules = self.modules
+        names = {module.__name__ for module in modules}
+        seen: set[int] = set()
+        for module in modules:
+            for value in list(vars(module).values()):
+                if isinstance(value, type) and value.__module__ in names and id(value) not in seen:
+                    seen.add(id(value))
+                    yield value
+
+    def _script_names(self, value: Any) -> set[str]:
+        """Return the names by which the script knows an object."""
+        return {name for name, held in vars(self.script.module).items() if held is value}
+
+    def _first_call(self, names: Container[str]) -> ast.Call | None:
+        """Return the training function's first call of one of these names, if possible outside of any `try`.
+
+        A loop's calls for a viewer are in a `try`.
+        """
+        nodes = list(ast.walk(self.source.training))
+        tried = {id(inner) for node in nodes if isinstance(node, ast.Try) for inner in ast.walk(node)}
+        calls = [node for node in nodes if isinstance(node, ast.Call) and _called_name(node) in names]
+        return min(calls, key=lambda call: (id(call) in tried, call.lineno), default=None)
+
+    @property
+    def _model_variable(self) -> str:
+        """Name of the training function's variable for the model."""
+        made = (
+            node.targets[0].id
+            for node in ast.walk(self.source.training)
+            if isinstance(node, ast.Assign) and node.value is self._model_call and isinstance(node.targets[0], ast.Name)
+        )
+        return next(made, "gaussians")
+
+    def _call(
+        self,
+        function: Callable[..., Any],
+        call: ast.Call | None,
+        values: Mapping[str, Any],
+        given: Mapping[str, Any],
+    ) -> Any:
+        """Call a function with the arguments of a call in the script, as far as they can be evaluated outside of it."""
+        parameters = _parameters(function)
+        written: dict[str, ast.expr] = {}
+        if call is not None:
+            written |= dict(zip(parameters, call.args, strict=False))
+            written |= {word.arg: word.value for word in call.keywords if word.arg is not None}
+        arguments = dict(given)
+        for name, expression in written.items():
+            if name in given:
+                continue
+            try:
+                arguments[name] = self._evaluated(expression, values)
+            except Exception as error:  # the expression needs something that exists in the loop only
+                if name not in parameters or parameters[name].default is inspect.Parameter.empty:
+                    raise UserInputError(
+                        f"{self.source.place(expression)}: {ast.unparse(expression)}, the {name} of "
+                        f"{getattr(function, '__name__', function)}(), is known inside of the training loop only "
+                        f"({type(error).__name__}), and has no default; {OTHERWISE}"
+                    ) from error
+        return function(**arguments)
+
+    def _evaluated(self, expression: ast.expr, values: Mapping[str, Any]) -> Any:
+        code = compile(ast.Expression(expression), str(self.script.path), "eval", dont_inherit=True)
+        return eval(code, vars(self.script.module), dict(values))
+
+
+def _changing(model: type) -> set[str]:
+    """Return the names of a model's methods that add, remove or reset Gaussians."""
+    methods = {n: _names(value) for n, value in inspect.getmembers(model, inspect.isfunction) if not n.startswith("__")}
+    found = set(COUNT_CHANGES) & methods.keys()
+    while more := {name for name, used in methods.items() if used & found} - found:
+        found |= more
+    return found | ({OPACITY_RESET} & methods.keys())
+
+
+def _names(function: Any) -> set[str]:
+    """Return the names of attributes and globals that a function uses."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return set() if code is None else set(code.co_names)
+
+
+def _called_name(call: ast.Call) -> str:
+    """Return the name that is called, without the module or object before it."""
+    return str(getattr(call.func, "id", None) or getattr(call.func, "attr", ""))
+
+
+def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters

@@ -1,0 +1,307 @@
+"""Try a checkout before the first stage: one iteration of its own loop, then all that a run does with its model.
+
+What fails there would fail after minutes or hours otherwise. The loop is left at its second iteration. Generators of
+random numbers, the script's arguments and its output are as if nothing had run.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import random
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import TrainingCall
+from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.hierarchy.plan import StagePlan, level_size
+from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+
+logger = logging.getLogger(__name__)
+
+MOST_POINTS = 20_000
+"""About how many of the scene's points the dry run starts from."""
+
+SAME_COLOR = 1e-3
+"""Largest difference of two images of one field: rounding gives 1e-6, a wrong colour map about 1."""
+
+NATIVE_COEFFICIENTS = 15
+"""SH coefficients above the first that a rasterizer may read when it does not know the flag of signed colour."""
+
+OFF = "`lapgs run --off` runs the script as it is"
+NESTED_WORKS = "nested levels work: --hierarchy nested"
+
+
+class DryRun:
+    """Try a checkout.
+
+    Args:
+        context: shared objects of the run, whose replacements are attached.
+        call: the script's call of `training`.
+        scene: the checkout's scene.
+        plan: the stages.
+        activate: receives what answers the replaced symbols; None at the end.
+    """
+
+    def __init__(
+        self,
+        context: RunContext,
+        call: TrainingCall,
+        scene: CheckoutScene,
+        plan: StagePlan,
+        activate: Callable[[Any], None],
+    ) -> None:
+        self._context, self._scene, self._plan, self._activate = context, scene, plan, activate
+        self._adapter = context.adapter
+        self._call = call
+        self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
+
+    def run(self, folder: Path, residuals: bool) -> None:
+        """Try one iteration of the script's loop, and all that a run does with its model.
+
+        Args:
+            folder: receives what the checkout writes.
+            residuals: whether the run trains residuals.
+
+        Raises:
+            UserInputError: the checkout cannot be trained so; the line says what failed, where, and what works.
+        """
+        with _undisturbed(self._context.device), _silent_writer(self._adapter.train):
+            stage = _DryStage(self._context, self._scratch_call(folder), self._scene, self._view)
+            self._iterate(stage)
+            view = self._view(self._scene.train[0])
+            image = self._render(view, stage.gaussians)
+            if residuals:
+                self._require_three_axes(stage.gaussians)
+            with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
+                field = self._adapter.export_field(stage.gaussians, signed=False)
+            if residuals:
+                with self._step("a model made from a finished field", "one that renders", NESTED_WORKS):
+                    self._render(view, self._adapter.model_of(stage.call, field))
+            self._evaluate(view, image)
+
+    def color_path(self) -> ColorPath:
+        """Return how the checkout's rasterizer evaluates signed colour, which is found out by rendering.
+
+        Raises:
+            UserInputError: it cannot; the line says what failed, where, and what works.
+        """
+        with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
+            gaussians = self._adapter.new_model(self._call)
+            gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            path = self._color_path(self._view(self._scene.train[0]), gaussians)
+        if path is ColorPath.PRECOMPUTED:
+            logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
+        return path
+
+    def _iterate(self, stage: _DryStage) -> None:
+        """Run the first iteration of the script's loop."""
+        self._context.wrapper.stage = stage.rendering
+        self._activate(stage)
+        try:
+            with self._step("the first iteration", "one as without lapgs", OFF):
+                stage.call.run()
+        except _Enough:
+            pass
+        finally:
+            self._context.wrapper.stage = None
+            self._activate(None)
+        place = self._adapter.profile.source.place(self._adapter.profile.source.training)
+        if stage.record.iteration == 0:
+            raise UserInputError(
+                f"{place}: {stage.call.function.__name__}() called no update_learning_rate, expected one call an "
+                f"iteration; {OFF}"
+            )
+
+    def _scratch_call(self, folder: Path) -> TrainingCall:
+        """Return the script's call with an output folder of its own, and without reports or checkpoints."""
+        values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
+        values["dataset"].model_path = str(folder)
+        folder.mkdir()
+        lists: dict[str, Any] = {
+            n: [] for n, v in self._call.values.items() if n.endswith("iterations") and isinstance(v, (list, tuple))
+        }
+        return self._call.changed(**values, **lists)
+
+    def _view(self, camera: Any) -> Any:
+        """Return a camera at the coarsest level."""
+        images, device = self._context.images, self._context.device
+        key = images.key(camera)
+        width, height = level_size(images[key].size, self._plan.levels - 1)
+
+        def image() -> Tensor:
+            whole = images[key].load(device)[None]
+            return torch.nn.functional.interpolate(whole, (height, width), mode="area")[0]
+
+        return self._adapter.view_at(camera, (width, height), False, image)
+
+    def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
+        """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
+        rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
+        background = torch.zeros(3, device=self._context.device)
+        with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
+            return self._context.render(rendering, self._call, view, gaussians, background)
+
+    def _require_three_axes(self, gaussians: Any) -> None:
+        place, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]
+        if axes != 3:
+            raise UserInputError(f"{place}: residuals need three scale axes, found {axes}; {NESTED_WORKS}")
+
+    @torch.no_grad()
+    def _evaluate(self, view: Any, image: Tensor) -> None:
+        """Measure an image, and say so if that is not possible: the run itself does not need it."""
+        try:
+            mean_quality([(image, view.original_image)])
+        except Exception as error:
+            logger.warning("held-out views cannot be measured (%s): the run goes on without", _first_line(error))
+
+    def _color_path(self, view: Any, gaussians: Any) -> ColorPath:
+        """Return how the rasterizer evaluates signed colour: render colours of both signs with and without its flag."""
+        rest = gaussians._features_rest
+        kept = gaussians._features_dc, gaussians._features_rest
+        signs = torch.tensor([-2.0, 1.0, -1.0], device=kept[0].device)
+        try:
+            gaussians._features_dc = torch.nn.Parameter(signs.expand_as(kept[0]).clone())
+            gaussians._features_rest = torch.nn.Parameter(torch.zeros_like(rest))
+            expected = self._colored(view, gaussians, ColorPath.PRECOMPUTED)
+            if rest.shape[1] < NATIVE_COEFFICIENTS:
+                return ColorPath.PRECOMPUTED
+            found = self._colored(view, gaussians, ColorPath.NATIVE)
+        finally:
+            gaussians._features_dc, gaussians._features_rest = kept
+        same = all(
+            bool(((a - b).abs() <= SAME_COLOR * (1 + b.abs().max())).all())
+            for a, b in zip(found, expected, strict=True)
+        )
+        return ColorPath.NATIVE if same else ColorPath.PRECOMPUTED
+
+    def _colored(self, view: Any, gaussians: Any, path: ColorPath) -> tuple[Tensor, Tensor]:
+        """Return the image of a residual and the gradient of its sum by the first SH coefficients."""
+        with torch.enable_grad():
+            image = self._render(view, gaussians, path)
+            (gradient,) = torch.autograd.grad(image.sum(), gaussians._features_dc)
+        return image.detach(), gradient
+
+    @contextmanager
+    def _step(self, what: str, expected: str, works: str) -> Iterator[None]:
+        """Turn an exception of the checkout into one line with its place there."""
+        try:
+            yield
+        except (LapgsError, torch.cuda.OutOfMemoryError):
+            raise
+        except Exception as error:
+            raise UserInputError(
+                f"dry run: {what} failed at {self._place(error)}: {_first_line(error)}; expected {expected}; {works}"
+            ) from error
+
+    def _place(self, error: Exception) -> str:
+        """Return file and line of the checkout's code in which an error was raised."""
+        root = self._adapter.root
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if Path(frame.filename).is_relative_to(root)] or frames
+        path = Path(own[-1].filename)
+        return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{own[-1].lineno}"
+
+
+class _Enough(BaseException):
+    """Leave the script's loop."""
+
+
+class _DryRecord:
+    """Count the iterations of the dry run."""
+
+    iteration = 0
+
+    def outside(self, purpose: str) -> nullcontext[None]:
+        return nullcontext()
+
+
+class _DryStage:
+    """Answer the replaced symbols for one iteration; see `ActiveStage`."""
+
+    resets_opacities = keeps_schedule = True
+    window = None
+
+    def __init__(
+        self, context: RunContext, call: TrainingCall, scene: CheckoutScene, view: Callable[[Any], Any]
+    ) -> None:
+        self.call, self._scene, self._view, self._context = call, scene, view, context
+        self.record = _DryRecord()
+        self.gaussians: Any = None
+        cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
+        self.rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views=cameras)
+
+    def scene_for(self, gaussians: Any) -> Any:
+        self.gaussians = gaussians
+        train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
+        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+        scene = self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
+        self._context.adapter.stage_scene(scene)
+        return scene
+
+    def optimizers_made(self, gaussians: Any) -> None:
+        """Do nothing: there is nothing to inherit."""
+
+    densified = optimizers_made
+
+    def iteration_begins(self, gaussians: Any) -> None:
+        if self.record.iteration:
+            raise _Enough
+        self.record.iteration = 1
+
+
+def _some(points: Any) -> Any:
+    """Return some of a scene's points."""
+    step = len(points.points) // MOST_POINTS + 1
+    names = ("points", "colors", "normals")
+    return points if step == 1 else points._replace(**{name: getattr(points, name)[::step] for name in names})
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or ['no message'])[0]}"
+
+
+@contextmanager
+def _undisturbed(device: torch.device) -> Iterator[None]:
+    """Keep generators of random numbers, printed output and log as they are."""
+    devices = [torch.cuda.current_device()] if device.type == "cuda" else []
+    states = random.getstate(), np.random.get_state()
+    disabled = logging.root.manager.disable
+    with torch.random.fork_rng(devices), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        logging.disable(max(disabled, logging.INFO))
+        try:
+            yield
+        finally:
+            logging.disable(disabled)
+            random.setstate(states[0])
+            np.random.set_state(states[1])
+
+
+def _silent_writer(train: Any) -> Any:
+    """Replace TensorBoard's writer in a script, whose thread would outlive the folder."""
+    if "SummaryWriter" not in vars(train):
+        return nullcontext()
+    return Attachment([Replacement(train, "SummaryWriter", lambda _: _NoWriter, None, "training()")])
+
+
+class _NoWriter:
+    """Take the place of a writer of logs."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Take any arguments."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *args, **kwargs: None

@@ -1,0 +1,62 @@
+"""Test the dry run of `lapgs run`: it changes nothing, and what fails in it is one line with its place."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runs.archive import RunArchive
+from tests.contract.stub_runs import CHECKOUTS, NAMES, STUBS, Result, captured, drive, loaded, run_bare
+
+SHORT = ("--iterations", 15)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_after_a_dry_run_is_the_bare_run(name: str, scene: Path, tmp_path: Path) -> None:
+    """Random numbers, arguments, printed output and TensorBoard's log are as without it."""
+    bare = run_bare(STUBS[name], scene, tmp_path / "bare", *SHORT)
+    results: list[Result] = []
+    with captured(tmp_path, results), loaded(STUBS[name], scene, tmp_path / "run", *SHORT) as adapter:
+        drive(adapter, levels=1, dry_run=True)
+    assert results[0].losses == bare.losses
+    assert RunArchive.open(tmp_path / "run").manifest.complete
+    printed = [line for line in results[0].lines if "initialisation" in line]
+    assert len(printed) == 1, "the dry run prints nothing"
+
+
+FAILURES = {
+    "the loop": (
+        "train.py",
+        "        loss = (1.0 - opt.lambda_dssim)",
+        "        1 / 0\n        loss = (1.0 - opt.lambda_dssim)",
+        r"dry run: the first iteration failed at train.py:\d+: ZeroDivisionError: division by zero; expected",
+    ),
+    "no update_learning_rate": (
+        "train.py",
+        "        gaussians.update_learning_rate(iteration)\n",
+        "",
+        r"train.py:\d+: training\(\) called no update_learning_rate, expected one call an iteration",
+    ),
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_what_fails_is_one_line_with_its_place(failure: str, scene: Path, tmp_path: Path) -> None:
+    file, old, new, message = FAILURES[failure]
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    path = checkouts / "graphdeco" / file
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    script = checkouts / "graphdeco" / "train.py"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        pytest.raises(UserInputError, match=message) as caught,
+    ):
+        drive(adapter, dry_run=True)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
