@@ -22,7 +22,7 @@ def blend(
     shapes: Annotated[
         str | None,
         typer.Option(
-            metavar="LANESxROWSxSPLAT_LANESxSPLATS[xWARPS],...",
+            metavar="LANESxROWSxSPLAT_LANESxSPLATS[xWARPS[xBATCH]],...",
             help="Shapes of our kernel to time. Default: the one that training uses.",
         ),
     ] = None,

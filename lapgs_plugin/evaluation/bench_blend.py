@@ -51,20 +51,22 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
     """Parse shapes such as "8x8x4x2,8x4x4x4x1", in the order of `blend_kernels.Shape`; None for the default one.
 
     Raises:
-        UserInputError: an entry is not 4 or 5 powers of 2, or does not fill a tile's regions and a warp's threads.
+        UserInputError: an entry is not 4 to 6 powers of 2, or does not fill a tile's regions and a warp's threads.
     """
     from lapgs_plugin.rasterizers.gsplat import blend_kernels
 
     shapes = {}
     for entry in (text or "x".join(map(str, blend_kernels.SHAPE))).split(","):
         numbers = [int(number) if number.isdigit() else 0 for number in entry.strip().split("x")]
-        if not 4 <= len(numbers) <= 5 or any(number < 1 or number & (number - 1) for number in numbers):
-            raise UserInputError(f"--shapes {entry!r}: expected 4 or 5 powers of 2 such as 8x8x4x2")
+        if not 4 <= len(numbers) <= 6 or any(number < 1 or number & (number - 1) for number in numbers):
+            raise UserInputError(f"--shapes {entry!r}: expected 4 to 6 powers of 2 such as 8x8x4x2")
         shape = blend_kernels.Shape(*numbers)
-        if max(shape.lanes, shape.rows) > blend_kernels.TILE or shape.lanes * shape.splat_lanes != 32 * shape.warps:
+        fills_warps = shape.lanes * shape.splat_lanes == 32 * shape.warps
+        bucket = shape.splat_lanes * shape.splats
+        if max(shape.lanes, shape.rows) > blend_kernels.TILE or not fills_warps or shape.batch < max(bucket, 32):
             raise UserInputError(
-                f"--shapes {entry!r}: expected LANESxROWSxSPLAT_LANESxSPLATS[xWARPS] with LANES and ROWS up to "
-                f"{blend_kernels.TILE} and LANES times SPLAT_LANES = 32 times WARPS"
+                f"--shapes {entry!r}: expected LANESxROWSxSPLAT_LANESxSPLATS[xWARPS[xBATCH]] with LANES and ROWS up to "
+                f"{blend_kernels.TILE}, LANES times SPLAT_LANES = 32 times WARPS, and BATCH at least 32 and the bucket"
             )
         shapes[entry.strip()] = shape
     return shapes

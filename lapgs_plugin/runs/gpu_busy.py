@@ -63,7 +63,7 @@ class GpuBusy:
 def profile_kernels() -> StopProfile:
     """Start a profile of the current CUDA device."""
     torch.cuda.synchronize()
-    profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA], acc_events=True)
+    profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA])
     profile.start()
 
     def stop() -> float:
@@ -83,7 +83,9 @@ def kernel_seconds(events: Iterable[Any]) -> float:
     return 1e-6 * math.fsum(
         event.time_range.elapsed_us()
         for event in events
-        if event.device_type.name == "CUDA" and not event.is_user_annotation and not event.name.startswith(HOST_COPIES)
+        if event.device_type.name == "CUDA"
+        and not getattr(event, "is_user_annotation", False)  # PyTorch 2.4 has none
+        and not event.name.startswith(HOST_COPIES)
     )
 
 

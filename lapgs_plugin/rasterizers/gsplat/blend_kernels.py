@@ -25,10 +25,6 @@ import triton.language as tl
 from torch import Tensor
 
 TILE = 16
-BATCH = 32
-"""Pairs that a program tests at once for whether they reach its region."""
-QUEUE = tl.constexpr(64)
-"""Pairs that wait for a bucket: at most a batch and a bucket of 32, and a power of 2."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
@@ -49,6 +45,7 @@ class Shape(NamedTuple):
         splat_lanes: threads that hold different Gaussians; `lanes * splat_lanes` is 32 times `warps`.
         splats: Gaussians in the registers of a thread.
         warps: of a program.
+        batch: pairs that a program tests at once for whether they reach its region; at least a bucket.
     """
 
     lanes: int = 8
@@ -56,6 +53,7 @@ class Shape(NamedTuple):
     splat_lanes: int = 4
     splats: int = 2
     warps: int = 1
+    batch: int = 32
 
 
 SHAPE = Shape()
@@ -163,6 +161,7 @@ def _fill(
         The next pair, and how many Gaussians have entered the queue.
     """
     in_batch = tl.arange(0, batch)
+    size: tl.constexpr = 2 * batch
     while (begin < stop) & (tail - head < bucket):
         there = begin + in_batch < stop
         gaussian = tl.load(flat + begin + in_batch, there, 0)
@@ -171,7 +170,7 @@ def _fill(
         a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
         c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
         wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
-        slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (QUEUE - 1)
+        slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (size - 1)
         tl.debug_barrier()  # all threads have read the bucket before
         tl.store(queue + slot, gaussian, wanted)
         tl.debug_barrier()  # threads read what others wrote
@@ -201,6 +200,7 @@ def _forward_kernel(
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
     bucket: tl.constexpr = splats * splat_lanes
+    size: tl.constexpr = 2 * batch  # of the queue: it has room for a batch and almost a bucket
     index, image, row, column = _region(across, tiles, lanes, rows, tile)
     along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
@@ -211,7 +211,7 @@ def _forward_kernel(
 
     begin = tl.load(offsets + index)
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    queue = queues + tl.program_id(0) * QUEUE
+    queue = queues + tl.program_id(0) * size
     order = tl.arange(0, splat_lanes)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
     order = tl.broadcast_to(order, (lanes, splat_lanes, splats, 1))
     head, tail = 0, 0
@@ -220,7 +220,7 @@ def _forward_kernel(
             queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
         )
         there = head + order < tail
-        gaussian = tl.load(queue + ((head + order) & (QUEUE - 1)), there, 0)
+        gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
         head += bucket
         x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)
         y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)
@@ -266,6 +266,7 @@ def _backward_kernel(
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
     # products over splats need no shuffles.
     bucket: tl.constexpr = splats * splat_lanes
+    size: tl.constexpr = 2 * batch  # of the queue: it has room for a batch and almost a bucket
     index, image, row, column = _region(across, tiles, lanes, rows, tile)
     along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
@@ -279,7 +280,7 @@ def _backward_kernel(
 
     begin, count = tl.load(offsets + index), tl.load(counts + tl.program_id(0))
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    queue = queues + tl.program_id(0) * QUEUE
+    queue = queues + tl.program_id(0) * size
     # Which Gaussian of a bucket an element is; those in one thread are consecutive.
     order_of_sums = tl.arange(0, splat_lanes)[:, None] * splats + tl.arange(0, splats)[None, :]
     order = tl.broadcast_to(order_of_sums[None, :, :, None], (lanes, splat_lanes, splats, 1))
@@ -289,9 +290,9 @@ def _backward_kernel(
             queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
         )
         there = head + order < tail
-        gaussian = tl.load(queue + ((head + order) & (QUEUE - 1)), there, 0)
+        gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
         there_of_sums = head + order_of_sums < tail
-        of_sums = tl.load(queue + ((head + order_of_sums) & (QUEUE - 1)), there_of_sums, 0)
+        of_sums = tl.load(queue + ((head + order_of_sums) & (size - 1)), there_of_sums, 0)
         head += bucket
         x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)  # (lanes, splat_lanes, splats, 1)
         y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)  # (lanes, splat_lanes, splats, rows)
@@ -347,9 +348,9 @@ def blend_forward(
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
         means2d, conics, colors, opacities, background, offsets, flat, images, counts,
-        flat.new_empty(programs, QUEUE.value), *numbers,
+        flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=BATCH, num_warps=shape.warps,
+        tile=TILE, batch=shape.batch, num_warps=shape.warps,
     )  # fmt: skip
     return images, counts
 
@@ -383,9 +384,9 @@ def blend_backward(
     _backward_kernel[(programs,)](
         means2d, conics, colors, opacities, offsets, flat, counts, images, by_images,
         by_means2d, by_absolute, by_conics, by_colors, by_opacities,
-        flat.new_empty(programs, QUEUE.value), *numbers,
+        flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=BATCH, absolute=absolute, num_warps=shape.warps,
+        tile=TILE, batch=shape.batch, absolute=absolute, num_warps=shape.warps,
     )  # fmt: skip
     return by_absolute, by_means2d, by_conics, by_colors, by_opacities
 
