@@ -50,6 +50,7 @@ def compose(
     *,
     nested: bool = False,
     gains: Mapping[int, float] = AS_TRAINED,
+    clamped: int | None = None,
 ) -> Composition:
     """Compose the renders of contiguous levels, with gradients where these have them.
 
@@ -59,6 +60,7 @@ def compose(
             residuals, or images as well where levels are nested.
         nested: whether every render is its level's whole image.
         gains: by level, the factor on its band; 1 for levels that are not in it.
+        clamped: a level whose sum is clamped to [0, 1], the last one; None for none.
     """
     residuals: dict[int, Tensor] = {}
     composed: dict[int, Tensor] = {}
@@ -74,7 +76,8 @@ def compose(
         residual = image - pyramid.up(coarser, (image.shape[-2], image.shape[-1])) if nested else image
         residuals[level] = scaled(residual, gain)
         whole = nested and as_trained
-        composed[level] = image if whole else upsample_add(pyramid, composed[level + 1], residuals[level])
+        coarse, shown = composed[level + 1], level == clamped
+        composed[level] = image if whole else upsample_add(pyramid, coarse, residuals[level], clamped=shown)
     assert base is not None, "a hierarchy has at least one level"
     return Composition(base, residuals, composed)
 

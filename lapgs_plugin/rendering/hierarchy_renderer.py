@@ -247,6 +247,19 @@ class HierarchyRenderer:
         return self._compose(cameras, needed, gains).composed[level]
 
     @torch.no_grad()
+    def frames(self, cameras: Sequence[Camera], level: int = 0) -> Tensor:
+        """Return `images` clamped to [0, 1], (b, 3, h, w), to be shown or measured.
+
+        Args, Raises:
+            As `render_batch`.
+        """
+        if self.nested or level == self.levels - 1:
+            return self.images(cameras, level).clamp(0.0, 1.0)
+        self.require_level(level)
+        # The kernel that adds the last residual also clamps.
+        return self._compose(cameras, range(self.levels - 1, level - 1, -1), AS_TRAINED, level).composed[level]
+
+    @torch.no_grad()
     def band(self, camera: Camera, level: int, gain: float = 1.0) -> Tensor:
         """Return what one level adds to the coarser ones, (3, h, w) at its size; for the coarsest, its image.
 
@@ -266,14 +279,17 @@ class HierarchyRenderer:
             return self.by_field.zeros([camera], level)[0]
         return scaled(self.by_field.render_level([camera], level), gain)[0]
 
-    def _compose(self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float]) -> Composition:
+    def _compose(
+        self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float], clamped: int | None = None
+    ) -> Composition:
         """Render and compose these levels, coarsest first. With nested levels the first may be any."""
         if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
             found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
             raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
         nested = self.nested  # a nested field's image includes the coarser bands, so none can be omitted
         omitted = [] if nested else [level for level in levels if gains.get(level, 1.0) == 0.0]
-        return compose(self.pyramid, self.by_field.render(cameras, levels, omitted), nested=nested, gains=gains)
+        renders = self.by_field.render(cameras, levels, omitted)
+        return compose(self.pyramid, renders, nested=nested, gains=gains, clamped=clamped)
 
     def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:
         """Check a level and gains, and return the gains."""

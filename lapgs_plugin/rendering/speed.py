@@ -132,7 +132,7 @@ def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> It
 
 
 def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
-    return lambda cameras: renderer.images(cameras, level).clamp(0.0, 1.0)
+    return lambda cameras: renderer.frames(cameras, level)
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:

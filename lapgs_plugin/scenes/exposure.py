@@ -48,7 +48,12 @@ class MeasuredExposure:
 
 
 def measure_exposure(scene: Scene) -> MeasuredExposure:
-    """Measure how the exposure of a scene's training photos differs; a spread of 0 if too few points are visible."""
+    """Measure how the exposure of a scene's training photos differs.
+
+    The spread is 0 if too few points are visible, or if all have one colour: these are made up, for scenes without any.
+    """
+    if len(scene.points) and bool((scene.colors == scene.colors[0]).all()):
+        return MeasuredExposure(torch.zeros(len(scene.train), 3), 0.0)
     chosen = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:POINTS]
     looked_up = [_colors_of(view, scene.points[chosen]) for view in scene.train]
     colors, right = (torch.stack(each) for each in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)

@@ -19,6 +19,8 @@ SAMPLES_TO_KEEP_BEST = 10
 """How often a stage measures the views that were set aside, to keep the best state."""
 LEAST_VIEWS = 12
 """Fewest training views of which some can be set aside."""
+FEW_VIEWS, MANY_PASSES = 24, 100
+"""A run on fewer training views than that, with more passes over them than that, may fit them alone."""
 FALL = 0.5
 """Decibels below the best measurement that count as getting worse."""
 
@@ -54,6 +56,18 @@ def copied(state: Any) -> Any:
     if isinstance(state, Tensor):
         return state.detach().to("cpu", copy=True)
     return {key: copied(value) for key, value in state.items()} if isinstance(state, dict) else state
+
+
+def few_views_line(views: int, iterations: int) -> str | None:
+    """Return a line for a user whose photos are few for the iterations of a run; None if they are enough."""
+    passes = iterations // views
+    if views >= FEW_VIEWS or passes <= MANY_PASSES:
+        return None
+    keep = " or --keep best" if views >= LEAST_VIEWS else ""
+    return (
+        f"{views} training views are few for {iterations:,} iterations, {passes} passes over them: new views may get "
+        f"worse late in the run; --eval shows it, and fewer --iterations{keep} may help"
+    )
 
 
 @dataclass

@@ -53,6 +53,7 @@ from lapgs_plugin.training.quality import (
     SAMPLES_TO_KEEP_BEST,
     QualityWatch,
     copied,
+    few_views_line,
     require_views_to_set_aside,
     set_aside,
     spread_views,
@@ -212,6 +213,8 @@ class Trainer:
                 residuals = any(stage.signed for stage in self.plan)
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
+                if not resume and (line := few_views_line(len(self.scene.train), self.plan.iterations)):
+                    self.monitor.say(line)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels:
                         continue

@@ -127,6 +127,16 @@ def test_nothing_is_clamped_between_levels_and_residuals_lie_over_zero(grid: str
     ]
 
 
+@pytest.mark.parametrize("signed", [True, False])
+def test_frames_are_clamped_images(signed: bool) -> None:
+    fields = {2: constant_field(1.5, False), 1: constant_field(-1.9, signed), 0: constant_field(2.7, signed)}
+    renderer = HierarchyRenderer(fields, 3, Pyramid(), Constant(), BACKGROUND)
+    for level in range(3):
+        images = renderer.images([CAMERA], level)
+        assert float(images.abs().max()) > 1 or level == 1
+        torch.testing.assert_close(renderer.frames([CAMERA], level), images.clamp(0, 1), rtol=0, atol=1e-6)
+
+
 def test_a_coarser_level_stops_early() -> None:
     fields = {1: constant_field(0.5, False), 0: constant_field(0.1, True)}
     rasterizer = Constant()

@@ -57,6 +57,8 @@ def test_measure_finds_the_gains_of_photos() -> None:
     assert alike.spread < 0.01
     assert alike.gains.abs().max() < 0.03
     assert DIFFERENT > 0.01
+    grey = replace(scene, colors=torch.full_like(scene.points, 0.5))  # as those that a scene without points gets
+    assert measure_exposure(grey).spread == 0
 
 
 def wall_scene(stops: tuple[float, ...]) -> Scene:

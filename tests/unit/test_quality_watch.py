@@ -16,7 +16,14 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.quality import FALL, SAMPLES_OF_A_STAGE, QualityWatch, set_aside, spread_views
+from lapgs_plugin.training.quality import (
+    FALL,
+    SAMPLES_OF_A_STAGE,
+    QualityWatch,
+    few_views_line,
+    set_aside,
+    spread_views,
+)
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage import StageRun
@@ -156,6 +163,15 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
         again = train(scene, settings, folder, Monitor(), resume=True)
         assert [(again.field(each).means == whole.field(each).means).all() for each in (1, 0)] == [True, True]
         assert again.exposure(0) == exposure
+
+
+def test_few_views_for_many_iterations_are_named() -> None:
+    assert few_views_line(24, 30_000) is few_views_line(12, 1200) is None
+    line = few_views_line(15, 7000)
+    assert line is not None
+    assert line.startswith("15 training views are few for 7,000 iterations, 466 passes over them")
+    assert "--keep best" in line
+    assert "--keep best" not in str(few_views_line(8, 7000))  # too few to set some aside
 
 
 def test_keep_best_needs_views_to_set_aside() -> None:

@@ -40,6 +40,8 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
             torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
         half = upsample_add_triton(Pyramid(grid), coarse.half(), fine)
         torch.testing.assert_close(half, Pyramid(grid).up(coarse.half().float(), (h, w)) + fine, rtol=0, atol=2e-6)
+        shown = upsample_add_triton(Pyramid(grid), coarse, fine, clamped=True)
+        torch.testing.assert_close(shown, expected.clamp(0, 1), rtol=0, atol=2e-6)
         leaf = fine.clone().requires_grad_()
         by_fine = torch.autograd.grad((upsample_add_triton(Pyramid(grid), coarse, leaf) * expected).sum(), leaf)
         assert (by_fine[0] == expected).all()

@@ -16,12 +16,13 @@ LARGEST_DIFFERENCE = 1e-4
 """Largest difference from PyTorch's operations, of values of about 1, that counts as rounding."""
 
 
-def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: bool = False) -> Tensor:
     """Return Up(coarse) + fine, equal to `pyramid.up(coarse) + fine` up to rounding, with its gradient.
 
     Args:
         coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images; float16 is taken, too.
         fine: (c, h, w) or (b, c, h, w), on the same device.
+        clamped: clamp the sum to [0, 1], to show it; without gradient.
     """
     size = fine.shape[-2], fine.shape[-1]
     require_half(coarse, size)
@@ -29,7 +30,9 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
         with torch.cuda.device(fine.device):  # Triton launches on the current one
-            return upsample_add_triton(pyramid, coarse, fine)
+            return upsample_add_triton(pyramid, coarse, fine, clamped)
+    if clamped:
+        return upsample_add(pyramid, coarse, fine).clamp_(0.0, 1.0)
     coarse = coarse.to(fine.dtype)
     if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
         return upsample(pyramid, coarse, size) + fine

@@ -44,7 +44,7 @@ def _kernel(
     source_image: int, source_plane: int, source_row: int, source_column: int,
     added_image: int, added_plane: int, added_row: int, added_column: int,
     out_image: int, out_plane: int, out_row: int, out_column: int,
-    adds: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
+    adds: tl.constexpr, clamps: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
     taps_down: tl.constexpr, taps_across: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Filter some rows of a strip of `block` columns and colours; *_image, *_plane, *_row, *_column are strides.
@@ -82,6 +82,8 @@ def _kernel(
             total += tl.load(added + row.to(tl.int64) * added_row, inside, 0.0)
         for tap in tl.static_range(taps_down):
             total += tl.load(row_weights + row * taps_down + tap) * kept[tap]
+        if clamps:  # NaN stays
+            total = tl.where(total < 0.0, 0.0, tl.where(total > 1.0, 1.0, total))
         tl.store(out + row.to(tl.int64) * out_row, total, inside)
         row += 1
 
@@ -93,9 +95,13 @@ class _Taps(NamedTuple):
     weights: Tensor
 
 
-def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
+def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False) -> Tensor:
     """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
     size = fine.shape[-2], fine.shape[-1]
+    if clamped:
+        image, (rows, columns) = torch.empty_like(fine), (_up(pyramid.grid, side, fine.device) for side in size)
+        _filter(coarse, rows, columns, image, fine, clamps=True)
+        return image
     out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
@@ -129,8 +135,10 @@ class _Upsampled(torch.autograd.Function):
         return out, by_fine, None, None
 
 
-def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None) -> None:
-    """Write weighted sums of `source`, plus `added` if given, to `out`."""
+def _filter(
+    source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None, *, clamps: bool = False
+) -> None:
+    """Write weighted sums of `source`, plus `added` if given, to `out`; clamped to [0, 1] if asked for."""
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
     b, planes, height, width = images[2].shape
@@ -141,7 +149,7 @@ def _filter(source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Ten
     launch(
         *images, *rows, *columns, height, width, count,
         *(stride for image in images for stride in image.stride()),
-        adds=added is not None, planes=planes, interleaved=images[2].stride(1) == 1,
+        adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
         taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
     )  # fmt: skip
 
