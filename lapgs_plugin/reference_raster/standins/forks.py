@@ -298,6 +298,9 @@ class Surfels(WholeSh):
         depth, alpha = blended[0].image[:1], blended[0].image[1:2]
         middle = (depth / alpha.clamp_min(1e-6)).detach()
         maps = torch.cat([depth, alpha, blended[1].image, middle, torch.zeros_like(depth)])
+        if maps.requires_grad:
+            # Where nothing is blended, checkouts divide by an alpha of zero; the CUDA code reads no gradient there.
+            maps.register_hook(torch.nan_to_num)  # type: ignore[no-untyped-call]  # torch's
         return output.image, output.radii, maps
 
 
