@@ -60,6 +60,16 @@ class ActiveStage:
         """Whether the schedule is the checkout's own, for the whole run."""
         return False
 
+    @property
+    def gaussians(self) -> Any:
+        """The checkout's model that is trained; None before its scene is made."""
+        return self._gaussians
+
+    @property
+    def has_more(self) -> bool:
+        """Whether the running call has iterations after this one."""
+        return self.record.iteration < self.stage.iterations
+
     def load_images(self) -> None:
         """Make the level's images; from now on the checkout renders for this stage."""
         with self.record.overhead.timed("pyramid"):

@@ -43,6 +43,7 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.single_call import SingleCall
+from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.watcher import Watcher
@@ -108,7 +109,12 @@ class HierarchyDriver:
         Raises:
             LapgsError: the checkout, its options, the scene and the hierarchy do not go together.
         """
-        with Attachment(self._replacements.all()), self._context.parts.watching_optimizers():
+        model = self._adapter.profile.model
+        with (
+            Attachment(self._replacements.all()),
+            self._context.parts.watching_optimizers(),
+            counting_steps(model, lambda: self._active),
+        ):
             self._adapter.script.run_main()
 
     def _train(self, call: TrainingCall) -> None:

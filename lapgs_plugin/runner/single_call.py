@@ -16,19 +16,17 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import StageWindow
-from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.adapters.base import CHECKPOINTS, StageWindow
+from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
-
-CHECKPOINT = "checkpoint"
-"""Parameter of the family's `training` that takes the path of a checkpoint: (state of the model, iteration)."""
 
 
 class NestedStage(ActiveStage):
@@ -48,6 +46,10 @@ class NestedStage(ActiveStage):
     @property
     def keeps_schedule(self) -> bool:
         return True
+
+    @property
+    def has_more(self) -> bool:
+        return self.stage.level > 0 or super().has_more
 
     def iteration_begins(self, gaussians: Any) -> None:
         if self.record.iteration == self.stage.iterations and self.stage.level > 0:
@@ -148,24 +150,24 @@ class SingleCall:
         the archive; so the checkout's way to restore them, which differs between forks, is left out.
         """
         adapter = self._context.adapter
-        model = adapter.profile.model
-        if CHECKPOINT not in self._call.values or "restore" not in vars(model):
-            raise UserInputError(
-                f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues "
-                f"from no {CHECKPOINT}, which nested levels need to start at iteration {iteration + 1}; start again "
-                "with --overwrite"
-            )
 
         def restore(gaussians: Any, state: Any, training_args: Any, *_: Any) -> None:
             if gaussians.optimizer is None:  # some scripts leave that to `restore`
                 gaussians.training_setup(training_args)
             adapter.resume(self._call, gaussians, iteration)
 
-        keeping = Replacement(model, "restore", lambda _: restore, ("self",), "training() after reading a checkpoint")
-        with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment([keeping]):
+        keeping = of_class(adapter.profile.model, "restore", lambda _: restore, "training() after reading a checkpoint")
+        takes = [name for name in CHECKPOINTS if name in self._call.values]
+        if not (takes and keeping):
+            raise UserInputError(
+                f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues from no "
+                f"checkpoint, which nested levels need to start at iteration {iteration + 1}; start again with "
+                "--overwrite"
+            )
+        with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment(keeping):
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
-            self._call.changed(**{CHECKPOINT: str(path)}).run()
+            self._call.changed(**dict.fromkeys(takes, str(path))).run()
 
     def _require_trained(self, stage: ActiveStage) -> None:
         """Check that the finest level was trained.
@@ -178,7 +180,7 @@ class SingleCall:
         if stage.stage.level > 0 or stage.record.iteration == 0:
             raise LapgsError(
                 f"{name}() ended after {trained} of {self._total} iterations, in level {stage.stage.level}; expected "
-                "one call of GaussianModel.update_learning_rate an iteration; train this checkout with `lapgs run "
+                f"one call of {CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run "
                 "--off`, or with as many --iterations as it runs"
             )
         if trained != self._total:
