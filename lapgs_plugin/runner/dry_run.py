@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -112,9 +112,7 @@ class DryRun:
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
             self._require_three_axes(gaussians)
-            # As finished fields are rendered; an adapter's own `snapshot` may need a model that was set up by the loop.
-            field = BackboneAdapter.snapshot(self._adapter, gaussians, signed=False)
-            gaussians = self._adapter.model_of(self._call, field)
+            gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
