@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
@@ -113,6 +114,16 @@ def alpha_mask(photo: Path, size: tuple[int, int]) -> Tensor | None:
     black, white = (read_image(photo, size=size, background=(each,) * 3, clamp=False)[:1] for each in (0.0, 1.0))
     opaque = 1.0 - (white - black)
     return None if bool((opaque > 0.5).all()) else _inside(opaque, photo)
+
+
+def write_mask(path: Path, mask: Tensor) -> None:
+    """Write a mask (1, h, w) of bool as a grey PNG, white inside. Missing folders are made.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask[0].to(torch.uint8).mul(255).numpy()).save(path, "PNG", compress_level=1)
 
 
 def _inside(values: Tensor, path: Path) -> Tensor:

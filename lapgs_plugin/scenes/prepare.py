@@ -35,7 +35,7 @@ from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, read_image, write_image
 from lapgs_plugin.scenes.left_out import left_out_because
-from lapgs_plugin.scenes.masks import MASKS, alpha_mask, find_masks, read_mask
+from lapgs_plugin.scenes.masks import MASKS, alpha_mask, find_masks, read_mask, write_mask
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
 from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.photos import HEIC, Photos, camera_of, convert_heic, find_photos, listed, target_name
@@ -51,6 +51,7 @@ RETRIEVAL_FROM = 500
 """Photos from which on only pairs that look alike are compared, unless a matcher was chosen."""
 SIMILAR = 40
 """Photos that each photo is compared with by the matcher "retrieval"."""
+HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
 HAS_VOCABULARY = hasattr(getattr(pycolmap, "VisualIndex", None), "build")
 LOOP_FROM, LOOP_EVERY, LOOP_SIMILAR = 40, 10, 20
 """Sequential matching of so many photos or more also compares every tenth with those that look most like it, because
@@ -58,7 +59,7 @@ the camera may come back to a place."""
 MAPPERS = ("incremental", "global")
 DEFAULT_MODEL, SIMPLE_MODEL = "OPENCV", "SIMPLE_RADIAL"
 """Camera models to fit by default: first, and if the result is doubtful."""
-FEW = 0.75
+FEW = 0.5
 """Share of photos below which so few are placed that the lens may be wrong."""
 SQUARE = 0.04
 """Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
@@ -237,7 +238,7 @@ def _check_arguments(
         )
     if mapper not in MAPPERS:
         raise UserInputError(f"--mapper {mapper!r}: expected {' or '.join(MAPPERS)}")
-    if mapper == "global" and not hasattr(pycolmap, "global_mapping"):
+    if mapper == "global" and not HAS_GLOBAL:
         raise UserInputError(
             f"--mapper global: pycolmap {pycolmap.__version__} has none; leave it out or upgrade pycolmap"
         )
@@ -301,7 +302,7 @@ def _make_masks(job: _Job, given: Path | None) -> None:
         size = image_size(photo)
         mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
         if mask is not None:
-            write_image(partial / f"{name}.png", mask.float().expand(3, -1, -1))
+            write_mask(partial / f"{name}.png", mask)
         return mask is not None
 
     if sum(_each_photo(job, "Reading masks", make, names)):
@@ -431,20 +432,30 @@ def _place_cameras(job: _Job) -> list[pycolmap.Reconstruction]:
         if job.asked_model != AUTO:
             logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.asked_model)
         else:
-            logger.info("%s; placing the cameras again with a simpler lens", doubt)
-            again = _map(job, "Placing again", job.work / "models_simple", SIMPLE_MODEL)
-            if _placed(again) >= _placed(models):
-                models = again
-            else:
-                logger.warning(
-                    "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or "
-                    "take more photos from other heights and distances",
-                    *(_placed(again), _placed(models), doubt),
-                )
+            models = _placed_again(job, models, doubt)
     if _placed(models) < 2:
         raise SceneError(
             f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of a static "
             "scene that overlap strongly, each taken a step aside from the last"
+        )
+    return models
+
+
+def _placed_again(job: _Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
+    """Return the best models of doubtful ones, those of a simpler lens, and if few are placed, of the other mapper."""
+    logger.info("%s; placing the cameras again with a simpler lens", doubt)
+    again = _map(job, "Placing again", job.work / "models_simple", SIMPLE_MODEL)
+    if _placed(again) >= _placed(models):
+        models = again
+    if _placed(models) < FEW * len(job.names) and job.mapper == "incremental" and HAS_GLOBAL:
+        logger.info("only %d photos could be placed; placing all at once (--mapper global)", _placed(models))
+        whole = _map(job, "Placing all", job.work / "models_global", SIMPLE_MODEL, mapper="global")
+        return whole if _placed(whole) > _placed(models) else models
+    if models is not again:
+        logger.warning(
+            "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or take more "
+            "photos from other heights and distances",
+            *(_placed(again), _placed(models), doubt),
         )
     return models
 
@@ -470,8 +481,17 @@ def _focal_difference(model: pycolmap.Reconstruction) -> float:
     return max(abs(camera.focal_length_x / camera.focal_length_y - 1.0) for camera in cameras)
 
 
-def _map(job: _Job, title: str, folder: Path, model: str | None = None) -> list[pycolmap.Reconstruction]:
-    """Recover models into a folder, unless it is there, and return them; `model` replaces the camera model."""
+def _map(
+    job: _Job, title: str, folder: Path, model: str | None = None, mapper: str | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Recover models into a folder, unless it is there, and return them.
+
+    Args:
+        job: the job.
+        title: of the progress bar.
+        folder: of the models.
+        model, mapper: replace the job's.
+    """
     if not folder.is_dir():
         unfinished, placed = folder.with_suffix(".partial"), job.work / "placed"
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -481,7 +501,7 @@ def _map(job: _Job, title: str, folder: Path, model: str | None = None) -> list[
             "photos": str(job.photos.absolute()),
             "models": str(unfinished),
             "placed": str(placed),
-            "mapper": job.mapper,
+            "mapper": mapper or job.mapper,
         }
         if model is not None:
             other = job.work / "simple.db"
@@ -532,7 +552,7 @@ def _write_scene(job: _Job, model: pycolmap.Reconstruction) -> None:
             return
         file = job.masks / f"{image.name}.png"
         mask = read_image(file, size=size) if file.is_file() else torch.ones(3, size[1], size[0])
-        write_image(job.scene / MASKS / f"{target}.png", (undistort(mask, lens) > 0.5).float())
+        write_mask(job.scene / MASKS / f"{target}.png", undistort(mask, lens)[:1] > 0.5)
 
     _each_photo(job, "Undistorting", write, images)
     for image in images:

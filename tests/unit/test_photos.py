@@ -244,6 +244,7 @@ def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
         ("auto", (1090, 8), 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
         ("auto", (1090, 8), 5, "first", "with a simpler lens only 5 of 8 photos could be placed"),
         ("auto", (1000, 2), 8, "second", "only 2 of 8 photos could be placed; placing the cameras again"),
+        ("auto", (1000, 2), 3, "global", "only 3 photos could be placed; placing all at once"),
         ("auto", (1000, 7), 8, "first", ""),
         ("OPENCV", (1090, 8), 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
     ],
@@ -258,13 +259,19 @@ def test_doubtful_lenses_are_told_and_tried_again(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    models = {None: _model(first[0], 1000, first[1]), "SIMPLE_RADIAL": _model(1000, 1000, again)}
-    monkeypatch.setattr(prepare_module, "_map", lambda job, title, folder, model=None: [models[model]])
+    models = {"first": _model(first[0], 1000, first[1]), "second": _model(1000, 1000, again)}
+    models["global"] = _model(1000, 1000, 8)
+
+    def mapped(job: object, title: str, folder: Path, model: str | None = None, mapper: str = "") -> list[object]:
+        assert model in (None, "SIMPLE_RADIAL")
+        return [models[mapper or ("first" if model is None else "second")]]
+
+    monkeypatch.setattr(prepare_module, "_map", mapped)
     found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
     job = prepare_module._Job(tmp_path, found, "auto", "incremental", asked, None, False)
     with caplog.at_level(logging.INFO):
         (best,) = prepare_module._place_cameras(job)
-    assert best is models[None if chosen == "first" else "SIMPLE_RADIAL"]
+    assert best is models[chosen]
     assert message in caplog.text
     assert bool(message) == bool(caplog.text)
 
