@@ -135,9 +135,9 @@ class HierarchyDriver:
                 self._options.kind,
             )
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
-            if self._options.dry_run:
-                dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
             path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
+            if self._options.dry_run:
+                dry_run.run(Path(scratch, "dry_run"), path)
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:

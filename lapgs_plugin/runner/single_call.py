@@ -29,6 +29,11 @@ from lapgs_plugin.runner.step_clock import CLOCK
 logger = logging.getLogger(__name__)
 
 
+SOON = 500
+"""Iterations after a change of level in which an error may be about it: what runs seldom, such as densification, has
+run by then."""
+
+
 class NestedStage(ActiveStage):
     """Run one level of a call that trains all of them.
 
@@ -85,6 +90,7 @@ class SingleCall:
         dataset.model_path = str(run.archive.path("level_0"))
         self._call = run.call.changed(dataset=dataset, opt=opt)
         self._stage: NestedStage | None = None
+        self._advanced = False  # whether this call has trained more than one level
 
     def train(self, scene_files: Path) -> None:
         """Call the script's `training`; `scene_files` holds the files that the Scene wrote.
@@ -106,9 +112,25 @@ class SingleCall:
             self._stage.finish()
         except torch.cuda.OutOfMemoryError as error:
             raise self._stage.out_of_memory(error) from error
+        except RuntimeError:
+            self._explain_failure(self._stage)
+            raise
         finally:
             self._activate(None)
             self._stage.close()
+
+    def _explain_failure(self, stage: NestedStage) -> None:
+        """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
+        done = stage.record.iteration
+        if self._advanced and done <= SOON:
+            logger.warning(
+                "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
+                "views, or what it made of them, from before its loop cannot train nested levels in one call: "
+                "--hierarchy laplacian makes a call for each level",
+                self._call.function.__name__,
+                done,
+                stage.stage.level,
+            )
 
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
@@ -131,6 +153,7 @@ class SingleCall:
         finished = self._stage
         assert finished is not None, "an iteration begins inside a stage"
         finished.finish()
+        self._advanced = True
         stage = self._stage = self._next()
         stage.take_over(finished, gaussians)
         finished.close()

@@ -274,6 +274,25 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str,
     assert [level for level, _ in contexts[30:]] == [0] * 60
 
 
+def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The checkout's own error stays; a line before it says what is different in one call."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text, loop = script.read_text(encoding="utf-8"), "    for iteration in range(first_iter, opt.iterations + 1):\n"
+    keeps = "    view = scene.getTrainCameras()[0]\n    kept = view.original_image\n"
+    script.write_text(text.replace(loop, f"{keeps}{loop}        kept + view.original_image\n"), encoding="utf-8")
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", script=script) as adapter,
+        pytest.raises(RuntimeError, match="size of tensor"),
+    ):
+        drive(adapter, **THIRDS)
+    assert "failed 1 iterations after its views got the size of level 0" in caplog.text
+    assert RunArchive.open(tmp_path / "run").available_levels == (1,)
+
+
 def test_a_loop_that_ends_early_says_where(scene: Path, tmp_path: Path) -> None:
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
         training = adapter.train.training
