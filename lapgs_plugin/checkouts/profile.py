@@ -241,12 +241,13 @@ class Profile:
         return {name for name, held in vars(self.script.module).items() if held is value}
 
     def _first_call(self, names: Container[str]) -> ast.Call | None:
-        """Return the training function's first call of one of these names, if possible outside of any `try`.
+        """Return the training function's first call of one of these names, if possible one that gradients come from.
 
-        A loop's calls for a viewer are in a `try`.
+        A loop's calls for a viewer are in a `try`, those for scores in a `with torch.no_grad()`.
         """
         nodes = list(ast.walk(self.source.training))
-        tried = {id(inner) for node in nodes if isinstance(node, ast.Try) for inner in ast.walk(node)}
+        beside = [node for node in nodes if isinstance(node, ast.Try) or _records_no_gradients(node)]
+        tried = {id(inner) for node in beside for inner in ast.walk(node)}
         calls = [node for node in nodes if isinstance(node, ast.Call) and _called_name(node) in names]
         return min(calls, key=lambda call: (id(call) in tried, call.lineno), default=None)
 
@@ -306,6 +307,14 @@ def _names(function: Any) -> set[str]:
     """Return the names of attributes and globals that a function uses."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     return set() if code is None else set(code.co_names)
+
+
+def _records_no_gradients(node: ast.AST) -> bool:
+    """Return whether a node is a `with torch.no_grad():`."""
+    if not isinstance(node, ast.With):
+        return False
+    calls = [item.context_expr for item in node.items if isinstance(item.context_expr, ast.Call)]
+    return any(_called_name(call) == "no_grad" for call in calls)
 
 
 def _called_name(call: ast.Call) -> str:

@@ -145,6 +145,10 @@ class Event:
         numbers = (each.number({}) or 0 for each in (*self.operands, *self.listed))
         return bool(self.calls) or max(numbers) > LOGGING
 
+    def never(self, variables: Mapping[str, Any]) -> bool:
+        """Return whether it happens at the iterations of a list, which is empty."""
+        return any(each.is_list and each.value(variables) in ([], ()) for each in self.operands)
+
     @property
     def bounds(self) -> tuple[Operand, ...]:
         """Iterations at which it begins, ends or happens."""
@@ -180,11 +184,13 @@ class Schedule:
         self.events = [] if loop is None else list(_events(loop.body, _target(loop), ()))
 
     def describe(self, variables: Mapping[str, Any] | None = None) -> list[str]:
-        """Return a line for each event that calls something; `variables` are those that the function sees, by name."""
-        ends = [[each.name == "iterations" for each in event.operands] for event in self.events]
-        return [
-            e.describe(variables or {}) for e, end in zip(self.events, ends, strict=True) if e.calls and not all(end)
-        ]
+        """Return a line for each event that calls something, or has a number of its own, and can happen.
+
+        Args:
+            variables: those that the function sees, by name; options of others have no value.
+        """
+        known = variables or {}
+        return [event.describe(known) for event in self.events if event.matters and not event.never(known)]
 
     def for_stage(
         self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: Window, keep: Collection[str] = ()

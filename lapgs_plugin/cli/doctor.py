@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lapgs_plugin.environment.findings import Finding
     from lapgs_plugin.environment.probes import Probe
 
@@ -24,19 +23,26 @@ MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold
 
 
 def doctor(
+    checkout: Annotated[
+        Path | None,
+        typer.Argument(help="Describe a 3DGS checkout instead: what is found in it, and what works with it."),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print all findings as JSON, for scripts and bug reports.")
     ] = False,
 ) -> None:
     """Check Python, PyTorch, GPU, compilers and packages, and say what `lapgs train` will use.
 
-    The command changes and downloads nothing, and its exit code is always 0. Lines marked !! are problems and say what
-    to do. Lines marked -- are optional parts that are not installed.
+    With a checkout, say what `lapgs run` finds in it: its root, its training function, its rasterizers and what works.
+    The command changes and downloads nothing, and its exit code is 0 unless CHECKOUT is none. Lines marked !! are
+    problems and say what to do. Lines marked -- are optional parts that are not installed.
     """
     import json
     from dataclasses import asdict
 
-    sections = examine()
+    from lapgs_plugin.cli.doctor_checkout import describe
+
+    sections = examine() if checkout is None else describe(checkout)
     if as_json:
         print(
             json.dumps({title: [asdict(finding) for finding in found] for title, found in sections.items()}, indent=2)
@@ -48,7 +54,6 @@ def doctor(
 def examine() -> dict[str, list[Finding]]:
     """Return all findings by section, the conclusion last. Slow probes run in parallel."""
     from concurrent.futures import ThreadPoolExecutor
-    from pathlib import Path
 
     from lapgs_plugin.adapters.registry import known_extensions
     from lapgs_plugin.environment import driver_version, findings

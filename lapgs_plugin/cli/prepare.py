@@ -31,7 +31,7 @@ def prepare(
         str,
         typer.Option(
             help="COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). "
-            "auto: OPENCV, and RADIAL if its two focal lengths come out implausible."
+            "auto: OPENCV, and SIMPLE_RADIAL if that places few photos or gives implausible focal lengths."
         ),
     ] = "auto",
     single_camera: Annotated[

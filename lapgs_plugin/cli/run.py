@@ -132,7 +132,7 @@ def run(
         if driver.folder is not None:
             keep_preview(driver.folder, chosen)
     except ImportError as error:
-        line = None if off else explain_import_error(error, str(script))
+        line = None if off else explain_import_error(error, path, on_cpu=chosen == "cpu")
         if line is None:
             raise
         raise line from error

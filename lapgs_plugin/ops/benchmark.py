@@ -15,9 +15,10 @@ from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.jit.threads import one_pool
-from lapgs_plugin.ops import adam, densification_statistics, photometric_loss, upsample
+from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss, upsample
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
+from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
 
@@ -71,6 +72,7 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
         "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
         "Adam": _adam_versions(ours, gaussians, device),
         "densification statistics": _statistics_versions(ours, gaussians, device),
+        "colour transform": _transform_versions(images[0]),
     }
     return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
 
@@ -148,6 +150,19 @@ def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | N
 def _gradient(loss: Callable[[], Tensor], leaf: Tensor) -> Tensor:
     """Return the gradient, times the number of pixels and channels, so that values are about 1."""
     return torch.autograd.grad(loss(), leaf)[0] * leaf.numel()
+
+
+def _transform_versions(image: Tensor) -> Versions:
+    transform = torch.eye(3, 4, device=image.device).requires_grad_()
+    leaf = image.clone().requires_grad_()
+
+    def gradients_of(apply: Callable[[Tensor, Tensor], Tensor]) -> Version:
+        return Version(lambda: torch.autograd.grad(apply(leaf, transform).sum(), (leaf, transform))[0])
+
+    versions = {TORCH: gradients_of(transform_colors_torch)}
+    if color_transform.triton_works(image):
+        versions["Triton"] = gradients_of(color_transform.transform_colors)
+    return versions
 
 
 def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:

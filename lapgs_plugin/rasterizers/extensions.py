@@ -10,7 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -33,13 +33,25 @@ CONSTANTS: dict[str, Any] = {
     "mult": 1.0,  # the whole ellipse alpha = 1/255; less cuts off visible borders of Gaussians
     "get_flag": False,
     "pixel_weights": None,
+    "kernel_size": 0.1,
+    "depth_threshold": 1.0,
+    "use_train_speedup": False,
+    "ignored_rate": 0.0,
+    "lambda_dssim": 0.2,
+    "use_hwc": False,
 }
 """Settings of every call, unless a run was trained with others."""
 VARYING = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
-    "metric_map",
+    "metric_map", "subpixel_offset",
 )  # fmt: skip
 """Settings of a single call."""
+OTHER_INPUTS: dict[str, Callable[[Tensor], Tensor | None]] = {
+    "scores": lambda means: means.new_zeros(len(means), 1),
+    "culling": lambda means: means.new_zeros(len(means), dtype=torch.bool),
+    "gt_image": lambda means: None,
+}
+"""Inputs that some rasterizers cannot do without, given centres (n, 3): with these values they change no image."""
 NEAR, FAR = 0.01, 100.0
 """Clipping planes of the projection matrix; the kernels only use its other rows."""
 SH_REST_COUNT = 15
@@ -95,7 +107,9 @@ class CudaExtension:
                 f"{name} as it is installed has no setting {', '.join(unknown)}; expected some of "
                 f"{', '.join(sorted(options_of(module)))}"
             )
-        self._takes_dc = "dc" in inspect.signature(module.GaussianRasterizer.forward).parameters
+        arguments = inspect.signature(module.GaussianRasterizer.forward).parameters
+        self._takes_dc = "dc" in arguments
+        self._others = {name: make for name, make in OTHER_INPUTS.items() if name in arguments}
         # Rasterizers that take SH of degree 0 separately also blend a tile's Gaussians in buckets of 32.
         self._in_buckets = self._takes_dc
         # Rasterizers with this setting return absolute gradients after the ordinary ones.
@@ -161,7 +175,8 @@ class CudaExtension:
         if n == 0 or (self._in_buckets and (antialiasing or not _surely_blends(field, camera))):
             inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
         rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
-        image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()})[:2]
+        others = {name: make(inputs["means3D"]) for name, make in self._others.items()}
+        image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()}, **others)[:2]
         return image, radii[:n]
 
     def _check(self, field: GaussianField, background: Tensor) -> None:
@@ -199,6 +214,8 @@ class CudaExtension:
             values["metric_map"] = torch.zeros(
                 camera.height * camera.width, dtype=torch.int32, device=background.device
             )
+        if "subpixel_offset" in self._settings:
+            values["subpixel_offset"] = torch.zeros(camera.height, camera.width, 2, device=background.device)
         return self._module.GaussianRasterizationSettings(**{name: values[name] for name in self._settings})
 
 

@@ -14,7 +14,9 @@ from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import SceneReference
+from lapgs_plugin.scenes.masks import ALPHA, NONE
 from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
+from lapgs_plugin.scenes.source import is_folder
 
 PATHS = ("orbit", "spline")
 
@@ -45,10 +47,15 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         moved_to: current folder of the scene; None if it is where the manifest says.
 
     Raises:
-        RunFolderError: it is missing, or not the scene that the run was trained on.
+        RunFolderError: it or its masks are missing, or it is not the scene that the run was trained on.
         SceneError: it cannot be read.
     """
     reference, path = _scene_folder(archive, moved_to)
+    if reference.masks not in (NONE, ALPHA) and not is_folder(path / reference.masks):
+        raise RunFolderError(
+            f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
+            "put them back"
+        )
     scene = load_scene(
         path,
         resolution=reference.resolution,

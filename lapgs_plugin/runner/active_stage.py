@@ -54,11 +54,22 @@ class ActiveStage:
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         self._gaussians: Any = None
+        self._scene_files: Path | None = None
 
     @property
     def keeps_schedule(self) -> bool:
         """Whether the schedule is the checkout's own, for the whole run."""
         return False
+
+    @property
+    def gaussians(self) -> Any:
+        """The checkout's model that is trained; None before its scene is made."""
+        return self._gaussians
+
+    @property
+    def has_more(self) -> bool:
+        """Whether the running call has iterations after this one."""
+        return self.record.iteration < self.stage.iterations
 
     def load_images(self) -> None:
         """Make the level's images; from now on the checkout renders for this stage."""
@@ -79,6 +90,12 @@ class ActiveStage:
     def scene_for(self, gaussians: Any) -> Any:
         """Return the scene of this stage, and initialise `gaussians` from it."""
         self._gaussians = gaussians
+        if self._scene_files is not None:
+            folder = Path(self._call.dataset.model_path)
+            folder.mkdir(exist_ok=True)
+            for path in self._scene_files.iterdir():
+                if path.is_file():
+                    shutil.copy(path, folder)
         scene = self._run.scene.copy(
             gaussians, self._call.dataset.model_path, self._views.train_views(), self._views.test_views()
         )
@@ -179,12 +196,11 @@ class ActiveStage:
             torch.cuda.empty_cache()
 
     def copy_scene_files(self, source: Path) -> None:
-        """Copy the files that the checkout's Scene writes beside a model to the call's folder, for its viewers."""
-        folder = Path(self._call.dataset.model_path)
-        folder.mkdir(exist_ok=True)
-        for path in source.iterdir():
-            if path.is_file():
-                shutil.copy(path, folder)
+        """Copy the files that the checkout's Scene writes beside a model, for its viewers, once the loop has a scene.
+
+        Some checkouts refuse an output folder that is there before they make it.
+        """
+        self._scene_files = source
 
     def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""

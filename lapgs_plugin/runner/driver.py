@@ -43,6 +43,7 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.single_call import SingleCall
+from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.watcher import Watcher
@@ -108,7 +109,12 @@ class HierarchyDriver:
         Raises:
             LapgsError: the checkout, its options, the scene and the hierarchy do not go together.
         """
-        with Attachment(self._replacements.all()), self._context.parts.watching_optimizers():
+        model = self._adapter.profile.model
+        with (
+            Attachment(self._replacements.all()),
+            self._context.parts.watching_optimizers(),
+            counting_steps(model, lambda: self._active),
+        ):
             self._adapter.script.run_main()
 
     def _train(self, call: TrainingCall) -> None:
@@ -129,9 +135,9 @@ class HierarchyDriver:
                 self._options.kind,
             )
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
-            if self._options.dry_run:
-                dry_run.run(Path(scratch, "dry_run"), residuals=not self._signs_nothing)
             path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
+            if self._options.dry_run:
+                dry_run.run(Path(scratch, "dry_run"), path)
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
                 self._context.watcher.run_started(archive)
                 try:

@@ -11,7 +11,7 @@ import io
 import logging
 import random
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import TrainingCall
+from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -68,27 +68,36 @@ class DryRun:
         self._adapter = context.adapter
         self._call = call
         self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
+        # Residuals ask for more than other stages do.
+        self._stage = next((stage for stage in plan if stage.signed), next(iter(plan)))
 
-    def run(self, folder: Path, residuals: bool) -> None:
+    def run(self, folder: Path, path: ColorPath) -> None:
         """Try one iteration of the script's loop, and all that a run does with its model.
 
         Args:
             folder: receives what the checkout writes.
-            residuals: whether the run trains residuals.
+            path: how signed colour is evaluated.
 
         Raises:
             UserInputError: the checkout cannot be trained so; the line says what failed, where, and what works.
         """
+        works = NESTED_WORKS if self._stage.signed else OFF
         with _undisturbed(self._context.device), _silent_writer(self._adapter.train):
-            stage = _DryStage(self._context, self._scratch_call(folder), self._scene, self._view)
-            self._iterate(stage)
+            sizes = {key: level_size(self._context.images[key].size, self._stage.level) for key in self._cameras}
+            rendering = StageRendering(self._stage.signed, path, self._cameras)
+            if self._stage.signed:
+                rendering.accumulated = _Nothing(sizes, self._context.device)
+                rendering.composed = frozenset(self._cameras)
+            stage = _DryStage(
+                self._context, self._scratch_call(folder), self._scene, self._view, rendering, self._window
+            )
+            self._iterate(stage, works)
             view = self._view(self._scene.train[0])
-            image = self._render(view, stage.gaussians)
-            if residuals:
-                self._require_three_axes(stage.gaussians)
+            with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
+                image = self._render(view, stage.gaussians)
             with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
                 field = self._adapter.export_field(stage.gaussians, signed=False)
-            if residuals:
+            if self._stage.signed:
                 with self._step("a model made from a finished field", "one that renders", NESTED_WORKS):
                     self._render(view, self._adapter.model_of(stage.call, field))
             self._evaluate(view, image)
@@ -102,17 +111,18 @@ class DryRun:
         with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            self._require_three_axes(gaussians)
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
         return path
 
-    def _iterate(self, stage: _DryStage) -> None:
+    def _iterate(self, stage: _DryStage, works: str) -> None:
         """Run the first iteration of the script's loop."""
         self._context.wrapper.stage = stage.rendering
         self._activate(stage)
         try:
-            with self._step("the first iteration", "one as without lapgs", OFF):
+            with self._step("the first iteration", "one as without lapgs", works):
                 stage.call.run()
         except _Enough:
             pass
@@ -126,34 +136,43 @@ class DryRun:
                 f"iteration; {OFF}"
             )
 
+    @property
+    def _window(self) -> StageWindow | None:
+        """The residual's stage; None for levels that keep the checkout's own schedule."""
+        start = sum(stage.iterations for stage in self._plan if stage.level > self._stage.level)
+        window = StageWindow(self._stage, start, self._plan.iterations, self._plan.levels, 1.0, 1.0)
+        return window if self._stage.signed else None
+
     def _scratch_call(self, folder: Path) -> TrainingCall:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""
-        values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
-        values["dataset"].model_path = str(folder)
-        folder.mkdir()
+        if self._window is not None:
+            call = self._adapter.stage_call(self._call, self._window, str(folder))
+        else:
+            values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
+            values["dataset"].model_path = str(folder)
+            call = self._call.changed(**values)
         lists: dict[str, Any] = {
-            n: [] for n, v in self._call.values.items() if n.endswith("iterations") and isinstance(v, (list, tuple))
+            name: [] for name, v in call.values.items() if name.endswith("iterations") and isinstance(v, (list, tuple))
         }
-        return self._call.changed(**values, **lists)
+        return call.changed(**lists)
 
     def _view(self, camera: Any) -> Any:
-        """Return a camera at the coarsest level."""
+        """Return a camera at the level of the tried stage."""
         images, device = self._context.images, self._context.device
         key = images.key(camera)
-        width, height = level_size(images[key].size, self._plan.levels - 1)
+        width, height = level_size(images[key].size, self._stage.level)
 
         def image() -> Tensor:
             whole = images[key].load(device)[None]
             return torch.nn.functional.interpolate(whole, (height, width), mode="area")[0]
 
-        return self._adapter.view_at(camera, (width, height), False, image)
+        return self._adapter.view_at(camera, (width, height), self._stage.signed, image)
 
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
         background = torch.zeros(3, device=self._context.device)
-        with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
-            return self._context.render(rendering, self._call, view, gaussians, background)
+        return self._context.render(rendering, self._call, view, gaussians, background)
 
     def _require_three_axes(self, gaussians: Any) -> None:
         place, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]
@@ -232,17 +251,21 @@ class _DryRecord:
 class _DryStage:
     """Answer the replaced symbols for one iteration; see `ActiveStage`."""
 
-    resets_opacities = keeps_schedule = True
-    window = None
+    resets_opacities = True
 
     def __init__(
-        self, context: RunContext, call: TrainingCall, scene: CheckoutScene, view: Callable[[Any], Any]
+        self,
+        context: RunContext,
+        call: TrainingCall,
+        scene: CheckoutScene,
+        view: Callable[[Any], Any],
+        rendering: StageRendering,
+        window: StageWindow | None,
     ) -> None:
-        self.call, self._scene, self._view, self._context = call, scene, view, context
+        self._context, self.call, self._scene, self._view = context, call, scene, view
+        self.rendering, self.window, self.keeps_schedule = rendering, window, window is None
         self.record = _DryRecord()
         self.gaussians: Any = None
-        cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
-        self.rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views=cameras)
 
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
@@ -261,6 +284,20 @@ class _DryStage:
         if self.record.iteration:
             raise _Enough
         self.record.iteration = 1
+
+
+class _Nothing:
+    """Return black images as predictions of coarser levels."""
+
+    def __init__(self, sizes: Mapping[str, tuple[int, int]], device: torch.device) -> None:
+        self._sizes, self._device = sizes, device
+
+    def prefetch(self, key: str) -> None:
+        """Do nothing."""
+
+    def get(self, key: str) -> Tensor:
+        width, height = self._sizes[key]
+        return torch.zeros(3, height, width, device=self._device)
 
 
 def _some(points: Any) -> Any:

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from lapgs_plugin.adapters.registry import known_extensions
 from lapgs_plugin.checkouts.profile import Profile
+from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "PIL": "pillow",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
+"""Distributions whose names differ from those of their packages."""
 
 
 def require_matching_rasterizer(profile: Profile, title: str) -> None:
@@ -33,13 +45,44 @@ def require_matching_rasterizer(profile: Profile, title: str) -> None:
                 )
 
 
-def explain_import_error(error: ImportError, script: str) -> MissingExtraError | None:
-    """Return an error of one line for an extension that cannot be imported; None for any other module."""
-    for name, purpose in known_extensions().items():
-        package = name.partition(".")[0]
-        if (error.name or "").partition(".")[0] == package:
-            return MissingExtraError(
-                f"{script} needs {package}, the {purpose}, which cannot be imported ({str(error).splitlines()[0]}); "
-                "install it as the checkout's README says, or run on CPU stand-ins with `lapgs run --device cpu`"
-            )
-    return None
+def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> MissingExtraError | None:
+    """Return an error of one line for a package that a checkout imports and that cannot be imported.
+
+    Args:
+        error: raised while a script was executed.
+        script: the script.
+        on_cpu: whether it runs on CPU stand-ins.
+
+    Returns:
+        The error; None if the checkout does not import the package itself.
+    """
+    package = _package(error.name or "")
+    purpose = next((why for name, why in known_extensions().items() if _package(name) == package), None)
+    source = _source(script)
+    imports = () if source is None else source.externals
+    where = next((one.where for one in imports if _package(one.name) == package), None)
+    if not package or (purpose is None and where is None):
+        return None
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    named = f", the {purpose}" if purpose else ""
+    problem = f"{where or script} needs {package}{named}, which cannot be imported ({reason})"
+    rasterizers = () if source is None else map(_package, source.rasterizer_modules)
+    if purpose is None and package not in rasterizers:
+        return MissingExtraError(f"{problem}: pip install {DISTRIBUTIONS.get(package, package)}")
+    if on_cpu:
+        return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA")
+    return MissingExtraError(
+        f"{problem}; install it as the checkout's README says, or run on CPU stand-ins with `lapgs run --device cpu`, "
+        "if `lapgs doctor CHECKOUT` finds one"
+    )
+
+
+def _source(script: Path) -> CheckoutSource | None:
+    try:
+        return CheckoutSource.read(script)
+    except (UserInputError, OSError):
+        return None
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]

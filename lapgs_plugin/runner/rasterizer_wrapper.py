@@ -155,16 +155,19 @@ class StageRendering:
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = _with_signed_colors(inputs, settings)
         outputs = rasterizer(**inputs)
-        place = _image_place(outputs, settings)
+        size = _size(settings)
+        place = _image_place(outputs, size)
         stored = outputs if place is None else outputs[place]
-        image = _channels_first(stored)
+        channels_last = stored.shape[-1] == 3 and (stored.shape[-3] != 3 or stored.shape[-3:-1] == size)
+        image = stored.reshape(stored.shape[-3:])  # some have a leading axis for several views
+        image = image.permute(2, 0, 1) if channels_last else image
         key = self.key(noted, settings)
         if noted is None and key is not None and not self._fits(key, image):
             key = None  # a viewer's camera at the place of a photo's
         image = self.compose(key, image)
         if self.capture:
             self.captured = image
-        image = _as_stored(image, stored)
+        image = (image.permute(1, 2, 0) if channels_last else image).reshape(stored.shape)
         return image if place is None else _with_item(outputs, place, image)
 
     @property
@@ -360,42 +363,34 @@ def _matrices(matrix: Any) -> tuple[bytes, bytes]:
     return values.tobytes(), np.ascontiguousarray(values.T).tobytes()
 
 
-def _image_place(outputs: Any, settings: Any) -> Any:
+def _size(settings: Any) -> tuple[int, ...]:
+    """Return (height, width) of the view, empty if the settings do not say it."""
+    fields = _fields(settings)
+    return tuple(int(fields[name]) for name in ("image_height", "image_width") if name in fields)
+
+
+def _image_place(outputs: Any, size: tuple[int, ...]) -> Any:
     """Return where the image is among a rasterizer's outputs, None if they are the image.
 
-    It is the first with three channels and the size of the view.
+    It is the first with three channels, before or after its axes of pixels, and the size of the view.
 
     Raises:
         UserInputError: there is none.
     """
     if isinstance(outputs, Tensor):
         return None
-    fields = _fields(settings)
-    size = tuple(int(fields[n]) for n in ("image_height", "image_width") if n in fields)
     items = outputs.items() if isinstance(outputs, dict) else enumerate(outputs)
     found = {place: tuple(v.shape) for place, v in items if isinstance(v, Tensor) and v.is_floating_point()}
     for place, shape in found.items():
         if 3 <= len(shape) <= 4 and all(one == 1 for one in shape[:-3]):
-            if shape[-3] == 3 and (not size or shape[-2:] == size):
-                return place
-            if shape[-1] == 3 and shape[-3:-1] == size:
+            first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
+            if first or last or (not size and 3 in (shape[-3], shape[-1])):
                 return place
     shapes = ", ".join(map(str, found.values())) or "no tensor"
     raise UserInputError(
         f"the checkout's rasterizer returns {shapes}, expected an image (3, h, w)"
         f"{' of ' + 'x'.join(map(str, size[::-1])) if size else ''}; `lapgs run --off` runs the script as it is"
     )
-
-
-def _channels_first(image: Tensor) -> Tensor:
-    """Return an image as (3, h, w)."""
-    image = image.reshape(image.shape[-3:])
-    return image if image.shape[0] == 3 else image.permute(2, 0, 1)
-
-
-def _as_stored(image: Tensor, like: Tensor) -> Tensor:
-    """Return an image (3, h, w) with the axes of another."""
-    return (image if like.shape[-3] == 3 else image.permute(1, 2, 0)).reshape(like.shape)
 
 
 def _with_item(outputs: Any, place: Any, image: Tensor) -> Any:

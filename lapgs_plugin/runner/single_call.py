@@ -16,19 +16,22 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import StageWindow
-from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.adapters.base import CHECKPOINTS, StageWindow
+from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT = "checkpoint"
-"""Parameter of the family's `training` that takes the path of a checkpoint: (state of the model, iteration)."""
+
+SOON = 500
+"""Iterations after a change of level in which an error may be about it: what runs seldom, such as densification, has
+run by then."""
 
 
 class NestedStage(ActiveStage):
@@ -48,6 +51,10 @@ class NestedStage(ActiveStage):
     @property
     def keeps_schedule(self) -> bool:
         return True
+
+    @property
+    def has_more(self) -> bool:
+        return self.stage.level > 0 or super().has_more
 
     def iteration_begins(self, gaussians: Any) -> None:
         if self.record.iteration == self.stage.iterations and self.stage.level > 0:
@@ -83,6 +90,7 @@ class SingleCall:
         dataset.model_path = str(run.archive.path("level_0"))
         self._call = run.call.changed(dataset=dataset, opt=opt)
         self._stage: NestedStage | None = None
+        self._advanced = False  # whether this call has trained more than one level
 
     def train(self, scene_files: Path) -> None:
         """Call the script's `training`; `scene_files` holds the files that the Scene wrote.
@@ -104,9 +112,25 @@ class SingleCall:
             self._stage.finish()
         except torch.cuda.OutOfMemoryError as error:
             raise self._stage.out_of_memory(error) from error
+        except RuntimeError:
+            self._explain_failure(self._stage)
+            raise
         finally:
             self._activate(None)
             self._stage.close()
+
+    def _explain_failure(self, stage: NestedStage) -> None:
+        """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
+        done = stage.record.iteration
+        if self._advanced and done <= SOON:
+            logger.warning(
+                "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
+                "views, or what it made of them, from before its loop cannot train nested levels in one call: "
+                "--hierarchy laplacian makes a call for each level",
+                self._call.function.__name__,
+                done,
+                stage.stage.level,
+            )
 
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
@@ -129,6 +153,7 @@ class SingleCall:
         finished = self._stage
         assert finished is not None, "an iteration begins inside a stage"
         finished.finish()
+        self._advanced = True
         stage = self._stage = self._next()
         stage.take_over(finished, gaussians)
         finished.close()
@@ -148,24 +173,24 @@ class SingleCall:
         the archive; so the checkout's way to restore them, which differs between forks, is left out.
         """
         adapter = self._context.adapter
-        model = adapter.profile.model
-        if CHECKPOINT not in self._call.values or "restore" not in vars(model):
-            raise UserInputError(
-                f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues "
-                f"from no {CHECKPOINT}, which nested levels need to start at iteration {iteration + 1}; start again "
-                "with --overwrite"
-            )
 
         def restore(gaussians: Any, state: Any, training_args: Any, *_: Any) -> None:
             if gaussians.optimizer is None:  # some scripts leave that to `restore`
                 gaussians.training_setup(training_args)
             adapter.resume(self._call, gaussians, iteration)
 
-        keeping = Replacement(model, "restore", lambda _: restore, ("self",), "training() after reading a checkpoint")
-        with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment([keeping]):
+        keeping = of_class(adapter.profile.model, "restore", lambda _: restore, "training() after reading a checkpoint")
+        takes = [name for name in CHECKPOINTS if name in self._call.values]
+        if not (takes and keeping):
+            raise UserInputError(
+                f"--resume: {self._call.function.__name__}() of {adapter.script.path.name} continues from no "
+                f"checkpoint, which nested levels need to start at iteration {iteration + 1}; start again with "
+                "--overwrite"
+            )
+        with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment(keeping):
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
-            self._call.changed(**{CHECKPOINT: str(path)}).run()
+            self._call.changed(**dict.fromkeys(takes, str(path))).run()
 
     def _require_trained(self, stage: ActiveStage) -> None:
         """Check that the finest level was trained.
@@ -178,7 +203,7 @@ class SingleCall:
         if stage.stage.level > 0 or stage.record.iteration == 0:
             raise LapgsError(
                 f"{name}() ended after {trained} of {self._total} iterations, in level {stage.stage.level}; expected "
-                "one call of GaussianModel.update_learning_rate an iteration; train this checkout with `lapgs run "
+                f"one call of {CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run "
                 "--off`, or with as many --iterations as it runs"
             )
         if trained != self._total:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.scenes.images import has_alpha, image_size, read_image
-from lapgs_plugin.scenes.source import is_file, is_folder
+from lapgs_plugin.scenes.source import is_folder
 
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
@@ -41,7 +42,11 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     Raises:
         SceneError: an image has no mask, or several.
     """
-    found = {name: _mask_of(folder, name) for name in names}
+    files = [file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES]
+    present: dict[str, list[Path]] = {}
+    for file in sorted(files):  # cameras write .JPG, other programs .jpg
+        present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
+    found = {name: _mask_of(folder, present, name) for name in names}
     if missing := [name for name, path in found.items() if path is None]:
         stem = _stem(missing[0])
         raise SceneError(
@@ -52,12 +57,12 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     return {name: path for name, path in found.items() if path is not None}
 
 
-def _mask_of(folder: Path, name: str) -> Path | None:
+def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | None:
     stem = _stem(name)
     whole = [name] if stem != name else [f"{name}{suffix}" for suffix in SUFFIXES]  # a checkout's name without suffix
     spellings = [f"{each}.png" for each in whole]
     spellings += [f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES]
-    files = [folder / each for each in spellings if is_file(folder / each)]
+    files = [file for each in spellings for file in present.get(each.lower(), ())]
     if len(files) > 1:
         raise SceneError(
             f"{folder}: photo {printable(name)} has the masks {printable(files[0].name)} and "
@@ -109,6 +114,16 @@ def alpha_mask(photo: Path, size: tuple[int, int]) -> Tensor | None:
     black, white = (read_image(photo, size=size, background=(each,) * 3, clamp=False)[:1] for each in (0.0, 1.0))
     opaque = 1.0 - (white - black)
     return None if bool((opaque > 0.5).all()) else _inside(opaque, photo)
+
+
+def write_mask(path: Path, mask: Tensor) -> None:
+    """Write a mask (1, h, w) of bool as a grey PNG, white inside. Missing folders are made.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask[0].to(torch.uint8).mul(255).numpy()).save(path, "PNG", compress_level=1)
 
 
 def _inside(values: Tensor, path: Path) -> Tensor:

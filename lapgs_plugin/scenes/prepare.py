@@ -35,7 +35,7 @@ from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, read_image, write_image
 from lapgs_plugin.scenes.left_out import left_out_because
-from lapgs_plugin.scenes.masks import MASKS, alpha_mask, find_masks, read_mask
+from lapgs_plugin.scenes.masks import MASKS, alpha_mask, find_masks, read_mask, write_mask
 from lapgs_plugin.scenes.output import check_output, check_written, one_line_errors, write_model
 from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.photos import HEIC, Photos, camera_of, convert_heic, find_photos, listed, target_name
@@ -51,9 +51,16 @@ RETRIEVAL_FROM = 500
 """Photos from which on only pairs that look alike are compared, unless a matcher was chosen."""
 SIMILAR = 40
 """Photos that each photo is compared with by the matcher "retrieval"."""
+HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
+HAS_VOCABULARY = hasattr(getattr(pycolmap, "VisualIndex", None), "build")
+LOOP_FROM, LOOP_EVERY, LOOP_SIMILAR = 40, 10, 20
+"""Sequential matching of so many photos or more also compares every tenth with those that look most like it, because
+the camera may come back to a place."""
 MAPPERS = ("incremental", "global")
-DEFAULT_MODEL, ONE_FOCAL_MODEL = "OPENCV", "RADIAL"
-"""Camera models to fit by default: first, and if its two focal lengths come out too different."""
+DEFAULT_MODEL, SIMPLE_MODEL = "OPENCV", "SIMPLE_RADIAL"
+"""Camera models to fit by default: first, and if the result is doubtful."""
+FEW = 0.5
+"""Share of photos below which so few are placed that the lens may be wrong."""
 SQUARE = 0.04
 """Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
 CAMERA_MODELS = (
@@ -117,8 +124,8 @@ def prepare_scene(
         matcher: "exhaustive" matches all pairs, "sequential" neighbours in name order (frames of a video), "retrieval"
             each photo with those that look most like it. "auto" chooses by the kind and number of photos.
         mapper: "incremental" places one photo after the other, "global" all at once.
-        camera_model: COLMAP's name of the camera model to fit, one of `CAMERA_MODELS`. "auto" fits OPENCV, and a model
-            with one focal length if the two of that are implausible.
+        camera_model: COLMAP's name of the camera model to fit, one of `CAMERA_MODELS`. "auto" fits OPENCV, and
+            SIMPLE_RADIAL if that places few photos or gives implausible focal lengths.
         single_camera: fit one camera to all photos. None: do so if they have the same size and EXIF camera.
         max_size: longest side in pixels of the scene's images and for feature extraction. None keeps the photos' size.
         masks: folder with a mask for each photo, see `masks.find_masks`. None takes those that transparent pixels of
@@ -149,7 +156,7 @@ def prepare_scene(
         "--frames": frames,
         "pycolmap": pycolmap.__version__,
     }
-    with one_line_errors(out):
+    with one_line_errors(out), _said_on_interruption(out):
         with _opened_work(out / WORK, settings, overwrite):
             job = _Job(out / WORK, found, matcher, mapper, camera_model, max_size, progress)
             _make_photos(job, frames)
@@ -196,7 +203,7 @@ class _Job:
             return self.asked_matcher
         if self.found.clip is not None:
             return "sequential"
-        return "retrieval" if len(self.names) > RETRIEVAL_FROM else "exhaustive"
+        return "retrieval" if len(self.names) > RETRIEVAL_FROM and HAS_VOCABULARY else "exhaustive"
 
     @property
     def camera_model(self) -> str:
@@ -225,9 +232,13 @@ def _check_arguments(
 ) -> None:
     if matcher not in MATCHERS:
         raise UserInputError(f"--matcher {matcher!r}: expected {', '.join(MATCHERS[:-1])} or {MATCHERS[-1]}")
+    if matcher == "retrieval" and not HAS_VOCABULARY:
+        raise UserInputError(
+            f"--matcher retrieval: pycolmap {pycolmap.__version__} has none; upgrade it to 4.2 or newer"
+        )
     if mapper not in MAPPERS:
         raise UserInputError(f"--mapper {mapper!r}: expected {' or '.join(MAPPERS)}")
-    if mapper == "global" and not hasattr(pycolmap, "global_mapping"):
+    if mapper == "global" and not HAS_GLOBAL:
         raise UserInputError(
             f"--mapper global: pycolmap {pycolmap.__version__} has none; leave it out or upgrade pycolmap"
         )
@@ -291,7 +302,7 @@ def _make_masks(job: _Job, given: Path | None) -> None:
         size = image_size(photo)
         mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
         if mask is not None:
-            write_image(partial / f"{name}.png", mask.float().expand(3, -1, -1))
+            write_mask(partial / f"{name}.png", mask)
         return mask is not None
 
     if sum(_each_photo(job, "Reading masks", make, names)):
@@ -332,6 +343,16 @@ def _one_camera(job: _Job, sizes: dict[str, tuple[int, int]], asked: bool | None
 def _camera_words(counted: tuple[tuple[Any, ...], int]) -> str:
     (width, height, *exif), count = counted
     return printable(f"{count} of {' '.join(filter(None, [f'{width}x{height}', *exif[:2]]))}")
+
+
+@contextmanager
+def _said_on_interruption(out: Path) -> Iterator[None]:
+    """Tell that the same command continues."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        logger.info("%s: the finished steps are kept; repeat the command to continue", out)
+        raise
 
 
 @contextmanager
@@ -377,12 +398,18 @@ def _find_features(job: _Job, single_camera: bool) -> None:
 
 def _match_pairs(job: _Job) -> None:
     count = len(job.names)
+    loops = -(-count // LOOP_EVERY) if count >= LOOP_FROM and HAS_VOCABULARY else 0
     total = {
         "exhaustive": count * (count - 1) // 2,
-        "sequential": _neighbour_pairs(count),
+        "sequential": _neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
         "retrieval": count * min(SIMILAR, count - 1),  # at most: many pairs are found from both sides
     }[job.matcher]
-    options = {"matcher": job.matcher, "similar": SIMILAR, "tree": str((job.work / "tree.bin").absolute())}
+    options = {
+        "matcher": job.matcher,
+        "similar": SIMILAR if job.matcher == "retrieval" else LOOP_SIMILAR,
+        "every": LOOP_EVERY if loops else 0,
+        "tree": str((job.work / "tree.bin").absolute()),
+    }
     _run_step(job, "Matching pairs", "pairs", total, "pairs", options, lambda: _rows(job, "two_view_geometries"))
 
 
@@ -394,35 +421,57 @@ def _neighbour_pairs(count: int) -> int:
 def _place_cameras(job: _Job) -> list[pycolmap.Reconstruction]:
     """Recover the models and return them, the one with most photos first.
 
-    If the default camera model gives focal lengths that no lens has, place the cameras again with one focal length.
+    If the default camera model places few photos or gives focal lengths that no lens has, place the cameras again with
+    a simpler one.
 
     Raises:
         SceneError: no photo could be placed.
     """
     models = _map(job, "Placing cameras", job.models)
-    if not models or models[0].num_reg_images() < 2:
+    if (doubt := _doubt(job, models)) is not None:
+        if job.asked_model != AUTO:
+            logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.asked_model)
+        else:
+            models = _placed_again(job, models, doubt)
+    if _placed(models) < 2:
         raise SceneError(
             f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of a static "
             "scene that overlap strongly, each taken a step aside from the last"
         )
-    if (apart := _focal_difference(models[0])) <= SQUARE:
-        return models
-    found = f"the focal lengths along x and y differ by {apart:.0%}, which no usual lens does"
-    if job.asked_model != AUTO:
-        logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", found, job.asked_model)
-        return models
-    logger.info("%s; placing the cameras again with one focal length", found)
-    title = "Placing again"
-    again = _map(job, title, job.work / "models_one_focal", ONE_FOCAL_MODEL)
-    if again and again[0].num_reg_images() >= models[0].num_reg_images():
-        return again
-    placed = again[0].num_reg_images() if again else 0
-    logger.warning(
-        "with one focal length only %d of %d photos could be placed; %s: look at the result with care, or take more "
-        "photos from other heights and distances",
-        *(placed, models[0].num_reg_images(), found),
-    )
     return models
+
+
+def _placed_again(job: _Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
+    """Return the best models of doubtful ones, those of a simpler lens, and if few are placed, of the other mapper."""
+    logger.info("%s; placing the cameras again with a simpler lens", doubt)
+    again = _map(job, "Placing again", job.work / "models_simple", SIMPLE_MODEL)
+    if _placed(again) >= _placed(models):
+        models = again
+    if _placed(models) < FEW * len(job.names) and job.mapper == "incremental" and HAS_GLOBAL:
+        logger.info("only %d photos could be placed; placing all at once (--mapper global)", _placed(models))
+        whole = _map(job, "Placing all", job.work / "models_global", SIMPLE_MODEL, mapper="global")
+        return whole if _placed(whole) > _placed(models) else models
+    if models is not again:
+        logger.warning(
+            "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or take more "
+            "photos from other heights and distances",
+            *(_placed(again), _placed(models), doubt),
+        )
+    return models
+
+
+def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:
+    """Return the number of photos in the largest model."""
+    return models[0].num_reg_images() if models else 0
+
+
+def _doubt(job: _Job, models: Sequence[pycolmap.Reconstruction]) -> str | None:
+    """Return why the models may be wrong because the lens was not found; None if nothing says so."""
+    if _placed(models) < FEW * len(job.names):
+        return f"only {_placed(models)} of {len(job.names)} photos could be placed"
+    if (apart := _focal_difference(models[0])) > SQUARE:
+        return f"the focal lengths along x and y differ by {apart:.0%}, which no usual lens does"
+    return None
 
 
 def _focal_difference(model: pycolmap.Reconstruction) -> float:
@@ -432,8 +481,17 @@ def _focal_difference(model: pycolmap.Reconstruction) -> float:
     return max(abs(camera.focal_length_x / camera.focal_length_y - 1.0) for camera in cameras)
 
 
-def _map(job: _Job, title: str, folder: Path, model: str | None = None) -> list[pycolmap.Reconstruction]:
-    """Recover models into a folder, unless it is there, and return them; `model` replaces the camera model."""
+def _map(
+    job: _Job, title: str, folder: Path, model: str | None = None, mapper: str | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Recover models into a folder, unless it is there, and return them.
+
+    Args:
+        job: the job.
+        title: of the progress bar.
+        folder: of the models.
+        model, mapper: replace the job's.
+    """
     if not folder.is_dir():
         unfinished, placed = folder.with_suffix(".partial"), job.work / "placed"
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -443,10 +501,10 @@ def _map(job: _Job, title: str, folder: Path, model: str | None = None) -> list[
             "photos": str(job.photos.absolute()),
             "models": str(unfinished),
             "placed": str(placed),
-            "mapper": job.mapper,
+            "mapper": mapper or job.mapper,
         }
         if model is not None:
-            other = job.work / "one_focal.db"
+            other = job.work / "simple.db"
             shutil.copyfile(job.database, other)
             options |= {"database": str(other.absolute()), "camera_model": model}
         _run_step(job, title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
@@ -494,7 +552,7 @@ def _write_scene(job: _Job, model: pycolmap.Reconstruction) -> None:
             return
         file = job.masks / f"{image.name}.png"
         mask = read_image(file, size=size) if file.is_file() else torch.ones(3, size[1], size[0])
-        write_image(job.scene / MASKS / f"{target}.png", (undistort(mask, lens) > 0.5).float())
+        write_mask(job.scene / MASKS / f"{target}.png", undistort(mask, lens)[:1] > 0.5)
 
     _each_photo(job, "Undistorting", write, images)
     for image in images:

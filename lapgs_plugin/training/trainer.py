@@ -30,7 +30,7 @@ from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -123,6 +123,9 @@ def warm_up(
     rendered = [result.image, render_image(rasterizer, model.field, camera, black)]
     if residuals:
         rendered.append(upsample_add(Pyramid(), coarse.to(target_types[-1]), rendered[1]))
+    if joint:
+        below = torch.zeros(8, 8, 3, device=device, requires_grad=True).permute(2, 0, 1)  # interleaved as renders are
+        rendered.append(upsample_add(Pyramid(), below, rendered[1]))
     targets = [torch.zeros(3, 16, 16, dtype=each, device=device) for each in target_types]
     losses = [photometric_loss(image, target) for image in rendered for target in targets]
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
@@ -134,9 +137,6 @@ def warm_up(
         model.step(0.0, 1, scale=StepScale.of(2))
     if on_gpu:
         densification_statistics.triton_works()
-    if joint:
-        below = upsample(Pyramid(), coarse.requires_grad_(), (16, 16))
-        below.square().sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
 @dataclass

@@ -22,6 +22,7 @@ from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 from lapgs_plugin.checkouts.script import loaded_script
+from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rendering.run import run_renderer, run_scene
@@ -56,15 +57,17 @@ class Stub:
         name: its folder.
         stand_in: variant of the rasterizer that it runs with.
         options: options that its tests always pass.
+        file: its training script, relative to its folder.
     """
 
     name: str
     stand_in: str
     options: tuple[Any, ...] = ()
+    file: str = "train.py"
 
     @property
     def script(self) -> Path:
-        return CHECKOUTS / self.name / "train.py"
+        return CHECKOUTS / self.name / self.file
 
 
 STUBS = {
@@ -76,6 +79,34 @@ STUBS = {
     )
 }
 NAMES = tuple(STUBS)
+
+FORKS = {
+    stub.name: stub
+    for stub in (
+        Stub(
+            "dash",
+            "graphdeco-aa",
+            ("--densify_mode", "freq", "--resolution_mode", "freq", "--disable_viewer"),
+            "train_dash.py",
+        ),
+        Stub("speedy", "speedy-splat", ("--prune_from_iter", 30, "--prune_interval", 15, "--prune_until_iter", 90)),
+        Stub(
+            "mini",
+            "mini-splatting",
+            ("--imp_metric", "indoor", "--simp_iteration1", 60, "--simp_iteration2", 75, "--num_depth", 600),
+            "ms/train.py",
+        ),
+        Stub(
+            "efficient",
+            "efficientgs",
+            (
+                *("--oneupSHdegree_from_iter", 62, "--oneupSHdegree_interval", 3, "--use_sparse_shs"),
+                *("--prune_by_max_weight", "--prune_way", "p4"),
+            ),
+        ),
+    )
+}
+"""Forks whose adapters have a policy of their own."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +187,7 @@ def loaded(
         cuda_on_cpu(stub.stand_in if stand_in is None else stand_in),
         loaded_script(script, arguments(stub, scene, folder, more)) as definitions,
     ):
-        yield adapter_class(script.parent)(definitions)
+        yield adapter_class(CheckoutSource.read(script).root)(definitions)
 
 
 def drive(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,6 +28,8 @@ from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
+    CHECKOUTS,
+    KINDS,
     NAMES,
     STUBS,
     THIRDS,
@@ -104,6 +107,13 @@ def watch(adapter: Any, seen: Seen) -> None:
 
     model.update_learning_rate = update_learning_rate
     renderer.GaussianRasterizer = make_rasterizer
+
+
+def without(kind: type, name: str) -> None:
+    """Take a method away from a class and its bases, which a test has loaded for itself."""
+    for each in kind.__mro__:
+        if name in vars(each):
+            delattr(each, name)
 
 
 def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = False, resume: bool = False) -> Seen:
@@ -233,9 +243,54 @@ def test_a_script_that_cannot_start_in_the_middle_says_so(scene: Path, tmp_path:
     with pytest.raises(KeyboardInterrupt):
         run_watched("graphdeco", scene, folder, stop=True)
     with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder) as adapter:
-        del adapter.train.GaussianModel.restore
+        without(adapter.profile.model, "restore")
         with pytest.raises(UserInputError, match=r"--resume: training.* of train.py continues from no checkpoint"):
             drive(adapter, resume=True, **THIRDS)
+
+
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+    """The loop leaves out the last step, and its densification replaces positions between a step and the next."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text = script.read_text(encoding="utf-8")
+    call = "gaussians.update_learning_rate(iteration)"
+    assert text.count(call) == 1
+    script.write_text(text.replace(call, "pass"), encoding="utf-8")
+    contexts: list[tuple[int, int]] = []
+
+    class Noting(StageHook):
+        def before_render(self, context: StageContext) -> None:
+            contexts.append((context.stage.level, context.iteration))
+
+    folder = tmp_path / "run"
+    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, script=script) as adapter:
+        without(adapter.profile.model, "update_learning_rate")
+        drive(adapter, hooks=(Noting(),), hierarchy=hierarchy, **THIRDS)
+    archive = RunArchive.open(folder)
+    assert [record.image_size for record in archive.manifest.records] == [(32, 24), (64, 48)]
+    # A call's first iteration begins with its first step, after its render.
+    assert contexts[:30] == [(1, 0), *((1, i) for i in range(2, 31))]
+    assert [level for level, _ in contexts[30:]] == [0] * 60
+
+
+def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The checkout's own error stays; a line before it says what is different in one call."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text, loop = script.read_text(encoding="utf-8"), "    for iteration in range(first_iter, opt.iterations + 1):\n"
+    keeps = "    view = scene.getTrainCameras()[0]\n    kept = view.original_image\n"
+    script.write_text(text.replace(loop, f"{keeps}{loop}        kept + view.original_image\n"), encoding="utf-8")
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", script=script) as adapter,
+        pytest.raises(RuntimeError, match="size of tensor"),
+    ):
+        drive(adapter, **THIRDS)
+    assert "failed 1 iterations after its views got the size of level 0" in caplog.text
+    assert RunArchive.open(tmp_path / "run").available_levels == (1,)
 
 
 def test_a_loop_that_ends_early_says_where(scene: Path, tmp_path: Path) -> None:

@@ -166,5 +166,5 @@ def test_on_a_gpu_a_script_of_no_known_checkout_runs_as_it_is(
     command = typer.main.get_command(app)
     command(["run", "--off", str(script), "-s", "scene"], standalone_mode=False)
     assert capsys.readouterr().out == "['-s', 'scene']\n"
-    with pytest.raises(UserInputError, match="not the root of a checkout"):
+    with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout"):
         command(["run", str(script), "-s", "scene"], standalone_mode=False)

@@ -10,6 +10,9 @@ import sys
 import pytest
 import torch
 
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import FEWEST_PIXELS, SWITCH, our_kernels_blend
+
 CHECKS = """
 import torch
 from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward, blend_forward
@@ -83,14 +86,14 @@ check([Shape(8, 8, 4, 1)], 2, 7, 5, 21, True, 1e-5)  # worst seen 1.6e-6
 check([Shape()], 1, 60, 5, 21, False, 2e-5)  # worst seen 4.7e-6
 if DEVICE == "cuda":
     shapes = [Shape(*each) for each in ((8, 8, 4, 2), (8, 4, 4, 4), (8, 4, 4, 2), (16, 4, 2, 4), (16, 16, 4, 1, 2))]
-    # An alpha that is FAINTEST up to rounding may count in one of both; an H200 has 1.9e-6.
+    # An alpha that is FAINTEST up to rounding may count in one of both; an H200 has 4.2e-6.
     check(shapes, 2, 100, 37, 50, True, 1e-3)
     check(shapes, 1, 500, 21, 35, False, 1e-3)
 
     from lapgs_plugin.rasterizers.gsplat.blend_gradients import triton_works
     found = triton_works.difference(torch.device(DEVICE))
     print("from gsplat", found)
-    assert found < 1e-3  # worst seen 6.4e-5, of gradients on an H200
+    assert found < 1e-3  # worst seen 3.4e-5, on an H200
 """
 
 
@@ -110,3 +113,23 @@ def test_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_compiled() -> None:
     run_checks("cuda")
+
+
+def test_another_choice_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "cuda")
+    with pytest.raises(UserInputError, match=f"{SWITCH}=cuda: expected triton or gsplat"):
+        our_kernels_blend(torch.zeros(1, 3), 1_000_000)
+
+
+def test_gsplat_blends_where_there_is_no_cuda_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(SWITCH, raising=False)
+    assert not our_kernels_blend(torch.zeros(1, 3), 1_000_000)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_our_kernels_blend_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(SWITCH, raising=False)
+    means = torch.zeros(1, 3, device="cuda")
+    assert our_kernels_blend(means, FEWEST_PIXELS)
+    assert not our_kernels_blend(means, FEWEST_PIXELS - 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from lapgs_plugin.cli.app import app
-from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr, ssim
 from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
 from lapgs_plugin.hierarchy.plan import Stage
@@ -23,6 +23,7 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import StageContext, SupervisionLoss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes import load_scene
@@ -145,6 +146,16 @@ def test_metrics_count_the_inside() -> None:
     assert ssim(image, target, everywhere) == pytest.approx(ssim(image, target), abs=1e-5)
 
 
+def test_a_run_whose_masks_are_gone_is_one_line(plain: Path, tmp_path: Path) -> None:
+    reference = SceneReference(str(plain), "full", False, (0.0, 0.0, 0.0), "colmap", masks="gone")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **TrainSettings(iterations=10).for_manifest())
+    with (
+        RunArchive.create(tmp_path / "run", manifest) as archive,
+        pytest.raises(RunFolderError, match=r"trained with the masks in .*gone, which are not there any more"),
+    ):
+        run_scene(archive)
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "sample"
@@ -164,8 +175,10 @@ def _write_masks(scene: Path, spelling: str, scale: float = 1.0, folder: str = "
         write_image(scene / folder / name, _mask().float().expand(3, -1, -1) * scale)
 
 
-@pytest.mark.parametrize("spelling", ["{name}.png", "{stem}.png", "{stem}_mask.png"])
-@pytest.mark.parametrize("scale", [1.0, 1 / 255])
+@pytest.mark.parametrize(
+    ("spelling", "scale"),
+    [("{name}.png", 1), ("{stem}.png", 1 / 255), ("{stem}_mask.png", 1), ("{stem}.JPG", 1)],  # some write 0 and 1
+)
 def test_masks_are_found_by_the_names_that_people_use(spelling: str, scale: float, scene: Path) -> None:
     assert all(view.mask is None for view in load_scene(scene, progress=False).train)
     _write_masks(scene, spelling, scale)

@@ -239,30 +239,41 @@ def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(
-    ("asked", "again", "chosen", "message"),
+    ("asked", "first", "again", "chosen", "message"),
     [
-        ("auto", 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
-        ("auto", 5, "first", "with one focal length only 5 of 8 photos could be placed"),
-        ("OPENCV", 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
+        ("auto", (1090, 8), 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
+        ("auto", (1090, 8), 5, "first", "with a simpler lens only 5 of 8 photos could be placed"),
+        ("auto", (1000, 2), 8, "second", "only 2 of 8 photos could be placed; placing the cameras again"),
+        ("auto", (1000, 2), 3, "global", "only 3 photos could be placed; placing all at once"),
+        ("auto", (1000, 7), 8, "first", ""),
+        ("OPENCV", (1090, 8), 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
     ],
 )
-def test_implausible_focal_lengths_are_told_and_tried_again(
+def test_doubtful_lenses_are_told_and_tried_again(
     asked: str,
+    first: tuple[float, int],
     again: int,
     chosen: str,
     message: str,
-    noise: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    models = {None: _model(1090, 1000, 8), "RADIAL": _model(1000, 1000, again)}
-    monkeypatch.setattr(prepare_module, "_map", lambda job, title, folder, model=None: [models[model]])
-    job = prepare_module._Job(tmp_path, find_photos(noise), "auto", "incremental", asked, None, False)
+    models = {"first": _model(first[0], 1000, first[1]), "second": _model(1000, 1000, again)}
+    models["global"] = _model(1000, 1000, 8)
+
+    def mapped(job: object, title: str, folder: Path, model: str | None = None, mapper: str = "") -> list[object]:
+        assert model in (None, "SIMPLE_RADIAL")
+        return [models[mapper or ("first" if model is None else "second")]]
+
+    monkeypatch.setattr(prepare_module, "_map", mapped)
+    found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
+    job = prepare_module._Job(tmp_path, found, "auto", "incremental", asked, None, False)
     with caplog.at_level(logging.INFO):
         (best,) = prepare_module._place_cameras(job)
-    assert best is models[None if chosen == "first" else "RADIAL"]
+    assert best is models[chosen]
     assert message in caplog.text
+    assert bool(message) == bool(caplog.text)
 
 
 def test_cameras_of_a_database_get_one_focal_length(tmp_path: Path) -> None:

@@ -202,7 +202,11 @@ def test_points_project_onto_their_features_in_the_undistorted_images(prepared: 
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(
-    photos: Path, prepared: tuple[Path, PrepareResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: Path,
+    prepared: tuple[Path, PrepareResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     out = tmp_path / "scene"
     rows = prepare_module._rows
@@ -216,8 +220,9 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     monkeypatch.setattr(prepare_module, "POLL_SECONDS", 0.02)
     monkeypatch.setattr(prepare_module, "_rows", interrupted_rows)
     for interrupted in ("descriptors", "two_view_geometries"):
-        with pytest.raises(KeyboardInterrupt):
+        with caplog.at_level(logging.INFO), pytest.raises(KeyboardInterrupt):
             prepare_scene(photos, out, progress=True)
+        assert "the finished steps are kept; repeat the command to continue" in caplog.text
         assert [entry.name for entry in out.iterdir()] == [".prepare"]
         with sqlite3.connect(out / ".prepare" / "database.db") as database:
             assert database.execute(f"SELECT COUNT(*) FROM {interrupted}").fetchone()[0] >= 3

@@ -141,6 +141,8 @@ def test_events_are_listed_with_the_values_of_their_options() -> None:
     ]
     assert "line 26: iteration == GLOBAL.late (once)" in lines
     assert not any("print" in line or "close" in line for line in lines)
+    of_no_list = Schedule(definition).describe({"testing_iterations": []})
+    assert len(of_no_list) == len(lines) - 1, "nothing is reported"
 
 
 def test_functions_without_a_loop_have_no_events() -> None:

@@ -315,9 +315,9 @@ def test_some_tile_always_has_a_gaussian_and_the_image_is_the_oracles(
 def test_settings_that_are_not_known_are_refused_by_name() -> None:
     with install("graphdeco") as modules:
         module = modules["diff_gaussian_rasterization"]
-        fields = [*module.GaussianRasterizationSettings._fields, "kernel_size"]
+        fields = [*module.GaussianRasterizationSettings._fields, "glow"]
         module.GaussianRasterizationSettings = type("Settings", (), {"_fields": tuple(fields)})
-        with pytest.raises(UserInputError, match="its settings have kernel_size"):
+        with pytest.raises(UserInputError, match="its settings have glow"):
             CudaExtension("diff_gaussian_rasterization", device="cpu")
 
 

@@ -94,6 +94,8 @@ for shape, kind, interleaved in (
 broken = prediction.detach().clone()
 broken[1, 0, 0] = torch.nan
 assert photometric_loss_triton(broken, stored, 0.2).isnan()
+cut = torch.rand(3, 4, 6)[:, 1:, 1:]  # with gaps in memory
+close(photometric_loss_triton(cut, cut.clone(), 0.2), torch.zeros(()))
 
 norms, counts = torch.rand(n), torch.rand(n)
 expected = norms + torch.where(shown, (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1), 0.0), counts + shown

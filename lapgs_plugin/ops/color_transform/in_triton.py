@@ -34,7 +34,7 @@ def _apply(
     for channel in tl.static_range(3):
         row = transform + view * 12 + channel * 4
         value = tl.load(row) * red + tl.load(row + 1) * green + tl.load(row + 2) * blue + tl.load(row + 3)
-        tl.store(out + (view * 3 + channel) * n + places, value, here)
+        tl.store(out + view * by_view + channel * by_channel + places * by_pixel, value, here)
 
 
 @triton.jit(do_not_specialize=SIZES)  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -61,20 +61,21 @@ def _gradients(
         tl.atomic_add(by_transform + row + 1, tl.sum(gradient * green))
         tl.atomic_add(by_transform + row + 2, tl.sum(gradient * blue))
         tl.atomic_add(by_transform + row + 3, tl.sum(gradient))
-    to = by_image + view * 3 * n + places
+    to = by_image + view * by_view + places * by_pixel
     tl.store(to, by_red, here)
-    tl.store(to + n, by_green, here)
-    tl.store(to + 2 * n, by_blue, here)
+    tl.store(to + by_channel, by_green, here)
+    tl.store(to + 2 * by_channel, by_blue, here)
 
 
 class _Transformed(torch.autograd.Function):
-    """Map images (b, 3, n) of any strides and contiguous transforms (b, 3, 4) to images (b, 3, n)."""
+    """Map images (b, 3, n) without gaps and contiguous transforms (b, 3, 4) to images (b, 3, n) with their strides."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, transform: Tensor) -> Tensor:
         ctx.save_for_backward(image, transform)
         views, _, n = image.shape
-        out = image.new_empty(views, 3, n)
+        out = torch.empty_like(image)
+        assert out.stride() == image.stride(), "images without gaps"
         launch: Any = _apply[(triton.cdiv(n, BLOCK), views)]
         launch(image, transform, out, n, *image.stride(), block=BLOCK)
         return out
@@ -84,14 +85,16 @@ class _Transformed(torch.autograd.Function):
     def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor, Tensor]:
         image, transform = ctx.saved_tensors
         views, _, n = image.shape
-        by_image, by_transform = image.new_empty(views, 3, n), torch.zeros_like(transform)
+        by_image, by_transform = torch.empty_like(image), torch.zeros_like(transform)
         launch: Any = _gradients[(triton.cdiv(n, BLOCK), views)]
         launch(image, transform, by_out, by_image, by_transform, n, *image.stride(), *by_out.stride(), block=BLOCK)
         return by_image, by_transform
 
 
 def transform_colors_triton(image: Tensor, transform: Tensor) -> Tensor:
-    """Do `transform_colors` for float32 images on a CUDA device, with any strides."""
+    """Do `transform_colors` for float32 images on a CUDA device, whose strides the result has."""
     pixels = image.flatten(-2).reshape(-1, 3, image.shape[-2] * image.shape[-1])
+    if not (pixels.is_contiguous() or pixels.mT.is_contiguous()):
+        pixels = pixels.contiguous()
     out: Tensor = _Transformed.apply(pixels, transform.reshape(-1, 3, 4).contiguous())  # type: ignore[no-untyped-call]  # torch's
     return out.view(image.shape)

@@ -245,6 +245,8 @@ def photometric_loss_triton(prediction: Tensor, target: Tensor, ssim_weight: flo
         target: of that shape; float32, float16, or uint8 levels k of k / 255.
         ssim_weight: lambda.
     """
-    images = as_batch(prediction), as_batch(target)
-    loss: Tensor = _PhotometricLoss.apply(*images, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
+    image = as_batch(prediction)
+    if not (image.is_contiguous() or image.movedim(1, -1).is_contiguous()):
+        image = image.contiguous()  # maps and gradient have the strides of the image
+    loss: Tensor = _PhotometricLoss.apply(image, as_batch(target), ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss

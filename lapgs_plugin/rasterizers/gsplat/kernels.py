@@ -147,13 +147,19 @@ def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _view_directions(means: tl.tensor, centre: tl.tensor, rows: tl.tensor, there: tl.tensor) -> tl.tensor:
-    """Return unit directions x, y, z from the camera's centre."""
-    x = tl.load(means + 3 * rows, there, 1.0) - tl.load(centre)
-    y = tl.load(means + 3 * rows + 1, there, 1.0) - tl.load(centre + 1)
-    z = tl.load(means + 3 * rows + 2, there, 1.0) - tl.load(centre + 2)
-    inverse = 1.0 / tl.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse
+def _view_directions(mean: tl.tensor, centre: tl.tensor, channel: tl.tensor, there: tl.tensor) -> tl.tensor:
+    """Return unit directions x, y, z (g, 1) from the camera's centre, and one over the distances.
+
+    Means are (g, 4), the last channel without meaning. Every load is of neighbouring channels, because Triton would
+    spread Gaussians alone over threads in another way, and each harmonic would go from one thread to another.
+    """
+    away = mean - tl.load(centre + channel, channel < 3, 0.0)
+    away = tl.where(there & (channel < 3), away, 1.0)
+    inverse = 1.0 / tl.sqrt(tl.sum(tl.where(channel < 3, away * away, 0.0), 1))[:, None]
+    x = tl.sum(tl.where(channel == 0, away, 0.0), 1)[:, None] * inverse
+    y = tl.sum(tl.where(channel == 1, away, 0.0), 1)[:, None] * inverse
+    z = tl.sum(tl.where(channel == 2, away, 0.0), 1)[:, None] * inverse
+    return x, y, z, inverse
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -162,7 +168,8 @@ def _block_colors(
     active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return colours (g, 4) of a block; the last channel is meaningless."""
-    x, y, z = _view_directions(means, centre, rows, visible)
+    mean = tl.load(means + 3 * rows + channel, visible & (channel < 3), 0.0)
+    x, y, z, _ = _view_directions(mean, centre, channel, visible)
     color = tl.zeros((block, 4), tl.float32)
     for k in tl.static_range(coefficients):
         wanted = visible & (channel < 3) & (k < active)
@@ -254,8 +261,7 @@ def _gradient_kernel(
     n: tl.tensor, cameras: int, active: int, signed: int,
     coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers. Every
-    # load is of neighbouring channels, because Triton would spread Gaussians alone over threads in another way.
+    # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers.
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
     here, in_channel = rows < n, (rows < n) & (channel < 3)
@@ -274,12 +280,7 @@ def _gradient_kernel(
     while camera < cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
         visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
-        away = mean - tl.load(centre + 3 * camera + channel, channel < 3, 0.0)
-        away = tl.where(in_channel & visible, away, 1.0)  # (g, 4), the last without meaning
-        inverse = tl.rsqrt(tl.sum(tl.where(channel < 3, away * away, 0.0), 1))[:, None]
-        x = tl.sum(tl.where(channel == 0, away, 0.0), 1)[:, None] * inverse
-        y = tl.sum(tl.where(channel == 1, away, 0.0), 1)[:, None] * inverse
-        z = tl.sum(tl.where(channel == 2, away, 0.0), 1)[:, None] * inverse
+        x, y, z, inverse = _view_directions(mean, centre + 3 * camera, channel, here & visible)
         flow = tl.load(by_color + 3 * seen + channel, in_channel & visible, 0.0)  # (g, 4)
         color = tl.load(colors + 3 * seen + channel, in_channel & visible, 0.0)
         flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)

@@ -19,8 +19,6 @@ import pycolmap
 
 SEED = 0
 
-LOOP_FROM = 40
-"""Photos from which on sequential matching also looks for places that the camera came back to."""
 MOST_DESCRIPTORS, DESCRIPTORS_A_WORD = 500_000, 50
 FEWEST_WORDS, MOST_WORDS = 64, 8192
 EMBEDDING = 64
@@ -64,7 +62,11 @@ def _find_features(job: dict[str, Any]) -> None:
 
 
 def _match_pairs(job: dict[str, Any]) -> None:
-    """Match features. Keys: database, matcher, similar (photos for each by retrieval), tree (a file to write)."""
+    """Match features.
+
+    Keys: database, matcher, similar (photos to compare with by looks), every (distance of photos that sequential
+    matching compares so, 0 for none), tree (a file to write).
+    """
     matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
@@ -77,11 +79,10 @@ def _match_pairs(job: dict[str, Any]) -> None:
         pycolmap.match_vocabtree(job["database"], matching, alike, verification)
     else:
         neighbours = pycolmap.SequentialPairingOptions()
-        with pycolmap.Database.open(job["database"]) as database:
-            returns = database.num_images() >= LOOP_FROM and hasattr(pycolmap.VisualIndex, "build")
-        if returns:
+        if job["every"]:
             _make_tree(job["database"], job["tree"])
             neighbours.loop_detection, neighbours.vocab_tree_path = True, job["tree"]
+            neighbours.loop_detection_period, neighbours.loop_detection_num_images = job["every"], job["similar"]
         pycolmap.match_sequential(job["database"], matching, neighbours, verification)
 
 

@@ -1,0 +1,92 @@
+"""Drive DashGaussian: renders that grow with training, and a budget of Gaussians that follows their size.
+
+Its scheduler is made from the images and Gaussians that training starts with. A stage that starts with inherited
+Gaussians would render smaller than the level below it, and grow to six times what it inherited.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.checkouts.attachment import Replacement
+
+SCHEDULER = "utils.schedule_utils"
+"""Module of its scheduler, which only `train_dash.py` imports."""
+
+
+class Adapter(generic.Adapter):
+    """Drive a DashGaussian checkout, whose plain `train.py` needs nothing of this.
+
+    A residual is rendered at its level's size. It starts with as many Gaussians as it may have, and the budget grows by
+    those that qualify for densification, as it does in the checkout. Nested levels keep the checkout's own schedule.
+    """
+
+    info = BackboneInfo(
+        name="dashgaussian",
+        title="DashGaussian",
+        rasterizer="diff_gaussian_rasterization",
+        stand_in="graphdeco-aa",
+        own_files=("train_dash.py", "utils/schedule_utils.py"),
+        fork_of=("graphdeco",),
+    )
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return all((folder / name).is_file() for name in cls.info.own_files)
+
+    def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
+        changed = super().stage_call(call, window, model_path)
+        if window.start > 0 and hasattr(changed.pipe, "resolution_mode"):
+            # Its learning rates wait for the renders to reach full size, which they have.
+            changed.pipe.resolution_mode = "const"
+        return changed
+
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        if SCHEDULER not in sys.modules:
+            return []
+        scheduler = sys.modules[SCHEDULER].TrainingScheduler
+        return [
+            Replacement(
+                scheduler,
+                "get_res_scale",
+                lambda original: _full_size_after_the_base(original, window_of),
+                ("self", "iteration"),
+                "training() when it densifies",
+            ),
+            Replacement(
+                scheduler,
+                "__init__",
+                lambda original: _budget_of_inherited(original, window_of),
+                ("self", "opt", "pipe", "gaussians"),
+                "training() at its start",
+            ),
+        ]
+
+
+def _full_size_after_the_base(
+    original: Callable[[Any, int], int], window_of: Callable[[], StageWindow | None]
+) -> Callable[[Any, int], int]:
+    def get_res_scale(self: Any, iteration: int) -> int:
+        window = window_of()
+        return original(self, iteration) if window is None or window.start == 0 else 1
+
+    return get_res_scale
+
+
+def _budget_of_inherited(
+    original: Callable[..., None], window_of: Callable[[], StageWindow | None]
+) -> Callable[..., None]:
+    """Start a field that inherits Gaussians with a budget of as many, and without the momentum of five times that."""
+
+    def __init__(self: Any, opt: Any, pipe: Any, gaussians: Any, *others: Any, **more: Any) -> None:
+        original(self, opt, pipe, gaussians, *others, **more)
+        window = window_of()
+        if window is not None and window.start > 0 and self.momentum != -1:  # -1: the user set the budget
+            self.momentum, self.max_n_gaussian = 0, self.init_n_gaussian
+
+    return __init__

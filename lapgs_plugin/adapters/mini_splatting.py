@@ -1,0 +1,112 @@
+"""Drive Mini-Splatting: in mid-training it replaces Gaussians by points at their depths, and keeps a sample of them.
+
+Both make a field anew from the images that it renders. That is right for a field that makes the whole image, and wrong
+for a residual, whose Gaussians come from the level below.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.checkouts.attachment import Replacement
+
+SIMPLIFICATIONS = ("simp_iteration1", "simp_iteration2")
+"""Arguments of its script: the iterations after which it simplifies."""
+
+SH_EVERY = 1000
+"""Iterations between two SH degrees."""
+
+
+class Adapter(generic.Adapter):
+    """Drive a Mini-Splatting checkout.
+
+    The base is simplified at its share of the run's iterations. A residual is neither simplified nor made anew, and
+    has SH from its start, which the checkout unlocks after simplification.
+    """
+
+    info = BackboneInfo(
+        name="mini_splatting",
+        title="Mini-Splatting",
+        rasterizer="diff_gaussian_rasterization_ms",
+        stand_in="mini-splatting",
+        own_files=("ms/train.py",),
+        fork_of=("graphdeco",),
+        unscaled=SIMPLIFICATIONS,
+    )
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return all((folder / name).is_file() for name in cls.info.own_files)
+
+    def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
+        self._degree = call.dataset.sh_degree
+        changed = super().stage_call(call, window, model_path)
+        if not hasattr(call.values.get("args"), SIMPLIFICATIONS[0]):
+            return changed  # gs/train.py is plain 3DGS
+        args = copy.copy(call.values["args"])
+        for name in SIMPLIFICATIONS:
+            never = window.stage.iterations + 1
+            setattr(args, name, never if window.start > 0 else window.scaled(getattr(args, name)))
+        return changed.changed(args=args)
+
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        def signed() -> bool:
+            window = window_of()
+            return window is not None and window.stage.signed
+
+        model = self.profile.model
+        return [
+            Replacement(
+                model, "reinitial_pts", lambda original: _unless(original, signed), ("self", "pts", "rgb"), "training()"
+            ),
+            Replacement(
+                model,
+                "create_from_pcd",
+                lambda original: self._with_sh(original, signed),
+                ("self", "pcd"),
+                "Scene, and fields that inherit",
+            ),
+            Replacement(
+                model,
+                "update_learning_rate",
+                lambda original: _unlocking_sh(original, signed),
+                ("self", "iteration"),
+                "training() at the start of every iteration",
+            ),
+        ]
+
+    def _with_sh(self, original: Callable[..., None], signed: Callable[[], bool]) -> Callable[..., None]:
+        """Give a residual all SH coefficients; the checkout makes its model without."""
+
+        def create_from_pcd(gaussians: Any, pcd: Any, *others: Any) -> None:
+            if signed():
+                gaussians.max_sh_degree = self._degree
+            original(gaussians, pcd, *others)
+
+        return create_from_pcd
+
+
+def _unless(original: Callable[..., None], signed: Callable[[], bool]) -> Callable[..., None]:
+    """Keep a residual's Gaussians where the checkout would make them anew."""
+
+    def reinitial_pts(gaussians: Any, pts: Any, rgb: Any) -> None:
+        if not signed():
+            original(gaussians, pts, rgb)
+
+    return reinitial_pts
+
+
+def _unlocking_sh(original: Callable[[Any, int], Any], signed: Callable[[], bool]) -> Callable[[Any, int], Any]:
+    """Unlock a residual's SH at the checkout's interval."""
+
+    def update_learning_rate(gaussians: Any, iteration: int) -> Any:
+        if signed() and iteration % SH_EVERY == 0:
+            gaussians.oneupSHdegree()
+        return original(gaussians, iteration)
+
+    return update_learning_rate

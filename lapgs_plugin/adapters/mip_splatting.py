@@ -1,0 +1,56 @@
+"""Drive Mip-Splatting: each Gaussian has a filter in space, which its render adds to scales and opacities."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall
+
+if TYPE_CHECKING:
+    from lapgs_plugin.fields.gaussian_field import GaussianField
+
+FILTER = "filter_3D"
+"""Attribute of its model: (n, 1) standard deviations."""
+
+
+class Adapter(generic.Adapter):
+    """Drive a Mip-Splatting checkout; its fields are archived with their filters applied."""
+
+    info = BackboneInfo(
+        name="mip_splatting",
+        title="Mip-Splatting",
+        rasterizer="diff_gaussian_rasterization",
+        stand_in="mip-splatting",
+        own_files=("create_fused_ply.py",),
+        fork_of=("graphdeco",),
+        raster_defaults={"kernel_size": 0.1},
+    )
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return all((folder / name).is_file() for name in ("train.py", *cls.info.own_files))
+
+    def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
+        import torch
+
+        field = super().snapshot(gaussians, signed)
+        if not hasattr(gaussians, FILTER):
+            return field
+        with torch.no_grad():
+            opacities = gaussians.get_opacity_with_3D_filter.squeeze(-1)
+            return field.with_parameters(
+                {
+                    "log_scales": torch.log(gaussians.get_scaling_with_3D_filter),
+                    "opacity_logits": torch.logit(opacities.clamp(1e-6, 1 - 1e-6)),
+                }
+            )
+
+    def new_model(self, call: TrainingCall) -> Any:
+        import torch
+
+        gaussians = super().new_model(call)
+        # Training computes the filters; archived fields have them applied.
+        setattr(gaussians, FILTER, torch.zeros(1, 1, device="cuda"))
+        return gaussians

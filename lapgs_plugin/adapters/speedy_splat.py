@@ -1,0 +1,53 @@
+"""Drive Speedy-Splat: it prunes at fixed intervals by how much each Gaussian changes the images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.adapters import generic
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow
+from lapgs_plugin.checkouts.attachment import Replacement
+
+
+class Adapter(generic.Adapter):
+    """Drive a Speedy-Splat checkout, whose scores must not reach finished fields that are trained jointly."""
+
+    info = BackboneInfo(
+        name="speedy_splat",
+        title="Speedy-Splat",
+        rasterizer="diff_gaussian_rasterization",
+        stand_in="speedy-splat",
+        own_files=("compute_scene_metrics.py",),
+        fork_of=("graphdeco",),
+        density_scores=("score_func",),
+    )
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return all((folder / name).is_file() for name in ("train.py", *cls.info.own_files))
+
+    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+        return [
+            Replacement(
+                self.train,
+                "score_func",
+                lambda original: self._scores_alone,
+                ("view", "gaussians", "pipeline", "background", "scores"),
+                "prune()",
+            )
+        ]
+
+    def _scores_alone(self, view: Any, gaussians: Any, pipeline: Any, background: Any, scores: Any) -> None:
+        """Add a view's scores to `scores` (n, 1), as the checkout does, with gradients by nothing else.
+
+        The checkout's backward pass would add gradients of this image to those of finished fields that are trained
+        jointly. Its own field's are lost either way: pruned parameters are new ones.
+        """
+        import torch
+
+        of_view = torch.zeros_like(scores, requires_grad=True)
+        image = self.train.render(view, gaussians, pipeline, background, scores=of_view)["render"]
+        (found,) = torch.autograd.grad(image.sum(), of_view)
+        scores += found

@@ -1,0 +1,117 @@
+"""Describe a checkout for `lapgs doctor CHECKOUT`, from its sources alone."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lapgs_plugin.errors import UserInputError
+
+if TYPE_CHECKING:
+    from lapgs_plugin.checkouts.source import CheckoutSource, RasterizerUse
+    from lapgs_plugin.environment.findings import Finding
+
+COLORS = {"shs", "colors_precomp"}
+"""Inputs of rasterizers by which a residual gets colours of both signs."""
+
+
+def describe(path: Path) -> dict[str, list[Finding]]:
+    """Return what `lapgs run` makes of a checkout, by section.
+
+    Args:
+        path: its root, its training script, or a folder of scripts in it.
+
+    Raises:
+        UserInputError: it is no 3DGS checkout; the line says what is missing.
+    """
+    from lapgs_plugin.adapters.registry import adapter_class
+    from lapgs_plugin.environment.findings import Finding
+
+    source = _source(path)
+    adapter = adapter_class(source.root)
+    parameters = ", ".join(argument.arg for argument in source.training.args.args)
+    return {
+        "Checkout": [
+            Finding("Root", "ok", str(source.root)),
+            Finding("Adapter", "ok", f"{adapter.info.title} (--backbone {adapter.info.name})"),
+            Finding("Training", "ok", f"{source.place(source.training)}: {source.training.name}({parameters})"),
+            Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
+        ],
+        "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [_no_rasterizer(source)],
+        "Packages": _packages(source),
+        "lapgs run": [*_kinds(source), _stand_in(source)],
+    }
+
+
+def _source(path: Path) -> CheckoutSource:
+    from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
+
+    if path.is_file():
+        return CheckoutSource.read(path)
+    scripts = training_scripts(path.absolute())
+    problem = UserInputError(f"{path} has no train*.py, expected the root of a 3DGS checkout, or its training script")
+    for script in scripts:
+        try:
+            return CheckoutSource.read(script)
+        except UserInputError as error:
+            problem = error
+    raise problem
+
+
+def _rasterizer(use: RasterizerUse) -> Finding:
+    from lapgs_plugin.environment.findings import Finding
+
+    inputs = ", ".join(sorted(use.inputs))
+    detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
+    if _installed(use.module):
+        return Finding(use.module, "ok", detail)
+    return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
+
+
+def _no_rasterizer(source: CheckoutSource) -> Finding:
+    from lapgs_plugin.environment.findings import Finding
+
+    return Finding("none", "problem", f"none of the {len(source.modules)} modules that the script imports uses one")
+
+
+def _packages(source: CheckoutSource) -> list[Finding]:
+    """Return packages that the script cannot do without and that are not installed."""
+    from lapgs_plugin.environment.findings import Finding
+
+    needed = {one.name.partition(".")[0]: one for one in reversed(source.externals) if not one.optional}
+    known = sys.stdlib_module_names | {module.partition(".")[0] for module in source.rasterizer_modules}
+    missing = {name: one for name, one in needed.items() if name not in known and not _installed(name)}
+    if not missing:
+        return [Finding("Imports", "ok", "all others are installed")]
+    return [Finding(name, "absent", f"{one.where} imports it; not installed") for name, one in sorted(missing.items())]
+
+
+def _kinds(source: CheckoutSource) -> list[Finding]:
+    from lapgs_plugin.environment.findings import Finding
+
+    inputs = frozenset[str]().union(*(use.inputs for use in source.rasterizers))
+    nested = Finding("nested", "ok", "one call of the checkout's own training; the dry run of `lapgs run` says more")
+    if inputs & COLORS:
+        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {' and '.join(sorted(inputs & COLORS))}")]
+    why = f"its rasterizer takes neither {' nor '.join(sorted(COLORS))}, by which a residual has colours of both signs"
+    return [nested, Finding("laplacian", "absent", why)]
+
+
+def _stand_in(source: CheckoutSource) -> Finding:
+    from lapgs_plugin.adapters.registry import adapter_class
+    from lapgs_plugin.environment.findings import Finding
+    from lapgs_plugin.errors import MissingExtraError
+
+    try:
+        return Finding("--device cpu", "ok", f"stand-in {adapter_class(source.root).stand_in_for(source.root, ())}")
+    except MissingExtraError as error:
+        return Finding("--device cpu", "absent", str(error))
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False

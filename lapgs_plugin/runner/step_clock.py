@@ -1,0 +1,54 @@
+"""Count iterations by optimizer steps, where the checkout's model is not told when an iteration begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+
+from lapgs_plugin.runner.active_stage import ActiveStage
+
+CLOCK = "update_learning_rate"
+"""Method of the family's models that loops call at the start of each iteration."""
+
+
+@contextmanager
+def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
+    """Begin an iteration after each step of the running stage's positions, unless the model has the method `CLOCK`.
+
+    The first begins before the first step. So the loop may leave out the step of the last iteration.
+
+    Args:
+        model: class of the Gaussians.
+        running: returns the running stage.
+    """
+    if hasattr(model, CLOCK):
+        yield
+        return
+
+    def stage_of(optimizer: Optimizer) -> ActiveStage | None:
+        stage = running()
+        if not isinstance(stage, ActiveStage) or stage.gaussians is None:
+            return None
+        positions = stage.gaussians._xyz
+        steps = any(each is positions for group in optimizer.param_groups for each in group["params"])
+        return stage if steps else None
+
+    def before(optimizer: Optimizer, *_: Any) -> None:
+        stage = stage_of(optimizer)
+        if stage is not None and stage.record.iteration == 0:
+            stage.iteration_begins(stage.gaussians)
+
+    def after(optimizer: Optimizer, *_: Any) -> None:
+        stage = stage_of(optimizer)
+        if stage is not None and stage.has_more:
+            stage.iteration_begins(stage.gaussians)
+
+    handles = register_optimizer_step_pre_hook(before), register_optimizer_step_post_hook(after)
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()

@@ -1,0 +1,5 @@
+"""Options."""
+
+from utils.plain_options import ModelParams, OptimizationParams, PipelineParams
+
+__all__ = ["ModelParams", "OptimizationParams", "PipelineParams"]

@@ -1,0 +1,144 @@
+"""What `lapgs run` and `lapgs doctor` find in a checkout's sources, and the lines for checkouts that do not fit."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+
+from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runner.installed_rasterizer import explain_import_error
+from tests.contract.stub_runs import CHECKOUTS, STUBS, loaded
+
+MODULE = "diff_gaussian_rasterization"
+OTHER = "diff_gaussian_rasterization_abs"
+
+
+@pytest.fixture
+def fork(tmp_path: Path) -> Path:
+    """Make a fork whose scripts are in a folder, and whose renderer imports another rasterizer when it is called."""
+    root = Path(shutil.copytree(CHECKOUTS / "graphdeco", tmp_path / "fork", ignore=shutil.ignore_patterns("__pyc*")))
+    (root / "ms").mkdir()
+    script = (root / "train.py").read_text(encoding="utf-8")
+    (root / "ms" / "train.py").write_text("import sys\nsys.path.append('..')\nimport open3d\n" + script)
+    (root / "train.py").unlink()
+    renderer = root / "gaussian_renderer" / "__init__.py"
+    text = renderer.read_text(encoding="utf-8")
+    line = f"from {MODULE} import GaussianRasterizationSettings, GaussianRasterizer\n"
+    assert line in text
+    head, tail = text.replace(line, "").split("    screenspace_points = ", 1)
+    inside = f"    import {MODULE}\n    from {OTHER} import GaussianRasterizationSettings, GaussianRasterizer as R\n"
+    tail = tail.replace("GaussianRasterizer(raster_settings", "R(raster_settings")
+    renderer.write_text(f"# {line}{head}{inside}    screenspace_points = {tail}", encoding="utf-8")
+    return root
+
+
+def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
+    source = CheckoutSource.read(fork / "ms" / "train.py")
+    assert source.root == fork
+    assert source.model[0] == "GaussianModel"
+    assert source.model[1].startswith("scene/gaussian_model.py:")
+    (use,) = source.rasterizers
+    assert (use.module, use.inside, use.functions, use.outputs) == (OTHER, True, ("render",), 3)
+    assert use.names == ("GaussianRasterizationSettings", "GaussianRasterizer")
+    assert {"antialiasing", "viewmatrix"} < use.settings
+    assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
+    with pytest.raises(
+        MissingExtraError, match=f"no CPU stand-in for {OTHER}, which gaussian_renderer/__init__.py:"
+    ) as e:
+        adapter_class(fork).stand_in_for(fork, ())
+    assert "\n" not in str(e.value)
+
+
+def test_a_rasterizer_that_is_not_installed_is_the_checkouts_own(fork: Path) -> None:
+    error = ModuleNotFoundError(f"No module named '{OTHER}'", name=OTHER)
+    script = fork / "ms" / "train.py"
+    on_gpu, on_cpu = (explain_import_error(error, script, on_cpu=on_cpu) for on_cpu in (False, True))
+    for line in map(str, (on_gpu, on_cpu)):
+        assert line.startswith("gaussian_renderer/__init__.py:")
+        assert f"needs {OTHER}, which cannot be imported" in line
+        assert "\n" not in line
+    assert "--device cpu" in str(on_gpu)
+    assert "--device cpu" not in str(on_cpu), "it was given"
+
+
+def test_a_name_that_a_stand_in_lacks(fork: Path) -> None:
+    """As `compute_relocation` of 3dgs-mcmc once was."""
+    error = ImportError(f"cannot import name 'compute_relocation' from '{MODULE}'", name=MODULE)
+    line = str(explain_import_error(error, CHECKOUTS / "graphdeco" / "train.py", on_cpu=True))
+    assert "compute_relocation" in line
+    assert "it needs CUDA" in line
+
+
+def test_a_package_that_is_not_installed_is_to_be_installed(fork: Path) -> None:
+    """As open3d of Mip-Splatting."""
+    error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
+    line = str(explain_import_error(error, fork / "ms" / "train.py", on_cpu=True))
+    assert line == (
+        "ms/train.py:3 needs open3d, which cannot be imported (No module named 'open3d'): pip install open3d"
+    )
+
+
+WINDOW = StageWindow(Stage(0, (8, 6), 20, signed=True), 10, 30, 2, 4.0, 2.0)
+
+
+def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: Path) -> None:
+    """2DGS has no `debug_from`, Speedy-Splat `visualize_iterations`, EfficientGS `no_gui`."""
+    given: list[Any] = []
+
+    def training(cfg: Any, options: Any, visualize_iterations: list[int], no_gui: bool = True) -> None:
+        given.append((cfg, options, visualize_iterations, no_gui))
+
+    cfg = SimpleNamespace(source_path="scene", model_path="out", white_background=True)
+    options = SimpleNamespace(iterations=30, feature_lr=0.1, densify_grad_threshold=0.2)
+    with loaded(STUBS["graphdeco"], scene, tmp_path) as adapter:
+        call = TrainingCall.bind(training, (cfg, options, [5, 15]), {})
+        adapter.stage_call(call, WINDOW, "run/level_0").run()
+    ((own, changed, visualized, gui),) = given
+    assert (own.model_path, own.white_background, cfg.model_path) == ("run/level_0", False, "out")
+    assert (changed.iterations, changed.feature_lr, changed.densify_grad_threshold) == (20, 0.4, 0.4)
+    assert (visualized, gui) == ([5], True)
+    with pytest.raises(UserInputError, match=r"training\(cfg, options, .* got no argument with source_path") as caught:
+        TrainingCall.bind(training, (1, options, []), {})
+    assert "\n" not in str(caught.value)
+
+
+def lapgs(*words: Any) -> None:
+    typer.main.get_command(app)(list(map(str, words)), standalone_mode=False)
+
+
+def test_a_script_of_no_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = tmp_path / "train.py"
+    script.write_text('import json\nif __name__ == "__main__":\n    print("here")\n')
+    with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout") as caught:
+        lapgs("run", "--device", "cpu", script)
+    assert "\n" not in str(caught.value)
+    lapgs("run", "--off", "--device", "cpu", script)
+    assert capsys.readouterr().out == "here\n", "--off recognises nothing"
+    with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout"):
+        lapgs("doctor", tmp_path)
+    with pytest.raises(UserInputError, match=r"has no train\*.py, expected the root of a 3DGS checkout"):
+        lapgs("doctor", tmp_path / "nowhere")
+
+
+def test_doctor_describes_a_checkout(
+    fork: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    lapgs("doctor", fork)
+    text = capsys.readouterr().out
+    for part in (str(fork), "--backbone generic", "ms/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
+        assert part in text
+    lapgs("doctor", CHECKOUTS / "taming")
+    text = capsys.readouterr().out
+    assert "Taming-3DGS (--backbone taming)" in text
+    assert "stand-in taming" in text

@@ -1,0 +1,145 @@
+"""Views of a level: attributes follow its size, and the wrapped renderers recognise a view however it gets there."""
+
+from __future__ import annotations
+
+import copy
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lapgs_plugin.checkouts.level_views import SceneImages, make_level_view, view_key, without_depth
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.rasterizer_wrapper import GREY, RasterizerWrapper, StageRendering
+
+WIDTH, HEIGHT = 8, 6
+
+
+class Camera(nn.Module):
+    """Has what cameras of forks have."""
+
+    def __init__(self, name: str, data_device: str = "cuda") -> None:
+        super().__init__()
+        self.image_name = name
+        self.original_image = torch.full((3, HEIGHT, WIDTH), 0.5, device=data_device)
+        self.image_width, self.image_height, self.resolution = WIDTH, HEIGHT, (WIDTH, HEIGHT)
+        self.focal_x, self.focal_y, self.Cx, self.FoVx = 10.0, 12.0, 4.0, 0.7
+        self.K = np.array([[10.0, 0, 4], [0, 12, 3], [0, 0, 1]])
+        self.mask = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % WIDTH < WIDTH // 2
+        self.invdepthmap, self.depth_mask, self.depth_reliable = np.ones((HEIGHT, WIDTH), np.float32), None, True
+        self.alpha_mask = torch.ones(1, HEIGHT, WIDTH)
+        self.world_view_transform = torch.randn(4, 4, generator=torch.Generator().manual_seed(len(name)))
+
+
+def made(name: str = "photo", **options: Any) -> tuple[Camera, SceneImages]:
+    images, original = SceneImages(), Camera.__init__
+    try:
+        Camera.__init__ = images.adopting(original)  # type: ignore[method-assign,assignment]
+        return Camera(name, **options), images
+    finally:
+        Camera.__init__ = original  # type: ignore[method-assign]
+
+
+def test_attributes_follow_the_size_of_the_level() -> None:
+    camera, images = made()
+    assert not hasattr(camera, "original_image"), "its image is in the store, and was never on a GPU"
+    assert images[images.key(camera)].size == (WIDTH, HEIGHT)
+    view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
+    assert (view.image_width, view.image_height, view.resolution) == (4, 3, (4, 3))
+    assert (view.focal_x, view.focal_y, view.Cx, view.FoVx) == (5.0, 6.0, 2.0, 0.7)
+    assert view.K.tolist() == [[5, 0, 2], [0, 6, 1.5], [0, 0, 1]]
+    assert view.mask.tolist() == [[[True, True, False, False]] * 3]
+    assert view.invdepthmap.shape == (3, 4)
+    assert view.alpha_mask is None, "opaque"
+    assert view.original_image.shape == (3, 3, 4)
+    assert (camera.focal_x, camera.K[0, 0], camera.invdepthmap.shape) == (10.0, 10.0, (HEIGHT, WIDTH)), "unchanged"
+    without_depth(view)
+    assert (view.invdepthmap, view.depth_reliable) == (None, False)
+    view.original_image = torch.ones(3, 3, 4)  # some checkouts move it to the GPU
+    assert view.original_image.sum() == 36
+
+
+def test_a_view_has_its_key_in_every_copy() -> None:
+    camera, images = made()
+    view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
+    for one in (camera, view, copy.copy(view), copy.deepcopy(view)):
+        assert view_key(one) == images.key(camera)
+    assert [view_key(other) for other in (None, torch.zeros(3), SimpleNamespace(lapgs_key=3))] == [None] * 3
+
+
+class Settings(NamedTuple):
+    """Settings of a fork's rasterizer, under names of its own."""
+
+    image_height: int
+    image_width: int
+    bg_color: Tensor
+    w2c: Tensor
+
+
+def rasterize(means: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
+    """Render the background plus the mean of the Gaussians, as (h, w, 3)."""
+    size = rasterizer_settings.image_height, rasterizer_settings.image_width, 3
+    return torch.zeros(1, *size[:2]), rasterizer_settings.bg_color.expand(size) + means.mean()
+
+
+def residual(camera: Camera, key: str, below: Tensor) -> tuple[RasterizerWrapper, Any, Any]:
+    """Return a wrapper of a residual's stage with its replacements of `Settings` and `rasterize`."""
+    wrapper = RasterizerWrapper()
+    store = SimpleNamespace(get=lambda _: below, prefetch=lambda _: None)
+    wrapper.stage = StageRendering(True, ColorPath.NATIVE, {key: camera}, accumulated=store, composed=frozenset({key}))
+    return wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
+
+
+@pytest.mark.parametrize("how", ["the camera", "a copy of its matrix", "a transposed matrix"])
+def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
+    camera, images = made()
+    wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
+
+    def render(viewpoint: Any, matrix: Tensor) -> Tensor:
+        image: Tensor = function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), matrix))[1]
+        return image
+
+    match how:
+        case "the camera":
+            image = wrapper.renderer(render)(view, torch.eye(4))
+        case "a copy of its matrix":
+            image = render(None, camera.world_view_transform.clone())
+        case _:
+            image = render(None, camera.world_view_transform.T.contiguous())
+    assert image.shape == (3, 4, 3)
+    assert image.unique().tolist() == [0.75], "over zero, not over the checkout's white background"
+    assert wrapper.noted is None
+
+
+def test_training_on_a_view_that_is_not_recognised_stops() -> None:
+    camera, images = made()
+    _, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    means = torch.zeros(2, 3, requires_grad=True)
+    image = function(means, settings(3, 4, torch.ones(3), torch.eye(4)))[1]
+    assert image.unique().tolist() == [GREY], "a viewer may look"
+    with pytest.raises(UserInputError, match="trains on a camera that is no view of its scene") as caught:
+        image.sum().backward()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_render_of_another_size_is_said() -> None:
+    """DashGaussian's frequency schedule renders a view smaller than its level."""
+    camera, images = made()
+    wrapper, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    render = wrapper.renderer(lambda view: function(torch.zeros(2, 3), settings(2, 2, torch.ones(3), torch.eye(4))))
+    with pytest.raises(UserInputError, match=r"renders view photo at 2x2, expected 4x3.*--hierarchy nested") as caught:
+        render(camera)
+    assert "\n" not in str(caught.value)
+
+
+def test_outputs_without_an_image_are_named() -> None:
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    broken = wrapper._function(lambda rasterizer_settings: (torch.zeros(7, 3, 4), torch.zeros(2)))
+    with pytest.raises(UserInputError, match=r"returns \(7, 3, 4\), \(2,\), expected an image \(3, h, w\) of 4x3"):
+        broken(rasterizer_settings=settings(3, 4, torch.ones(3), torch.eye(4)))
