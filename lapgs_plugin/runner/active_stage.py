@@ -101,7 +101,6 @@ class ActiveStage:
         )
         with self.record.overhead.timed("inheritance"):
             self._model.initialise(gaussians)
-        self._adapter.stage_scene(scene)
         return scene
 
     def optimizers_made(self, gaussians: Any) -> None:

@@ -271,9 +271,7 @@ class _DryStage:
         self.gaussians = gaussians
         train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
         gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
-        scene = self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
-        self._context.adapter.stage_scene(scene)
-        return scene
+        return self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
 
     def optimizers_made(self, gaussians: Any) -> None:
         """Do nothing: there is nothing to inherit."""
