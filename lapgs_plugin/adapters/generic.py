@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 OF_A_CALL = {
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
-    "scale_modifier", "prefiltered", "debug", "lambda_dssim",
+    "scale_modifier", "prefiltered", "debug", "lambda_dssim", "depth_threshold",
 }  # fmt: skip
 """Settings of rasterizers that are no property of a run."""
 

@@ -47,7 +47,10 @@ class Adapter(generic.Adapter):
                 }
             )
 
-    def model_of(self, call: TrainingCall, field: GaussianField) -> Any:
-        gaussians = super().model_of(call, field)
-        setattr(gaussians, FILTER, field.means.new_zeros(len(field), 1))  # applied already
+    def new_model(self, call: TrainingCall) -> Any:
+        import torch
+
+        gaussians = super().new_model(call)
+        # Training computes the filters; archived fields have them applied.
+        setattr(gaussians, FILTER, torch.zeros(1, 1, device="cuda"))
         return gaussians

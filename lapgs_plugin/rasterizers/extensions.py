@@ -34,6 +34,7 @@ CONSTANTS: dict[str, Any] = {
     "get_flag": False,
     "pixel_weights": None,
     "kernel_size": 0.1,
+    "depth_threshold": 1.0,
     "use_train_speedup": False,
     "ignored_rate": 0.0,
     "lambda_dssim": 0.2,

@@ -21,7 +21,8 @@ OF_OTHERS = {
     # of scripts of the backbones
     "--benchmark_dir", "--cams", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
-    "--highfeature_lr", "--ho_iteration", "--mult", "--opacity_reset_interval", "--optimizer_type",
+    "--highfeature_lr", "--ho_iteration", "--kernel_size", "--max_n_gaussian", "--mult", "--opacity_reset_interval",
+    "--optimizer_type",
     "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
     "--test_iterations",
     # of the extension in docs/extending.md
@@ -50,6 +51,9 @@ def test_every_command_parses(document: Path, tmp_path: Path, monkeypatch: pytes
     # The rehearsal of `lapgs run` recognises a checkout; its script is never started.
     shutil.copytree(ROOT / "tests/contract/checkouts/graphdeco", tmp_path / "checkout")
     monkeypatch.chdir(tmp_path / "checkout")
+    Path("ms").mkdir()
+    for script in ("train_dash.py", "ms/train.py"):  # of forks
+        shutil.copy("train.py", script)
     config = Path("runs/garden/run.toml")  # a command with --config reads it when it is parsed
     config.parent.mkdir(parents=True)
     config.write_text('scene = "data/garden"\n')

@@ -138,6 +138,22 @@ def test_absgs_returns_shares_and_absolute_gradients() -> None:
     assert bool((points.grad[:, 2:] >= points.grad[:, :2].abs() * (1 - 1e-4)).all())
 
 
+def test_pixel_gs_counts_pixels_and_scales_screen_gradients_by_depth() -> None:
+    case = small_case()
+    expected = call(module_of("graphdeco"), "graphdeco", case, activated(case))
+    found = call(module_of("pixel-gs"), "pixel-gs", case, activated(case), depth_threshold=4.0)
+    assert torch.equal(found[0], expected[0])
+    for image, points in ((expected[0], expected[-1]), (found[0], found[-1])):
+        image.sum().backward(inputs=[points])
+    pose = case.camera.world_to_camera
+    depths = case.field.means.detach() @ pose[2, :3] + pose[2, 3]
+    assert 0 < int((depths < 4).sum()) < 40
+    scaled = expected[-1].grad * (depths / 4).square().clamp(max=1)[:, None]
+    torch.testing.assert_close(found[-1].grad, scaled, rtol=1e-5, atol=1e-6)
+    shares, _ = blended(case)
+    assert (found[2][:, 0] - (shares > 0).sum((1, 2))).abs().max() <= 1  # alpha of a pixel may be at 1/255
+
+
 def test_mip_splatting_is_graphdecos_antialiasing_with_absolute_gradients() -> None:
     case = small_case()
     more: dict[str, Any] = {"kernel_size": 0.3, "subpixel_offset": torch.zeros(41, 53, 2)}

@@ -10,6 +10,9 @@ import sys
 import pytest
 import torch
 
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import FEWEST_PIXELS, SWITCH, our_kernels_blend
+
 CHECKS = """
 import torch
 from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward, blend_forward
@@ -110,3 +113,23 @@ def test_interpreted() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_compiled() -> None:
     run_checks("cuda")
+
+
+def test_another_choice_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "cuda")
+    with pytest.raises(UserInputError, match=f"{SWITCH}=cuda: expected triton or gsplat"):
+        our_kernels_blend(torch.zeros(1, 3), 1_000_000)
+
+
+def test_gsplat_blends_where_there_is_no_cuda_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(SWITCH, raising=False)
+    assert not our_kernels_blend(torch.zeros(1, 3), 1_000_000)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_our_kernels_blend_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(SWITCH, raising=False)
+    means = torch.zeros(1, 3, device="cuda")
+    assert our_kernels_blend(means, FEWEST_PIXELS)
+    assert not our_kernels_blend(means, FEWEST_PIXELS - 1)

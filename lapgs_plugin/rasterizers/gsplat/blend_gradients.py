@@ -60,7 +60,8 @@ def our_kernels_blend(means: Tensor, pixels: int) -> bool:
     chosen = os.environ.get(SWITCH) or DEFAULT
     if chosen not in (TRITON, GSPLAT):
         raise UserInputError(f"{SWITCH}={chosen}: expected {TRITON} or {GSPLAT}")
-    return chosen == TRITON and pixels >= FEWEST_PIXELS and triton_works(means)
+    # Asked for small images too: then the render that warms up before training compiles the kernels.
+    return chosen == TRITON and triton_works(means) and pixels >= FEWEST_PIXELS
 
 
 def blend(given: ToBlend, size: tuple[int, int], ours: bool) -> Blended:
@@ -127,5 +128,7 @@ def triton_works(device: torch.device) -> float:
     found = []
     for ours in (True, False):
         blended = blend(given, (width, height), ours)
-        found.append((blended.images, *gradients(given, blended, by_images, absolute=True)))
+        # Each is a kernel of its own; `absolute` or not, training uses one of them.
+        plain, whole = (gradients(given, blended, by_images, absolute) for absolute in (False, True))
+        found.append((blended.images, *plain[1:], *whole))
     return largest((one - other).abs() / other.abs().max() for one, other in zip(*found, strict=True))

@@ -204,6 +204,19 @@ class _Padded(torch.autograd.Function):
         return torch.cat([gradient[:, :2], gradient[:, 2:].sum(1, keepdim=True)], 1)
 
 
+class PixelGS(WholeSh):
+    """Scale the gradient by `means2D` by the square of depth over `depth_threshold`, where that is less than 1."""
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        settings = self.raster_settings
+        points = inputs.means2d
+        if settings.depth_threshold is not None and points.requires_grad:
+            depths = inputs.means.detach() @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
+            factors = (depths / settings.depth_threshold).square().clamp(max=1)[:, None]
+            points = points * factors + (points * (1 - factors)).detach()
+        return super()._render(replace(inputs, means2d=points))
+
+
 _SAID: set[str] = set()
 
 

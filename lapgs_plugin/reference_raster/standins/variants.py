@@ -9,6 +9,7 @@ Matrices are transposed, as in the CUDA bindings. Settings beside those of the v
     pixel_weights   Taming-3DGS: (height, width) float32 to sum up for each Gaussian, or None
     kernel_size     Mip-Splatting: variance of the blur, in px^2
     subpixel_offset Mip-Splatting: (height, width, 2) added to the pixels' positions
+    depth_threshold Pixel-GS: depth under which screen-space gradients are scaled down
     use_train_speedup, ignored_rate, lambda_dssim, use_hwc
                     EfficientGS: skip tiles in the backward pass; image as (height, width, 3)
 """
@@ -123,6 +124,12 @@ def _with_blended(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and whether each Gaussian is blended in some pixel, (n,) int32."""
     assert output.contributions is not None
     return output.image, output.radii, (torch.from_numpy(output.contributions.counts) > 0).int()
+
+
+def _with_pixels(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return the image, the radii, and the number of pixels in which each Gaussian is blended, (n, 1) float32."""
+    assert output.contributions is not None
+    return output.image, output.radii, torch.from_numpy(output.contributions.counts).float()[:, None]
 
 
 def _summing(settings: Any) -> Options:
@@ -247,6 +254,13 @@ FORKS = {
         _image_and_radii,
         binding="EfficientGS",
         needs_logs=True,
+    ),
+    "pixel-gs": Variant(
+        "Stand in for the rasterizer of Pixel-GS: with the pixels of each Gaussian, and gradients scaled by depth.",
+        (*_VIEW[:6], "depth_threshold", *_VIEW[6:], "prefiltered", "debug"),
+        _summing,
+        _with_pixels,
+        binding="PixelGS",
     ),
     "2dgs": Variant(
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
