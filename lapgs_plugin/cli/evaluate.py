@@ -208,5 +208,7 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     if (busy := metrics["gpu_busy_seconds"]) is not None:
         console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
-    for name, reason in metrics["lpips_missing"].items():
-        console.print(f"LPIPS {name} was not measured: {reason}", highlight=False, markup=False)
+    missing = metrics["lpips_missing"]
+    for reason in dict.fromkeys(missing.values()):
+        names = ", ".join(name for name in missing if missing[name] == reason)
+        console.print(f"LPIPS ({names}) not measured: {reason}", highlight=False, markup=False, soft_wrap=True)
