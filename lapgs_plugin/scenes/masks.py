@@ -52,7 +52,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
             f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
-            "whole photo), or leave masks out with --masks none"
+            "whole photo), or use no masks (in training: --masks none)"
         )
     return {name: path for name, path in found.items() if path is not None}
 

@@ -142,6 +142,8 @@ def prepare_scene(
     """
     _check_arguments(photos, out, matcher, mapper, camera_model, max_size)
     check_output(out, overwrite, WORK)
+    if masks is not None and not masks.is_dir():
+        raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
     found = find_photos(photos)
     if frames is not None and (found.clip is None or frames < 2):
         raise UserInputError(f"--frames {frames}: expected at least 2, and a video instead of {photos}")
