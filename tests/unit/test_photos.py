@@ -166,6 +166,15 @@ def test_videos_that_cannot_be_used_are_one_line(clip: Path, tmp_path: Path, mon
     (tmp_path / "cut.mp4").write_bytes(clip.read_bytes()[:1000])
     refused(SceneError, r"cut\.mp4: the video cannot be decoded", tmp_path / "cut.mp4")
     refused(UserInputError, "--frames 1: expected at least 2", clip, frames=1)
+    (tmp_path / "photos").mkdir()
+    photos = [tmp_path / "photos" / f"{index}.png" for index in range(2)]
+    for photo in photos:
+        write_image(photo, torch.ones(3, 64, 80))
+    refused(
+        UserInputError, "--frames 9: it picks frames from a video, and .*photos is a folder", photos[0].parent, frames=9
+    )
+    refused(SceneError, r"0\.png: one photo, expected a folder", photos[0])
+    refused(UserInputError, "--masks .*none: no such folder; leave it out", photos[0].parent, masks=Path("none"))
     monkeypatch.setattr(clip_module, "find_spec", lambda name: None)
     refused(MissingExtraError, r"needs imageio-ffmpeg: pip install 'lapgs_plugin\[video\]'", clip)
 
@@ -227,7 +236,9 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
             prepare_scene(noise, tmp_path / "scene", masks=masks, progress=False)
         assert not (tmp_path / "scene").exists()
 
-    refused(r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or 2_mask\.png")
+    refused(
+        r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or .*, or leave --masks out"
+    )
     write_image(masks / "2.png", torch.ones(3, 80, 64))
     refused(r"2\.png: the mask is 64x80 pixels, its photo 80x64 \(EXIF turns .*\); expected the same size")
 
