@@ -52,6 +52,7 @@ class _Interruption:
         installed: whether signals are handled as the module describes.
         in_command: whether a command runs, which may have something to clean up.
         raised: whether `Interrupted` was raised or will be.
+        advice: what to do after the command was stopped; the line ends with it.
     """
 
     def __init__(self) -> None:
@@ -59,6 +60,7 @@ class _Interruption:
         self.installed = False
         self.in_command = False
         self.raised = False
+        self.advice = ""
         self._since = 0.0
         self._said = False
 
@@ -112,7 +114,7 @@ class _Interruption:
         name = "SIGTERM" if self.number == signal.SIGTERM else "Ctrl-C"
         with suppress(OSError):
             show_cursor = _SHOW_CURSOR if os.isatty(2) else ""
-            os.write(2, f"{show_cursor}lapgs: stopped by {name}\n".encode())
+            os.write(2, f"{show_cursor}lapgs: stopped by {name}{self.advice}\n".encode())
 
     def leave(self) -> None:
         """End the process immediately."""
@@ -151,7 +153,7 @@ def command() -> Iterator[None]:
     if not _interruption.installed:
         yield
         return
-    _interruption.in_command = True
+    _interruption.in_command, _interruption.advice = True, ""
     try:
         yield
     except BaseException as error:
@@ -167,6 +169,11 @@ def command() -> Iterator[None]:
     if _interruption.raised:  # the command ended before the signal reached it, or swallowed it
         _interruption.print_line()
         sys.exit(_interruption.exit_code)
+
+
+def advise(what: str) -> None:
+    """Add what to do next to the line of this command, should a signal stop it."""
+    _interruption.advice = f"; {what}"
 
 
 def exit_code(code: int) -> int:

@@ -89,7 +89,7 @@ class LoggingProgress(Progress):
 
 
 class RateColumn(ProgressColumn):
-    """Show items per second, or seconds per item if that is below one."""
+    """Show items per second, or seconds for each item if that is below one."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ class RateColumn(ProgressColumn):
         rate = task.finished_speed or task.speed
         if not rate:
             return Text(f"- {self._unit}/s")
-        return Text(f"{rate:.1f} {self._unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s/{self._unit}")
+        return Text(f"{rate:.1f} {self._unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s each")
 
 
 def item_progress(unit: str) -> Progress:

@@ -396,9 +396,6 @@ class BackboneAdapter(ABC):
     def first_points(self, count: int) -> None:  # noqa: B027 - few need it
         """Receive the number of points of the scene, before the first stage."""
 
-    def stage_scene(self, scene: Any) -> None:  # noqa: B027 - few need it
-        """Receive the scene that a stage trains on, before its first iteration."""
-
     def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:  # noqa: B027 - few need it
         """Bring a model to the state that its class has after an iteration of the whole run, besides its parameters.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.files import atomic_write
+from lapgs_plugin.files import atomic_write, one_line_errors
 from lapgs_plugin.untrusted import read_toml
 
 RUN_CONFIG = "run.toml"
@@ -61,6 +62,15 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
             raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")
         values[name] = value
     return values
+
+
+def extend_config(path: Path, iterations: int, extended: int) -> None:
+    """Replace the iterations in the settings file of a run that was extended; older runs have no such file."""
+    if path.is_file():
+        line = f"iterations = {iterations}  # the last {extended} extended the finished run"
+        text = re.sub(r"(?m)^iterations = .*$", line, path.read_text(encoding="utf-8"))
+        with one_line_errors(path), atomic_write(path) as file:
+            file.write(text.encode())
 
 
 def write_config(path: Path, context: typer.Context, **replaced: str) -> None:

@@ -41,6 +41,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         ],
         "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [_no_rasterizer(source)],
         "Packages": _packages(source),
+        "Schedule": _schedule(source),
         "lapgs run": [*_kinds(source), _stand_in(source)],
     }
 
@@ -86,6 +87,15 @@ def _packages(source: CheckoutSource) -> list[Finding]:
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
     return [Finding(name, "absent", f"{one.where} imports it; not installed") for name, one in sorted(missing.items())]
+
+
+def _schedule(source: CheckoutSource) -> list[Finding]:
+    """Return what the training loop does at which iteration."""
+    from lapgs_plugin.checkouts.schedule import Schedule
+    from lapgs_plugin.environment.findings import Finding
+
+    lines = [line.partition(": ") for line in Schedule(source.training).describe()]
+    return [Finding(place, "ok", event) for place, _, event in lines] or [Finding("none", "ok", "counts no iterations")]
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:

@@ -196,11 +196,19 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         + (", as in this run, whose renders have the mean exposure" if metrics["exposure_compensated"] else ""),
         highlight=False,
     )
+    if metrics["exposure_predicted"]:
+        console.print(
+            "the other figures are of renders with the exposure that the training photos beside each view in the order "
+            "of names predict",
+            highlight=False,
+        )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]
         console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)
     if (busy := metrics["gpu_busy_seconds"]) is not None:
         console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
-    for name, reason in metrics["lpips_missing"].items():
-        console.print(f"LPIPS {name} was not measured: {reason}", highlight=False, markup=False)
+    missing = metrics["lpips_missing"]
+    for reason in dict.fromkeys(missing.values()):
+        names = ", ".join(name for name in missing if missing[name] == reason)
+        console.print(f"LPIPS ({names}) not measured: {reason}", highlight=False, markup=False, soft_wrap=True)

@@ -66,10 +66,12 @@ def prepare(
     """
     import logging
 
+    from lapgs_plugin.interrupt import advise
     from lapgs_plugin.scenes.prepare import AUTO, prepare_scene
 
     logging.basicConfig(format="%(message)s")
     logging.getLogger("lapgs_plugin.scenes").setLevel(logging.INFO)
+    advise("repeat the command to go on where it stopped")
     result = prepare_scene(
         photos,
         out,

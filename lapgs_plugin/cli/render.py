@@ -76,7 +76,11 @@ def render(
         typer.Option(help="Image size with --trajectory or --fps, such as 1280x720. Default: that of the cameras."),
     ] = None,
     panels: Annotated[
-        bool, typer.Option("--panels", help="With --trajectory: show base, residuals and composition side by side.")
+        bool,
+        typer.Option(
+            "--panels",
+            help="With --trajectory: show base, residuals (or differences) and composition side by side.",
+        ),
     ] = False,
     fps: Annotated[
         bool,
@@ -86,8 +90,9 @@ def render(
     """Render the base, the residuals and the composition of RUN, for its views or along a camera path.
 
     Files are named <view>_base, <view>_residual_<level> and <view>_composed, in the folders test and train. Base and
-    residuals have the size of their level. For nested levels, a residual is the difference that its level makes. In PNG
-    files residuals are shown around mid-grey: grey is zero, lighter is positive, darker is negative.
+    residuals have the size of their level. Nested levels have no residuals: <view>_difference_<level> is what a level
+    changes in the upsampled image of the level before. PNG files show residuals and differences around mid-grey: grey
+    is zero, lighter is positive, darker is negative.
 
     Examples:
 
@@ -232,7 +237,7 @@ def _write_views(
         for view in views:
             composition = renderer.render(view.camera, level)
             photo = renderer.pyramid.gaussian(view.image.to(renderer.device), level + 1)[level] if compare else None
-            images = view_images(composition, photo, raw=image_format == "exr")
+            images = view_images(composition, photo, raw=image_format == "exr", nested=renderer.nested)
             paths = [folder / f"{stems[view.name]}_{suffix}.{image_format}" for suffix in images]
             for _ in pool.map(write_image, paths, images.values()):
                 pass

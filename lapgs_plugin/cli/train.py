@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
-from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, write_config
+from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, extend_config, write_config
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -41,7 +41,14 @@ def train(
     photos: SceneOptions,
     settings: TrainSettings,
     control: TrainingControl,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out with its settings.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue the run in --out with its settings. A finished run is extended to --iterations, a larger "
+            "number than it has.",
+        ),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
     view: ViewOption = False,
     view_port: ViewPortOption = None,
@@ -60,6 +67,8 @@ def train(
         lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
 
         lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+
+        lapgs train data/garden -o runs/garden --resume --iterations 40000       (extends a finished run)
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
     """
@@ -98,6 +107,8 @@ def train(
         write_config(archive.path(RUN_CONFIG), context, masks=reference.masks)
     with archive:
         _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
+        if resume and settings.extended:
+            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended)
     keep_preview(out.absolute())
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     console.print(
@@ -131,7 +142,7 @@ def _resume(
         given: names of the options on the command line.
 
     Returns:
-        The run, its scene, and its settings, with those of `MAY_CHANGE` that were given.
+        The run, its scene, and its settings, with those of `MAY_CHANGE` that were given, or more iterations.
 
     Raises:
         UserInputError: the scene or an option differs from those that the run was started with.
@@ -152,6 +163,9 @@ def _resume(
                 "start again with --overwrite"
             )
         settings = TrainSettings.from_manifest(manifest, str(archive.path(MANIFEST)))
+        if manifest.complete:
+            settings = _extended(archive, settings, int(wanted["iterations"]) if "iterations" in given else None)
+            given = given - {"iterations"}
         started_with = _wanted(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
             if wanted[name] != started_with[name]:
@@ -173,6 +187,26 @@ def _resume(
         archive.close()
         raise
     return archive, loaded, settings
+
+
+def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -> TrainSettings:
+    """Return the settings of a finished run with the iterations to which it is extended, if it is.
+
+    Raises:
+        UserInputError: not more iterations than it has, or others than those of its interrupted extension.
+    """
+    from lapgs_plugin.runs.archive import CHECKPOINT, FORGET_EXTENSION
+
+    begun, done, run = archive.extends_to, settings.iterations, archive.path()
+    if asked is not None and begun not in (None, asked):
+        raise UserInputError(
+            f"--iterations {asked}: the run in {run} is being extended to {begun}; leave the option out to continue "
+            f"that, or, with the checkpoint {archive.path(CHECKPOINT)}: {FORGET_EXTENSION}"
+        )
+    if asked is not None and asked <= done:
+        raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
+    goal = asked or begun or done
+    return replace(settings, iterations=goal, extended=settings.extended + goal - done)
 
 
 def _load(reference: SceneReference) -> Scene:

@@ -10,6 +10,7 @@ file, or from one of the two packages.
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -24,6 +25,8 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and deviation by which LPIPS normalizes each channel of an image in [-1, 1]."""
 EPSILON = 1e-8
 """Added to the squared lengths of feature vectors, as in torchmetrics; lpips adds 1e-10 to the length."""
+DOWNLOADS = "https://download.pytorch.org/models/"
+"""Where torchvision's weights are, by their file names."""
 LINEAR_FILES = {"torchmetrics": "functional/image/lpips_models/{}.pth", "lpips": "weights/v0.1/{}.pth"}
 """The learned layers' files inside packages."""
 
@@ -263,7 +266,7 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
             continue
         weights = named.get(name) or _cached(name)
         if weights is None:
-            missing[variant] = f"no weights: give a file of them with --lpips-weights ({NETWORKS[name].cached_as})"
+            missing[variant] = f"no weights; {_how_to_get(name)}"
         elif smallest_side < NETWORKS[name].smallest:
             missing[variant] = f"images of {smallest_side} pixels are too small, expected {NETWORKS[name].smallest}"
         elif (complete := _with_learned(name, weights)) is None:
@@ -315,9 +318,23 @@ def _read(path: Path) -> Mapping[str, Tensor]:
     return weights
 
 
+def _cache_path(name: str) -> Path:
+    """Return where torchvision downloads the weights of a network to."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / NETWORKS[name].cached_as
+
+
+def _how_to_get(name: str) -> str:
+    """Return the command that downloads the weights of a network to where they are found."""
+    target = shlex.quote(str(_cache_path(name)))
+    return (
+        f"get them with: curl -fL --create-dirs -o {target} {DOWNLOADS}{NETWORKS[name].cached_as} (or copy that file "
+        "from another machine and name it with --lpips-weights)"
+    )
+
+
 def _cached(name: str) -> Mapping[str, Tensor] | None:
     """Read the weights that torchvision downloaded earlier; None where there are none."""
-    path = Path(torch.hub.get_dir()) / "checkpoints" / NETWORKS[name].cached_as
+    path = _cache_path(name)
     return _read(path) if path.is_file() else None
 
 

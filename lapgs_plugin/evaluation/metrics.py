@@ -84,9 +84,10 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         each = in_torch.ssim_map(torch.where(mask, image, target)[None], target[None])[0]
         return float(each.mean(0, keepdim=True)[mask].mean())
     if image.device.type == "cpu":
-        from lapgs_plugin.ops.photometric_loss.in_numba import ssim_cpu
+        from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
-        return float(ssim_cpu(image, target))
+        # Training has compiled this kernel. Its gradient is not needed here, but costs less than compiling another.
+        return 1.0 - float(photometric_loss_cpu(image, target, 1.0))
     return float(in_torch.ssim(image, target))
 
 

@@ -22,17 +22,19 @@ def around_grey(signed: Tensor) -> Tensor:
     return 0.5 + 0.5 * signed
 
 
-def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> dict[str, Tensor]:
+def view_images(composition: Composition, photo: Tensor | None, raw: bool, nested: bool = False) -> dict[str, Tensor]:
     """Return the images of a rendered view by file suffix, (3, h, w) each, at their level's size.
 
     Args:
         composition: of one or more levels.
         photo: at the finest composed level's size; adds "compare": photo, composition and difference `side_by_side`.
         raw: keep the sign of residuals and differences, for formats with negative values; otherwise around mid-grey.
+        nested: whether levels are nested, which have differences instead of residuals.
 
     Returns:
-        "base", "residual_<l>" for each residual, and "composed", or "composed_<l>" if l is not 0. No image is returned
-        twice: a hierarchy of one level gives "composed" alone, the coarsest level of several "base" alone.
+        "base", "residual_<l>" or "difference_<l>" for each finer level, and "composed", or "composed_<l>" if l is not
+        0. No image is returned twice: a hierarchy of one level gives "composed" alone, the coarsest level of several
+        "base" alone.
     """
     finest = min(composition.composed)
     composed = composition.composed[finest]
@@ -40,7 +42,7 @@ def view_images(composition: Composition, photo: Tensor | None, raw: bool) -> di
     if composition.residuals or finest > 0:
         images["base"] = composition.base
     for level, residual in composition.residuals.items():
-        images[f"residual_{level}"] = residual if raw else around_grey(residual)
+        images[f"{'difference' if nested else 'residual'}_{level}"] = residual if raw else around_grey(residual)
     if composition.residuals or finest == 0:
         images["composed" if finest == 0 else f"composed_{finest}"] = composed
     if photo is not None:

@@ -1,4 +1,4 @@
-"""Render views of runs as pictures for a page: photo, base, residuals, composition, baseline; whole and in detail."""
+"""Render views of runs as pictures for a page: photo, levels, composition, baseline; whole and in detail."""
 
 from __future__ import annotations
 
@@ -129,7 +129,9 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
         layers.append(_Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
     for level, residual in composition.residuals.items():
         detail = f"{_level_label(level, residual)}, zero is grey"
-        layers.append(_Layer("Residual", detail, around_grey(whole(residual, level))))
+        layers.append(
+            _Layer("Difference" if renderer.nested else "Residual", detail, around_grey(whole(residual, level)))
+        )
     layers.append(_Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
     for baseline in renderers[1:]:
         image = baseline.render(view.camera).composed[0].cpu()

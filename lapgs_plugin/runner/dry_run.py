@@ -112,6 +112,7 @@ class DryRun:
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
             self._require_three_axes(gaussians)
+            gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
@@ -271,9 +272,7 @@ class _DryStage:
         self.gaussians = gaussians
         train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
         gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
-        scene = self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
-        self._context.adapter.stage_scene(scene)
-        return scene
+        return self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
 
     def optimizers_made(self, gaussians: Any) -> None:
         """Do nothing: there is nothing to inherit."""

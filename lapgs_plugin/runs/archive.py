@@ -15,6 +15,9 @@ PLY is on the disk. So a run that is killed at any moment still opens, with the 
 Joint training of level k also changes the finished fields. Their new versions are first written beside the old ones, to
 point_cloud.with_level_<k>.ply. They count from the moment that the manifest lists level k; then they are renamed, by
 the next process that opens the run for writing if this one is killed before. If level k is not listed they are removed.
+
+Extending a finished run replaces files in the same way: new ones are written beside the old ones, to extended_<i>.NAME,
+where i is the new number of iterations, and count from the moment that the manifest has this number.
 """
 
 from __future__ import annotations
@@ -54,6 +57,9 @@ RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability
 PLY, OPTIMIZER, EXPOSURE = "point_cloud.ply", "optimizer.pt", "exposure.json"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
+FORGET_EXTENSION = "delete it to extend the run anew"
+EXTENDED = "extended_{}.{}"
+"""A file of a run after its extension to a number of iterations, until it replaces the file of that name."""
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Exposures = dict[str, Annotated[list[Row], Field(min_length=3, max_length=3)]]
@@ -194,7 +200,9 @@ class RunArchive:
         return self._folder.joinpath(*parts)
 
     def field_path(self, level: int) -> Path:
-        """Return the PLY of a level: the newest version that a finished level's training wrote."""
+        """Return the PLY of a level: the newest version that a finished level's training or an extension wrote."""
+        if _exists(extended := self._extended_path(level, PLY)):
+            return extended
         for later in reversed(self.available_levels):
             if _exists(waiting := self._waiting_path(level, later)):
                 return waiting
@@ -202,6 +210,11 @@ class RunArchive:
 
     def _settled_path(self, level: int) -> Path:
         return self.path(f"level_{level}", PLY)
+
+    def _extended_path(self, level: int, name: str, iterations: int | None = None) -> Path:
+        """Return where a file of a level waits that an extension replaces; by default that of the manifest's run."""
+        known = self._manifest.settings.get("iterations") if iterations is None else iterations
+        return self.path(f"level_{level}", EXTENDED.format(known, name))
 
     def _waiting_path(self, level: int, later: int) -> Path:
         return self.path(f"level_{level}", TRAINED_ALONG.format(later))
@@ -275,8 +288,70 @@ class RunArchive:
             self.path(CHECKPOINT).unlink(missing_ok=True)
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
 
+    def add_overhead(self, seconds: Mapping[str, float]) -> None:
+        """Add seconds by purpose to the overhead of the level that was finished last."""
+        self._require_lock()
+        *before, last = self._manifest.records
+        total = {**last.overhead_seconds}
+        for purpose, value in seconds.items():
+            total[purpose] = total.get(purpose, 0.0) + value
+        manifest = replace(self._manifest, records=(*before, replace(last, overhead_seconds=total)))
+        self._write_json(MANIFEST, asdict(manifest), training=True)
+        self._manifest = manifest
+
+    def finish_extension(
+        self,
+        record: LevelRecord,
+        fields: Mapping[int, GaussianField],
+        exposure: Exposures | None,
+        settings: Mapping[str, Any],
+    ) -> None:
+        """Replace fields and the finest level's record of a finished run that was trained further, all at once.
+
+        If this is interrupted before the manifest is written, the run is as before. Figures of the fields before
+        (metrics, flicker, report) are removed.
+
+        Args:
+            record: of level 0.
+            fields: by level, each with as many Gaussians as before; others stay.
+            exposure: see `finish_level`.
+            settings: that changed, with "iterations".
+
+        Raises:
+            FieldError: a field holds NaN or inf; nothing is written.
+        """
+        self._require_lock()
+        records, iterations = (*self._manifest.records[:-1], record), settings["iterations"]
+        manifest = replace(self._manifest, records=records, settings={**self._manifest.settings, **settings})
+        for level, field in fields.items():
+            _require_field_of(manifest.record(level), field)
+        for level, field in fields.items():
+            path = self._extended_path(level, PLY, iterations)
+            with one_line_errors(path, training=True):
+                field.save_ply(path)
+        if exposure is not None:
+            path = self._extended_path(record.level, EXPOSURE, iterations)
+            self._write_json(str(path), dict(exposure), training=True)
+        self._remove(METRICS, STABILITY, REPORT)
+        self._write_json(MANIFEST, asdict(manifest), training=True)
+        self._manifest = manifest
+        self._settle_fields()
+        self._remove(CHECKPOINT)
+
+    def _remove(self, *names: str) -> None:
+        with one_line_errors(self._folder):
+            for name in names:
+                self.path(name).unlink(missing_ok=True)
+
     def _settle_fields(self) -> None:
-        """Rename jointly trained fields to their final names, and remove those whose level was not finished."""
+        """Rename jointly trained or extended fields to their final names, and remove those that do not count."""
+        with one_line_errors(self._folder):
+            for waiting in self._folder.glob(f"level_*/{EXTENDED.format('*', '*')}"):
+                name = waiting.name.split(".", 1)[1]
+                if waiting.name == EXTENDED.format(self._manifest.settings.get("iterations"), name):
+                    waiting.replace(waiting.with_name(name))
+                else:
+                    waiting.unlink()
         for level in range(self._manifest.levels):
             for later in reversed(range(level)):
                 waiting = self._waiting_path(level, later)
@@ -305,7 +380,9 @@ class RunArchive:
         Raises:
             RunFolderError: the file is damaged.
         """
-        path = self.path(f"level_{level}", EXPOSURE)
+        path = self._extended_path(level, EXPOSURE)
+        if not _exists(path):
+            path = self.path(f"level_{level}", EXPOSURE)
         if not _exists(path):
             return None
         found: Exposures = read_json(path, Exposures, error=RunFolderError, advice="train again with --overwrite")
@@ -359,13 +436,35 @@ class RunArchive:
         advice = "write it again with `lapgs eval`"
         return dict(read_json(path, Metrics, error=RunFolderError, advice=advice)) if _exists(path) else None
 
-    def save_checkpoint(self, state: dict[str, Any]) -> None:
-        """Replace the checkpoint of the level in training; `state` as `tensors.write_tensors` takes it."""
+    def save_checkpoint(self, state: dict[str, Any], extends_to: int | None = None) -> None:
+        """Replace the checkpoint of the level in training.
+
+        Args:
+            state: as `tensors.write_tensors` takes it.
+            extends_to: of a finished run that is trained further, the number of iterations that it will have.
+        """
         self._require_lock()
-        write_tensors(self.path(CHECKPOINT), {"level": self._manifest.next_level, "state": state})
+        level = self._manifest.next_level
+        of = {"level": 0, "extends_to": extends_to} if level is None else {"level": level}
+        write_tensors(self.path(CHECKPOINT), {**of, "state": state})
+
+    @property
+    def extends_to(self) -> int | None:
+        """Iterations to which an interrupted extension was to train the finished run; None if there is none.
+
+        Raises:
+            RunFolderError: the checkpoint cannot be read.
+        """
+        path = self.path(CHECKPOINT)
+        if not self._manifest.complete or not _exists(path):
+            return None
+        found = read_tensors(path, FORGET_EXTENSION).get("extends_to")
+        return found if type(found) is int and found > int(self._manifest.settings.get("iterations", 0)) else None
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """Read the checkpoint of the next level to train, its tensors on the CPU; None if there is none.
+
+        That of a finished run is of its interrupted extension.
 
         Raises:
             RunFolderError: it cannot be read, or its level is neither finished nor the next.
@@ -379,7 +478,7 @@ class RunArchive:
         if type(level) is not int or not isinstance(state, dict):
             found = f"level {shortened(level)} and a state that is a {type(state).__name__}"
             raise RunFolderError(f"{path} holds {found}, expected a number and a dictionary; {advice}")
-        if level == self._manifest.next_level:
+        if level == self._manifest.next_level or (level == 0 and self.extends_to is not None):
             return state
         if level not in self.available_levels:
             raise RunFolderError(f"{path} is of level {level}, expected {self._manifest.next_level}; {advice}")
@@ -473,8 +572,9 @@ def _remove_results(folder: Path) -> None:
         (level / PLY).unlink(missing_ok=True)
         (level / OPTIMIZER).unlink(missing_ok=True)
         (level / EXPOSURE).unlink(missing_ok=True)
-        for waiting in level.glob(TRAINED_ALONG.format("*")):
-            waiting.unlink()
+        for pattern in (TRAINED_ALONG.format("*"), EXTENDED.format("*", "*")):
+            for waiting in level.glob(pattern):
+                waiting.unlink()
         if not any(level.iterdir()):
             level.rmdir()
 

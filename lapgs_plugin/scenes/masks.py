@@ -34,17 +34,10 @@ def resolve_masks(scene: Path, setting: str) -> str:
     return str(Path(setting).absolute())
 
 
-def find_masks(
-    folder: Path, names: Sequence[str], without: str = "leave masks out with --masks none"
-) -> dict[str, Path]:
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
 
     The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder.
-
-    Args:
-        folder: of the masks.
-        names: of the images.
-        without: how a command uses no masks, for the message.
 
     Raises:
         SceneError: an image has no mask, or several.
@@ -59,7 +52,7 @@ def find_masks(
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
             f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
-            f"whole photo), or {without}"
+            "whole photo), or use no masks (in training: --masks none)"
         )
     return {name: path for name, path in found.items() if path is not None}
 

@@ -140,8 +140,10 @@ def prepare_scene(
         LapgsError: the disk is full, the folder cannot be written, or COLMAP failed.
         MissingExtraError: a package that reads videos or HEIC photos is missing.
     """
-    _check_arguments(photos, out, matcher, mapper, camera_model, max_size, masks)
+    _check_arguments(photos, out, matcher, mapper, camera_model, max_size)
     check_output(out, overwrite, WORK)
+    if masks is not None and not masks.is_dir():
+        raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
     found = find_photos(photos)
     if frames is not None and frames < 2:
         raise UserInputError(f"--frames {frames}: expected at least 2")
@@ -230,7 +232,7 @@ class _Job:
 
 
 def _check_arguments(
-    photos: Path, out: Path, matcher: str, mapper: str, camera_model: str, max_size: int | None, masks: Path | None
+    photos: Path, out: Path, matcher: str, mapper: str, camera_model: str, max_size: int | None
 ) -> None:
     if matcher not in MATCHERS:
         raise UserInputError(f"--matcher {matcher!r}: expected {', '.join(MATCHERS[:-1])} or {MATCHERS[-1]}")
@@ -248,8 +250,6 @@ def _check_arguments(
         raise UserInputError(f"--camera-model {camera_model!r}: expected auto or one of {', '.join(CAMERA_MODELS)}")
     if max_size is not None and max_size < MIN_SIDE:
         raise UserInputError(f"--max-size {max_size}: expected at least {MIN_SIDE} pixels")
-    if masks is not None and not masks.is_dir():
-        raise UserInputError(f"--masks {masks}: no such folder; leave it out to use masks of transparent pixels only")
     source, target = photos.resolve(), out.resolve()
     if source.is_relative_to(target) or target.is_relative_to(source):
         raise UserInputError(f"{out}: one of {photos} and {out} lies in the other; write OUT somewhere else")
@@ -294,7 +294,7 @@ def _make_masks(job: _Job, given: Path | None) -> None:
     """Write masks of the photos' sizes under COLMAP's names, white where nothing is known of a photo."""
     if job.masks.is_dir():
         return
-    files = {} if given is None else find_masks(given, job.names, "leave --masks out")
+    files = {} if given is None else find_masks(given, job.names)
     names = job.names if files else [name for name in job.names if has_alpha(job.photos / name)]
     if not names:
         return

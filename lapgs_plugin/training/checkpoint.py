@@ -98,7 +98,7 @@ def check_checkpoint(
     Args:
         state: of the checkpoint.
         path: of its file, for the message.
-        stage: to continue.
+        stage: to continue, as planned.
         settings: of the run.
         finished: levels of the run.
 
@@ -186,8 +186,8 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
     iteration, joint_from = state["progress"]["iteration"], settings.joint_from(stage)
     if state["level"] != stage.level:
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
-    if iteration > stage.iterations:
-        raise ValueError(f"progress.iteration is {iteration}, expected at most {stage.iterations}")
+    if iteration > (most := stage.iterations + settings.extension_of(stage)):
+        raise ValueError(f"progress.iteration is {iteration}, expected at most {most}")
     _check_model(state["model"], "model", stage.signed, settings.sh_degree)
     if (best := state.get("best")) is not None:
         if best["iteration"] > iteration:
@@ -196,7 +196,7 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         for level, model in (best["joint"] or {}).items():
             _check_model(model, f"best.joint.{level}", model["signed"], settings.sh_degree)
     joint = state.get("joint") or {}
-    wanted = set(finished) if joint_from is not None and iteration >= joint_from else set()
+    wanted = set(finished) - {stage.level} if joint_from is not None and iteration >= joint_from else set()
     if joint.keys() != wanted:
         raise ValueError(f"joint has levels {sorted(joint)}, expected {sorted(wanted)}")
     for level, model in joint.items():

@@ -56,6 +56,7 @@ class StageSchedule:
     Attributes:
         gather_from, gather: from this iteration on, the gradients of so many views make one step.
         views: the same for earlier steps. A step ends early where something is due.
+        extended: iterations after the `iterations` of the schedule, all as the last one is.
     """
 
     iterations: int
@@ -72,12 +73,13 @@ class StageSchedule:
     gather: int
     before: int
     views: int = 1
+    extended: int = 0
 
     @classmethod
     def create(
         cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1, training_views: int = 1
     ) -> StageSchedule:
-        shrink = min(1.0, settings.iterations / REFERENCE_ITERATIONS)
+        shrink = min(1.0, settings.scheduled / REFERENCE_ITERATIONS)
         given = settings.densification
 
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
@@ -88,10 +90,13 @@ class StageSchedule:
         if given.reset_every == 0 or (keeps_opacities and given.reset_every is None):
             resets = stage.iterations + 1  # never
         until = constant(given.until, given.options.densify_until, 1)
-        of_stage = round(until * stage.iterations / settings.iterations)
+        of_stage = round(until * stage.iterations / settings.scheduled)
         if (share := settings.densify_share_of(stage)) is not None:
             of_stage = round(share * stage.iterations)
         densify_until = nested_densify_until(of_stage) if before else of_stage
+        extended = settings.extension_of(stage)
+        if extended:
+            densify_until = min(densify_until, stage.iterations)
         # A refinement replaces parameters, and with them gradients that wait for those of other views.
         late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         rates = settings.learning_rates
@@ -110,7 +115,13 @@ class StageSchedule:
             gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
             before=before,
             views=views,
+            extended=extended,
         )
+
+    @property
+    def end(self) -> int:
+        """The last iteration."""
+        return self.iterations + self.extended
 
     def refines(self, iteration: int) -> bool:
         """Return whether Gaussians are added and removed after this iteration, while densification lasts."""
@@ -124,12 +135,12 @@ class StageSchedule:
         """Return the number of views, at least 1, of the step after `done` iterations."""
         if self.gathers(done + 1):
             within = (done + 1 - self.gather_from) % self.gather
-            return min(self.gather - within, self.iterations - done)
+            return min(self.gather - within, self.end - done)
         return 1 if self.views == 1 else min(self.views, self._next_due(done) - done)
 
     def _next_due(self, done: int) -> int:
         """Return the first iteration after `done` that ends a step, because statistics or the field change with it."""
-        due = [self.iterations]
+        due = [self.end]
         if done < self.densify_until:
             # Statistics are collected before iteration `densify_until`, and pruning follows it.
             due += [(done // every + 1) * every for every in (self.densify_every, self.reset_every)]
@@ -158,13 +169,22 @@ class StageSchedule:
     def sampled(self, count: int) -> frozenset[int]:
         """Return so many iterations, evenly spread and ending with the last, after which quality is measured.
 
+        Of a stage that is extended they are iterations of the extension.
+
         Those that follow a reset of opacities closely come before it instead: no field looks like itself then.
         """
         found = set()
         for index in range(1, count + 1):
-            due = math.ceil(self.iterations * index / count)
+            due = math.ceil((self.extended or self.iterations) * index / count)
+            due += self.iterations if self.extended else 0
             reset, since = divmod(due, self.reset_every)
-            if reset and due < self.densify_until + RECOVERY and since < RECOVERY and index < count:
+            if (
+                reset
+                and not self.extended
+                and due < self.densify_until + RECOVERY
+                and since < RECOVERY
+                and index < count
+            ):
                 due -= since + self.views  # the step that ends with the reset is the one after it
             found.add(max(1, due))
         return frozenset(found)

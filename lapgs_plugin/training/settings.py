@@ -185,6 +185,7 @@ class TrainSettings(HierarchySettings):
         panel=SCHEDULE,
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
+    extended: int = 0  # iterations of the finest stage after its schedule's end, by --resume --iterations
     ssim_weight: float = 0.2
     learning_rates: LearningRates = field(default_factory=LearningRates)
     densification: Densification = field(default_factory=Densification)
@@ -199,6 +200,8 @@ class TrainSettings(HierarchySettings):
         self.densification.check()
         if not 0 <= self.sh_degree <= 3:
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
+        if not 0 <= self.extended < self.iterations:
+            raise UserInputError(f"extended {self.extended}: expected 0 to below the iterations, {self.iterations}")
         if self.sh_every is not None and self.sh_every < 1:
             raise UserInputError(f"sh_every {self.sh_every}: expected at least 1")
         self._check_base()
@@ -256,6 +259,15 @@ class TrainSettings(HierarchySettings):
         ]
         if idle:
             raise UserInputError(f"{', '.join(idle)} with --strategy {density.strategy}: no effect there; leave it out")
+
+    @property
+    def scheduled(self) -> int:
+        """Iterations of the run's schedule, all stages together, without those that extended the finished run."""
+        return self.iterations - self.extended
+
+    def extension_of(self, stage: Stage) -> int:
+        """Return the iterations of a stage after its schedule's end."""
+        return self.extended if stage.level == 0 else 0
 
     @property
     def asked_views(self) -> int | None:
@@ -395,7 +407,7 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
     **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
-    **{"protocol": "default", "exposure": OFF, "keep": LAST},
+    **{"protocol": "default", "exposure": OFF, "keep": LAST, "extended": 0},
 }
 """Settings that older manifests do not name, with the values they had."""
 

@@ -27,6 +27,7 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
@@ -65,6 +66,13 @@ class StageProgress:
     peak_gaussians: int = 0
     gaussian_steps: int = 0
     most_views: int | None = None
+
+    @classmethod
+    def of(cls, record: LevelRecord) -> StageProgress:
+        """Return the progress at the end of a finished stage, whose smoothed loss is not kept."""
+        mean = record.num_gaussians if record.mean_gaussians is None else record.mean_gaussians
+        steps = round(mean * record.iterations)
+        return cls(record.iterations, record.train_seconds, math.nan, record.peak_gaussians, steps)
 
 
 @dataclass(frozen=True)

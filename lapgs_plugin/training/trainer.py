@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
+from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -28,6 +29,7 @@ from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
+from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
@@ -60,7 +62,7 @@ from lapgs_plugin.training.quality import (
 )
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, OFF, TrainSettings
-from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.stage import StageProgress, StageRun
 from lapgs_plugin.training.views import level_views
 
 TRAIN, TEST = "train", "test"
@@ -89,7 +91,7 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         )
     if views is not None and settings.keep == BEST:
         require_views_to_set_aside(views)
-    return StagePlan.create(size, settings.iterations, settings.levels, settings.shares, settings.kind)
+    return StagePlan.create(size, settings.scheduled, settings.levels, settings.shares, settings.kind)
 
 
 def check_storage(settings: TrainSettings, device: torch.device) -> None:
@@ -184,6 +186,10 @@ class Trainer:
         check_storage(self.settings, self.device)
         if self.gpu_busy:
             require_cuda(self.device)
+            if self.settings.extended:
+                raise UserInputError(
+                    "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
+                )
         self._overhead = Overhead()
         self._quality = QualityWatch()
         self._best: dict[str, Any] | None = None  # the stage's best state so far, see `checkpoint.BestState`
@@ -196,7 +202,9 @@ class Trainer:
         self._last_checkpoint = time.monotonic()
 
     def run(self, resume: bool = False) -> None:
-        """Train all stages that are not finished yet.
+        """Train all stages that are not finished yet, or extend a finished run.
+
+        A run whose settings have more iterations than its manifest is extended: its finest stage trains on.
 
         Args:
             resume: continue from the run folder's checkpoint, or after its last finished level.
@@ -217,7 +225,7 @@ class Trainer:
                 if few is not None and not resume:
                     self.monitor.say(few)
                 for stage in self.plan:
-                    if stage.level in self.archive.available_levels:
+                    if stage.level in self.archive.available_levels and self._to_extend(stage) is None:
                         continue
                     here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
                     self._run_stage(stage, here, stop)
@@ -230,12 +238,18 @@ class Trainer:
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""
-        state, level = self.archive.load_checkpoint(), self.archive.manifest.next_level
+        state, level = self.archive.load_checkpoint(), self.archive.manifest.next_level or 0
         if state is not None:
             (stage,) = (each for each in self.plan if each.level == level)
             path = self.archive.path(CHECKPOINT)
             check_checkpoint(state, path, stage, self.settings, self.archive.available_levels)
         return state
+
+    def _to_extend(self, stage: Stage) -> LevelRecord | None:
+        """Return the record of a finished stage that is to train on; None for all others."""
+        done = {record.level: record for record in self.archive.manifest.records}.get(stage.level)
+        whole = stage.iterations + self.settings.extension_of(stage)
+        return done if done is not None and done.iterations < whole else None
 
     def _exposures(self, stage: Stage, checkpoint: dict[str, Any] | None) -> ViewExposures | None:
         """Return the colour transforms that a stage starts with; None if the run does not compensate exposure."""
@@ -278,7 +292,9 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
-        self._overhead = Overhead(None if checkpoint is None else checkpoint["overhead"])
+        before = self._to_extend(stage)
+        spent = None if before is None else before.overhead_seconds
+        self._overhead = Overhead(spent if checkpoint is None else checkpoint["overhead"])
         self._memory = PeakMemory(self.device)
         run = self._prepare(stage, self._first_model(stage, checkpoint), checkpoint)
         self._samples = run.schedule.sampled(SAMPLES_OF_A_STAGE if not self._aside else SAMPLES_TO_KEEP_BEST)
@@ -289,19 +305,21 @@ class Trainer:
             views = None if run.exposures is None else len(run.exposures.names)
             check_exposure(checkpoint.get("exposure"), views, path)
             run.restore(checkpoint)
-            if self.breakdown and not run.breakdown.measures:
-                self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
+        if self.breakdown and not run.breakdown.measures:
+            self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
         self.archive.rewind_history(stage.level, run.progress.iteration)
-        self.monitor.stage_started(stage, run.progress.iteration + 1)
+        if before is not None and checkpoint is None and self._aside:
+            self._note_best(run)  # the finished run's state is the one to beat
+        self.monitor.stage_started(run.stage, run.progress.iteration + 1)
         self._last_tick = (run.progress.seconds, run.progress.iteration)
-        run.hooks.on_stage_start(stage)
-        self.watcher.stage_started(stage)
+        run.hooks.on_stage_start(run.stage)
+        self.watcher.stage_started(run.stage)
 
         def after_iteration(run: StageRun) -> None:
             self._after_iteration(run, stop)
 
         run.run(after_iteration)
-        run.hooks.on_stage_end(stage)
+        run.hooks.on_stage_end(run.stage)
         self._finish(run)
 
     def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
@@ -314,6 +332,10 @@ class Trainer:
         if checkpoint is not None:
             return TrainableField.from_state(checkpoint["model"], rates, extent, device=self.device, sparse=sparse)
         with self._overhead.timed("inheritance"):
+            if self._to_extend(stage) is not None:
+                return TrainableField.create(
+                    self.archive.field(stage.level).to(self.device), rates, extent, sparse=sparse
+                )
             if continues_field(stage, self.plan.levels):
                 field = self.archive.field(stage.level + 1)
                 model = TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
@@ -359,8 +381,9 @@ class Trainer:
         with self._overhead.timed("pyramid"):
             self._images = self._level_images(stage)
         self._fill_caches(stage)
+        before = self._to_extend(stage)
         return StageRun(
-            stage=stage,
+            stage=replace(stage, iterations=schedule.end),
             schedule=schedule,
             settings=self.settings,
             views=level_views(self.scene.train, stage.level),
@@ -375,10 +398,17 @@ class Trainer:
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             exposures=self._exposures(stage, checkpoint),
-            breakdown=breakdown_on(self.device) if self.breakdown else Breakdown(),
+            breakdown=self._breakdown(before),
+            progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
         )
+
+    def _breakdown(self, before: LevelRecord | None) -> Breakdown:
+        """Return what measures the parts of iterations, from the beginning of the stage or after its record."""
+        if not self.breakdown or (before is not None and not before.breakdown_seconds):
+            return Breakdown()
+        return breakdown_on(self.device, None if before is None else before.breakdown_seconds)
 
     def _unfreeze(self, states: dict[int, dict[str, Any]] | None) -> JointFields:
         """Return the finished fields for joint training, from a checkpoint's `JointFields.state` or the archive.
@@ -395,7 +425,7 @@ class Trainer:
             return TrainableField.create(self.archive.field(level).to(self.device), rates, extent, sparse=sparse)
 
         return JointFields(
-            models={level: model(level) for level in self.archive.available_levels},
+            models={level: model(level) for level in self.archive.available_levels if level > 0},
             cameras={view.name: view.camera for view in (*self.scene.train, *self.scene.test, *self._aside)},
             rasterizer=self.rasterizer,
             background=torch.tensor(self.scene.background).to(self.device),
@@ -496,7 +526,8 @@ class Trainer:
         before_seconds, before_iteration = self._last_tick
         progress = run.progress
         self._last_tick = (progress.seconds, progress.iteration)
-        finished = sum(record.train_seconds for record in self.archive.manifest.records)
+        records = self.archive.manifest.records
+        finished = sum(record.train_seconds for record in records if record.level != run.stage.level)
         tick = Tick(
             level=run.stage.level,
             iteration=progress.iteration,
@@ -514,7 +545,9 @@ class Trainer:
         some = spread_views(self.scene.test, SAMPLED_VIEWS) if self.scene.test and sample else []
         views = self.scene.test if every else some
         with self._overhead.timed("evaluation") if views else nullcontext():
-            found = {view.name: self._psnr(run, view) for view in views}
+            learned = None if run.exposures is None else run.exposures.archived()
+            exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
+            found = {view.name: self._psnr(run, view, exposures.get(view.name)) for view in views}
         measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
         if some:
             plain, fitted = zip(*(found[view.name] for view in some), strict=True)
@@ -522,14 +555,20 @@ class Trainer:
         return measured
 
     @torch.no_grad()
-    def _psnr(self, run: StageRun, view: View) -> tuple[float, float]:
-        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, as it is and fitted."""
+    def _psnr(self, run: StageRun, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
+        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, and after a colour fit.
+
+        Args:
+            exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
+        """
         camera = level_camera(view.camera, run.stage.level)
         image = self.rasterizer(run.model.field, camera, background=run.background).image
         cached = None if self._test_cache is None else self._test_cache.get
         predict = cached if run.joint is None else run.joint.predict
         image = add_prediction(image, None if predict is None else predict(view.name))
         whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
+        if exposure is not None:
+            whole = transform_colors(whole, exposure.to(self.device))
         mask = None if view.mask is None else view.mask.to(self.device)
         photo = view.image.to(self.device)
         return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
@@ -580,12 +619,15 @@ class Trainer:
     def _save_checkpoint(self, run: StageRun) -> None:
         with self._overhead.timed("checkpoints"):
             kept = {} if self._best is None else {"best": self._best}
-            self.archive.save_checkpoint({**run.state(), **kept, "overhead": dict(self._overhead)})
+            state = {**run.state(), **kept, "overhead": dict(self._overhead)}
+            self.archive.save_checkpoint(state, extends_to=self.settings.iterations)
         self._last_checkpoint = time.monotonic()
 
     def _finish(self, run: StageRun) -> None:
         """Archive a finished stage."""
         self._take_best(run)
+        before = self._to_extend(self.plan[run.stage.level])
+        used = {} if before is None else before.memory_bytes
         field = run.model.field.detach()
         record = LevelRecord(
             level=run.stage.level,
@@ -596,7 +638,7 @@ class Trainer:
             train_seconds=run.progress.seconds,
             overhead_seconds=dict(self._overhead),
             image_size=run.stage.image_size,
-            memory_bytes=self._memory.note(self._image_bytes),
+            memory_bytes={name: max(n, used.get(name, 0)) for name, n in self._memory.note(self._image_bytes).items()},
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
             gpu_busy_seconds=run.busy.seconds(),
@@ -604,7 +646,11 @@ class Trainer:
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         along = None if run.joint is None else run.joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
-        self.archive.finish_level(record, field, moments, along, exposure)
+        if before is None:
+            self.archive.finish_level(record, field, moments, along, exposure)
+        else:
+            extended = {"iterations": self.settings.iterations, "extended": self.settings.extended}
+            self.archive.finish_extension(record, {**(along or {}), run.stage.level: field}, exposure, extended)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property

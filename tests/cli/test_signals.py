@@ -146,7 +146,7 @@ def test_a_signal_while_a_command_starts(which: signal.Signals, delay: float, sc
 
 @pytest.mark.parametrize(
     ("name", "which"),
-    [("sample", signal.SIGTERM), ("render", signal.SIGINT), ("view", signal.SIGTERM), ("view", signal.SIGINT)],
+    [("sample", signal.SIGTERM), ("render", signal.SIGTERM), ("view", signal.SIGTERM), ("view", signal.SIGINT)],
 )
 def test_a_signal_in_the_middle_of_a_command(
     name: str, which: signal.Signals, scene: Path, run: Path, tmp_path: Path
@@ -228,6 +228,23 @@ def test_an_interruption_that_a_callback_loses_is_raised_again() -> None:
     assert time.monotonic() - begin < 25
     assert done.returncode == 143
     assert done.stderr == "lapgs: stopped by SIGTERM\n"
+
+
+PREPARING = """
+import os, signal, sys
+import lapgs_plugin.scenes.prepare as prepare
+from lapgs_plugin.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+prepare.prepare_scene = lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+sys.argv = ["lapgs", "prepare", "photos", "scene"]
+main()
+"""
+
+
+def test_a_stopped_prepare_says_that_repeating_it_continues() -> None:
+    done = subprocess.run([sys.executable, "-c", PREPARING], capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == "lapgs: stopped by Ctrl-C; repeat the command to go on where it stopped\n"
 
 
 CAMPAIGN = 150

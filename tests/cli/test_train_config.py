@@ -52,6 +52,19 @@ def test_the_command_line_comes_before_the_file(scene: Path, tmp_path: Path) -> 
     assert (manifest.seed, manifest.settings["iterations"], manifest.levels) == (5, 8, 1)
 
 
+def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: Path) -> None:
+    run, words = tmp_path / "run", ("train", scene, "-o", tmp_path / "run", "--resume", "--iterations")
+    lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)
+    for asked in (7, 8):
+        with pytest.raises(UserInputError, match=f"--iterations {asked}: the run in .* is finished with 8; give more"):
+            lapgs(*words, asked)
+    assert read_toml(run / "run.toml")["iterations"] == 8
+    lapgs(*words, 11)
+    assert read_toml(run / "run.toml")["iterations"] == 11
+    settings = RunArchive.open(run).manifest.settings
+    assert (settings["iterations"], settings["extended"]) == (11, 3)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -27,9 +27,9 @@ OTHER = "diff_gaussian_rasterization_abs"
 def fork(tmp_path: Path) -> Path:
     """Make a fork whose scripts are in a folder, and whose renderer imports another rasterizer when it is called."""
     root = Path(shutil.copytree(CHECKOUTS / "graphdeco", tmp_path / "fork", ignore=shutil.ignore_patterns("__pyc*")))
-    (root / "ms").mkdir()
+    (root / "scripts").mkdir()
     script = (root / "train.py").read_text(encoding="utf-8")
-    (root / "ms" / "train.py").write_text("import sys\nsys.path.append('..')\nimport open3d\n" + script)
+    (root / "scripts" / "train.py").write_text("import sys\nsys.path.append('..')\nimport open3d\n" + script)
     (root / "train.py").unlink()
     renderer = root / "gaussian_renderer" / "__init__.py"
     text = renderer.read_text(encoding="utf-8")
@@ -43,7 +43,7 @@ def fork(tmp_path: Path) -> Path:
 
 
 def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
-    source = CheckoutSource.read(fork / "ms" / "train.py")
+    source = CheckoutSource.read(fork / "scripts" / "train.py")
     assert source.root == fork
     assert source.model[0] == "GaussianModel"
     assert source.model[1].startswith("scene/gaussian_model.py:")
@@ -61,7 +61,7 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
 
 def test_a_rasterizer_that_is_not_installed_is_the_checkouts_own(fork: Path) -> None:
     error = ModuleNotFoundError(f"No module named '{OTHER}'", name=OTHER)
-    script = fork / "ms" / "train.py"
+    script = fork / "scripts" / "train.py"
     on_gpu, on_cpu = (explain_import_error(error, script, on_cpu=on_cpu) for on_cpu in (False, True))
     for line in map(str, (on_gpu, on_cpu)):
         assert line.startswith("gaussian_renderer/__init__.py:")
@@ -82,9 +82,9 @@ def test_a_name_that_a_stand_in_lacks(fork: Path) -> None:
 def test_a_package_that_is_not_installed_is_to_be_installed(fork: Path) -> None:
     """As open3d of Mip-Splatting."""
     error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
-    line = str(explain_import_error(error, fork / "ms" / "train.py", on_cpu=True))
+    line = str(explain_import_error(error, fork / "scripts" / "train.py", on_cpu=True))
     assert line == (
-        "ms/train.py:3 needs open3d, which cannot be imported (No module named 'open3d'): pip install open3d"
+        "scripts/train.py:3 needs open3d, which cannot be imported (No module named 'open3d'): pip install open3d"
     )
 
 
@@ -136,9 +136,10 @@ def test_doctor_describes_a_checkout(
     monkeypatch.setenv("COLUMNS", "300")
     lapgs("doctor", fork)
     text = capsys.readouterr().out
-    for part in (str(fork), "--backbone generic", "ms/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
+    for part in (str(fork), "--backbone generic", "scripts/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
         assert part in text
     lapgs("doctor", CHECKOUTS / "taming")
     text = capsys.readouterr().out
     assert "Taming-3DGS (--backbone taming)" in text
     assert "stand-in taming" in text
+    assert "iteration == args.ho_iteration (modify_functions)" in text, "what the loop does by iteration"

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.images import view_images
 from lapgs_plugin.reports.pictures import edge_squares, make_strip
 from lapgs_plugin.scenes.scene import View
 from tests.training_scene import blob_field, ring_camera
@@ -68,3 +69,12 @@ def test_base_and_residual_add_up_to_the_composition_pixel_by_pixel() -> None:
         left, top = (round(share * size / 100) for share, size in ((cutout.left, 56), (cutout.top, 40)))
         whole = composed[:, top : top + cutout.side, left : left + cutout.side].permute(1, 2, 0).numpy()
         assert composition == pytest.approx(whole, abs=0.5001 / 255)
+
+
+def test_nested_levels_have_differences_and_no_residuals() -> None:
+    camera, fields = ring_camera(0.3), {1: blob_field(), 0: blob_field(seed=1)}
+    renderer = HierarchyRenderer(fields, 2, Pyramid(), CpuRasterizer(), background=(0.3, 0.3, 0.3))
+    composition = renderer.render(camera)
+    strip = make_strip(View("a.png", camera, composition.composed[0]), "why", "figures", [renderer])
+    assert [picture.caption for picture in strip.pictures] == ["Photo", "Base", "Difference", "Composition"]
+    assert set(view_images(composition, None, raw=True, nested=renderer.nested)) == {"base", "difference_0", "composed"}

@@ -247,7 +247,7 @@ def test_thresholds_and_limits_of_stages() -> None:
     assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
     mcmc = Densification(strategy="mcmc", options=Mcmc(cap_max=9, base_cap_max=5))
     capped = replace(settings, residual_threshold=1.0, densification=mcmc)
-    assert [capped.strategy_of(stage) for stage in plan] == [Mcmc(cap, 5) for cap in (5, 9, 9)]
+    assert [capped.strategy_of(stage) for stage in plan] == [Mcmc(cap_max=cap, base_cap_max=5) for cap in (5, 9, 9)]
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:

@@ -221,39 +221,6 @@ def _photometric_kernel(
             sums[task, 1] += ssim_sum[x + RADIUS]
 
 
-@jit
-def _ssim_kernel(
-    counter: Integers, blocks: Integers, pitch: int, prediction: Floats, target: Floats, ssim: Floats
-) -> None:
-    """Compute SSIM of each pixel, (c, h, w)."""
-    width, dtype = prediction.shape[2], prediction.dtype
-    wide = _MOMENTS * pitch
-    moments, unused = np.zeros(4 * _GROUP * wide, dtype), np.zeros(_DERIVATIVES * pitch, dtype)
-    filtered = np.zeros(_GROUP * wide + WIDTH, dtype)
-    p_row, t_row = np.empty(pitch, dtype), np.empty(pitch, dtype)
-    inside, row = np.empty(pitch, dtype), np.empty(pitch, dtype)
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= len(blocks):
-            return
-        channel, top, bottom, start, stop = blocks[task]
-        left, first, last = start - 2 * RADIUS, max(start - 2 * RADIUS, 0), min(stop + 2 * RADIUS, width)
-        _mark_inside(start - RADIUS, width, inside)
-        for group, y in enumerate(range(top - RADIUS, bottom + RADIUS, _GROUP)):
-            for i in range(_GROUP):
-                _copy_row(prediction[channel], y + i, left, first, last, p_row)
-                _copy_row(target[channel], y + i, left, first, last, t_row)
-                _store_moments(p_row, t_row, pitch, moments, (group % 4 * _GROUP + i) * wide)
-            if y + _GROUP <= top + RADIUS:
-                continue
-            _filter_down(moments, group, wide, filtered)
-            for i in range(_GROUP):
-                centre = y - RADIUS + i
-                if top <= centre < bottom:
-                    _store_derivatives(filtered, i * wide, inside, pitch, unused, 0, row)
-                    ssim[channel, centre, start:stop] = row[RADIUS : RADIUS + stop - start]
-
-
 @lru_cache(maxsize=64)
 def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
     """Cut an image into blocks, (blocks, 5): channel, first and last row, first and last column; and a row's pitch.
@@ -333,21 +300,3 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
         raise UserInputError(f"ssim_weight {ssim_weight}: expected a number from 0 to 1, such as 0.2")
     loss: Tensor = _PhotometricLoss.apply(prediction, target, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss
-
-
-def ssim_map_cpu(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return SSIM of each pixel and channel, (c, h, w); not differentiable.
-
-    Raises:
-        UserInputError: the images differ in shape or type, or are not float32 or float64 on the CPU.
-    """
-    _check(prediction, target)
-    images = [image.detach().contiguous().numpy() for image in (prediction, target)]
-    ssim = np.empty_like(images[0])
-    parallel(_ssim_kernel, *_blocks(*prediction.shape), *images, ssim)
-    return torch.from_numpy(ssim)
-
-
-def ssim_cpu(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the mean of `ssim_map_cpu`, a scalar: the SSIM that papers on 3DGS report."""
-    return ssim_map_cpu(prediction, target).mean()

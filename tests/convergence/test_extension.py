@@ -1,0 +1,177 @@
+"""A finished run is trained further by `lapgs train --resume --iterations MORE`."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.cli.train import _extended
+from lapgs_plugin.errors import TrainingStoppedError, UserInputError
+from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import ring_scene
+
+BEFORE, AFTER = 40, 64
+WRITE_JSON = RunArchive._write_json
+SETTINGS = TrainSettings(
+    iterations=BEFORE,
+    hierarchy="laplacian",
+    sh_degree=1,
+    sh_every=10,
+    densification=Densification(start=3, until=1000, every=5, reset_every=50),
+    joint=0.25,
+)
+KINDS = {
+    "laplacian": SETTINGS,
+    "nested": replace(SETTINGS, hierarchy="nested", joint=None),
+    "one field": replace(SETTINGS, levels=1, joint=None, exposure="on", keep="best"),
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ring_scene(train=12)
+
+
+class StopAt(Monitor):
+    """Stop the run, as Ctrl-C does, when the finest level reaches an iteration."""
+
+    def __init__(self, iteration: int) -> None:
+        self._iteration = iteration
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == (0, self._iteration):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def finished(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    settings, path = KINDS[request.param], tmp_path_factory.mktemp("finished") / "run"
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
+    with RunArchive.create(path, manifest) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer()).run()
+    return path
+
+
+def extend(path: Path, scene: Scene, asked: int | None = AFTER, monitor: Monitor | None = None) -> None:
+    with RunArchive.open(path, resume=True) as archive:
+        settings = _extended(archive, TrainSettings.from_manifest(archive.manifest), asked)
+        Trainer(scene, settings, archive, CpuRasterizer(), monitor=monitor or Monitor()).run(resume=True)
+
+
+def fails_at_the_manifest(self: RunArchive, name: str, values: dict[str, Any], training: bool = False) -> None:
+    if name == MANIFEST:
+        raise OSError("no room")
+    WRITE_JSON(self, name, values, training)
+
+
+def contents(path: Path) -> list[bytes]:
+    archive = RunArchive.open(path)
+    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+
+
+def quality(path: Path, scene: Scene) -> float:
+    renderer = HierarchyRenderer.from_archive(RunArchive.open(path), CpuRasterizer())
+    return fmean(psnr(renderer.render(view.camera).composed[0], view.image) for view in scene.train)
+
+
+def test_a_finished_run_is_extended(finished: Path, scene: Scene, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(finished, tmp_path / "run"))
+    old = RunArchive.open(finished)
+    RunArchive.open(path).write_metrics({"psnr": 1.0})
+    extend(path, scene)
+    new = RunArchive.open(path)
+    settings = TrainSettings.from_manifest(new.manifest)
+    assert (settings.iterations, settings.extended) == (AFTER, AFTER - BEFORE)
+    (*coarser, before), (*same, after) = old.manifest.records, new.manifest.records
+    assert coarser == same
+    assert after.iterations == before.iterations + AFTER - BEFORE
+    assert after.num_gaussians == before.num_gaussians
+    assert after.train_seconds > before.train_seconds
+    assert not new.path(CHECKPOINT).exists()
+    assert new.metrics() is None, "they were of the shorter run"
+    joint = old.manifest.settings["joint"] > 0
+    assert [a != b for a, b in zip(contents(finished), contents(path), strict=True)][:-1] == [joint] * len(coarser)
+    assert contents(finished)[-1] != contents(path)[-1]
+    # It rose by 0.9 dB at least.
+    assert quality(path, scene) >= quality(finished, scene)
+    history = new.history()
+    assert history[: len(old.history())] == old.history()
+    assert (history[-1]["level"], history[-1]["iteration"]) == (0, after.iterations)
+    assert all(a["elapsed"] <= b["elapsed"] for a, b in itertools.pairwise(history))
+    unchanged = contents(path)
+    extend(path, scene, None)
+    assert contents(path) == unchanged, "nothing is left to do"
+
+
+@pytest.mark.parametrize("finished", ["laplacian", "one field"], indirect=True)
+def test_an_interrupted_extension_leaves_the_run_and_continues(finished: Path, scene: Scene, tmp_path: Path) -> None:
+    whole, parts = (Path(shutil.copytree(finished, tmp_path / name)) for name in ("whole", "parts"))
+    extend(whole, scene)
+    stop = RunArchive.open(finished).manifest.records[-1].iterations + 11
+    with pytest.raises(TrainingStoppedError):
+        extend(parts, scene, monitor=StopAt(stop))
+    assert contents(parts) == contents(finished)
+    assert RunArchive.open(parts).manifest == RunArchive.open(finished).manifest
+    with pytest.raises(UserInputError, match=f"--iterations {AFTER + 1}: .* is being extended to {AFTER}; leave"):
+        extend(parts, scene, AFTER + 1)
+    extend(parts, scene, None)
+    assert contents(parts) == contents(whole)
+
+
+@pytest.mark.parametrize("finished", ["laplacian"], indirect=True)
+def test_an_extension_that_cannot_be_written_leaves_the_run(
+    finished: Path, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = Path(shutil.copytree(finished, tmp_path / "run"))
+    with monkeypatch.context() as patch:
+        patch.setattr(RunArchive, "_write_json", fails_at_the_manifest)
+        with pytest.raises(OSError, match="no room"):
+            extend(path, scene)
+    assert list(path.glob("level_0/extended_*")), "written, but they do not count"
+    assert contents(path) == contents(finished)
+    extend(path, scene)
+    assert not list(path.glob("level_*/extended_*"))
+
+
+@pytest.mark.parametrize("finished", ["one field"], indirect=True)
+@pytest.mark.parametrize("asked", [BEFORE, BEFORE - 1])
+def test_no_more_iterations_are_refused(finished: Path, scene: Scene, asked: int) -> None:
+    with pytest.raises(UserInputError, match=f"--iterations {asked}: the run in .* is finished with {BEFORE}; give"):
+        extend(finished, scene, asked)
+
+
+def test_the_schedule_goes_on_as_it_ended() -> None:
+    settings = replace(SETTINGS, iterations=4000, levels=1, joint=None, densification=Densification(until=10_000))
+    stage = Stage(0, (64, 48), 4000, signed=False)
+    longer = StageSchedule.create(replace(settings, iterations=5001, extended=1001), stage)
+    schedule = StageSchedule.create(settings, stage)
+    assert longer.means_learning_rate(4500) == schedule.means_learning_rate(4000)
+    assert longer.densify_until == 4000
+    calm = replace(settings, densification=Densification(until=2000))
+    longer = StageSchedule.create(replace(calm, iterations=5001, extended=1001), stage)
+    done, steps = 0, []
+    while done < longer.end:
+        steps.append(longer.views_of_step(done))
+        done += steps[-1]
+    assert done == 5001
+    assert set(steps[-100:-1]) == {calm.gather}
+    assert all(4000 < each <= 5001 for each in longer.sampled(4))
