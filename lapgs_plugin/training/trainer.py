@@ -221,8 +221,9 @@ class Trainer:
                 residuals = any(stage.signed for stage in self.plan)
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
-                if not resume and (line := few_views_line(len(self.scene.train), self.plan.iterations)):
-                    self.monitor.say(line)
+                few = few_views_line(len(self.scene.train), self.plan.iterations, bool(self.scene.test))
+                if few is not None and not resume:
+                    self.monitor.say(few)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels and self._to_extend(stage) is None:
                         continue
