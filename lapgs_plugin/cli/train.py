@@ -104,7 +104,7 @@ def train(
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(control.rasterizer), overwrite)
-        write_config(archive.path(RUN_CONFIG), context)
+        write_config(archive.path(RUN_CONFIG), context, masks=reference.masks)
     with archive:
         _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
         if resume and settings.extended:

@@ -170,13 +170,10 @@ class ActiveStage:
         self._context.hooks.stage_ends(self.stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
-        try:
-            if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
-                with self.record.overhead.timed("evaluation"):
-                    self._measure_held_out(gaussians, self.stage.iterations)
-        finally:  # an evaluation that fails must not cost the stage
-            result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
-            self.record.archive(result, None if self._joint is None else self._joint.export_fields())
+        result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
+        self.record.archive(result, None if self._joint is None else self._joint.export_fields())
+        if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
+            self._evaluate(gaussians)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
@@ -248,6 +245,18 @@ class ActiveStage:
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
         self._views.rendering.accumulated = self._joint
+
+    def _evaluate(self, gaussians: Any) -> None:
+        """Measure the held-out views of the archived level; a failure costs no more than the measurement."""
+        try:
+            with self.record.after_archive("evaluation"):
+                self._measure_held_out(gaussians, self.stage.iterations)
+        except Exception as error:
+            logger.warning(
+                "held-out views of level %d could not be measured (%s: %s); the level is in the run folder, and `lapgs "
+                "eval` measures the run",
+                *(self.stage.level, type(error).__name__, (str(error).splitlines() or ["no message"])[0]),
+            )
 
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""

@@ -112,6 +112,7 @@ class DryRun:
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
             self._require_three_axes(gaussians)
+            gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))

@@ -126,6 +126,14 @@ class StageRecord:
             with self.outside("profile"):
                 self._busy.step(done)
 
+    @contextmanager
+    def after_archive(self, purpose: str) -> Iterator[None]:
+        """Count the time inside as overhead of the archived level."""
+        overhead = Overhead(settle=self._synchronize)
+        with overhead.timed(purpose):
+            yield
+        self._archive.add_overhead(overhead)
+
     def _write_history(self, iteration: int, values: Mapping[str, Any]) -> None:
         self._archive.append_history({"level": self._window.stage.level, "iteration": iteration, **values})
 

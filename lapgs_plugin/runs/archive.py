@@ -288,6 +288,17 @@ class RunArchive:
             self.path(CHECKPOINT).unlink(missing_ok=True)
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
 
+    def add_overhead(self, seconds: Mapping[str, float]) -> None:
+        """Add seconds by purpose to the overhead of the level that was finished last."""
+        self._require_lock()
+        *before, last = self._manifest.records
+        total = {**last.overhead_seconds}
+        for purpose, value in seconds.items():
+            total[purpose] = total.get(purpose, 0.0) + value
+        manifest = replace(self._manifest, records=(*before, replace(last, overhead_seconds=total)))
+        self._write_json(MANIFEST, asdict(manifest), training=True)
+        self._manifest = manifest
+
     def finish_extension(
         self,
         record: LevelRecord,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runs.archive import RunArchive
 from tests.contract.stub_runs import CHECKOUTS, NAMES, STUBS, Result, captured, drive, loaded, run_bare
 
@@ -66,3 +68,18 @@ def test_what_fails_is_one_line_with_its_place(failure: str, scene: Path, tmp_pa
         drive(adapter, dry_run=True, hierarchy="laplacian" if failure.startswith("residuals") else "nested")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_an_evaluation_that_fails_costs_no_run(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: Any) -> None:
+        assert RunArchive.open(tmp_path / "run").manifest.complete, "archived before"
+        raise RuntimeError("no image\nat all")
+
+    monkeypatch.setattr(StageViews, "held_out_quality", broken)
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT) as adapter:
+        drive(adapter, levels=1)
+    assert RunArchive.open(tmp_path / "run").field(0).means.isfinite().all()
+    (warning,) = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert "held-out views of level 0 could not be measured (RuntimeError: no image); " in warning
