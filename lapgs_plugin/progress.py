@@ -35,7 +35,9 @@ class LoggingProgress(Progress):
     """
 
     def __init__(self, *columns: ProgressColumn, console: Console, unit: str, **options: Any) -> None:
-        super().__init__(*columns, console=console, disable=not console.is_terminal, **options)
+        shown = console.is_terminal
+        # The thread with which rich refreshes a bar, and counts in `track`, ends at once where no bar is shown.
+        super().__init__(*columns, console=console, disable=not shown, auto_refresh=shown, **options)
         self._unit = unit
         self._printed: dict[TaskID, tuple[float, float]] = {}  # when, and completed items
 

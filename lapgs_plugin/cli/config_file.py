@@ -73,16 +73,21 @@ def extend_config(path: Path, iterations: int, extended: int) -> None:
             file.write(text.encode())
 
 
-def write_config(path: Path, context: typer.Context) -> None:
+def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
     """Write the parameters of a command that runs as a settings file that makes the same run.
 
     Parameters that are None and `OF_ONE_CALL` are left out.
+
+    Args:
+        path: of the file.
+        context: of the command.
+        replaced: parameters' values that mean the same in every folder, instead of those that were given.
     """
     lines = [
         f"# Made by lapgs {__version__}. The same again: {context.command_path} --config {path.name} -o NEW_FOLDER"
     ]
     for name in (str(each.name) for each in context.command.params):
-        value = context.params.get(name)
+        value = replaced.get(name, context.params.get(name))
         if value is None or name in OF_ONE_CALL or (isinstance(value, float) and not math.isfinite(value)):
             continue
         text = json.dumps(str(value.absolute()) if isinstance(value, Path) else value, ensure_ascii=False)

@@ -196,6 +196,12 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         + (", as in this run, whose renders have the mean exposure" if metrics["exposure_compensated"] else ""),
         highlight=False,
     )
+    if metrics["exposure_predicted"]:
+        console.print(
+            "the other figures are of renders with the exposure that the training photos beside each view in the order "
+            "of names predict",
+            highlight=False,
+        )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]
         console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)

@@ -147,7 +147,7 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
     from lapgs_plugin.training.merge import ITERATIONS, merge_levels
     from lapgs_plugin.training.monitor import ProgressMonitor
 
-    with ProgressMonitor(Console(stderr=True), 1) as monitor:
+    with ProgressMonitor(Console(stderr=True), 1, advice=False) as monitor:
         merged = merge_levels(archive, scene, iterations=iterations or ITERATIONS, monitor=monitor)
     line = f"{merged.kept:.2f} dB PSNR against the run's own images of {merged.views} views that it was not fitted to"
     if merged.photo_psnr is not None:

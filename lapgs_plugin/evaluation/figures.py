@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -12,10 +12,12 @@ from torch import Tensor
 
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr, ssim
 from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
@@ -63,8 +65,22 @@ class ViewMetrics:
     upsampled_psnr: dict[int, float]
 
 
-def measure_view(view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics) -> ViewMetrics:
-    """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device."""
+def measure_view(
+    view: View,
+    composition: Composition,
+    renderer: HierarchyRenderer,
+    lpips: LpipsMetrics,
+    exposure: Tensor | None = None,
+) -> ViewMetrics:
+    """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device.
+
+    Args:
+        exposure: (3, 4) colour transform from renders to this photo; None for renders as they are.
+    """
+    if exposure is not None:
+        transform = exposure.to(renderer.device)
+        composed = {level: transform_colors(image, transform) for level, image in composition.composed.items()}
+        composition = replace(composition, composed=composed)
     photo, mask = view.image.to(renderer.device), None
     targets: list[tuple[Tensor, Tensor | None]]
     if view.mask is None:
@@ -116,9 +132,11 @@ def evaluate_run(
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
         smallest = min(min(view.camera.width, view.camera.height) for view in views)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
+        learned = archive.exposure(archive.available_levels[-1])
+        exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
         with item_progress("views") as progress:
             measured = [
-                measure_view(view, renderer.render(view.camera), renderer, distances)
+                measure_view(view, renderer.render(view.camera), renderer, distances, exposures.get(view.name))
                 for view in progress.track(views, description=f"Measuring {split} views")
             ]
         speed = composed_speed(renderer, [view.camera for view in views[:FPS_VIEWS]], FPS_ROUNDS)
@@ -127,7 +145,8 @@ def evaluate_run(
         "lpips_missing": dict(distances.missing),
         "fps": speed.fps,
         "masked": any(view.mask is not None for view in views),
-        "exposure_compensated": archive.exposure(archive.available_levels[-1]) is not None,
+        "exposure_compensated": learned is not None,
+        "exposure_predicted": bool(exposures),
     }
     archive.write_metrics(metrics)
     return metrics
@@ -180,6 +199,8 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         fps: frames a second of the composed image, the median over some views; added by `evaluate_run`.
         exposure_compensated: whether the run learned colour transforms of its photos, so that its renders have
             their mean exposure; added by `evaluate_run`, absent in older files.
+        exposure_predicted: whether they were measured with the exposure that neighbouring photos predict, see
+            `predicted_exposures`; added by `evaluate_run`, absent in older files.
         masked: whether pixels outside of masks were left out; added by `evaluate_run`, absent in older files.
         split, num_views: the measured views, "test" or "train", and their number.
         train_seconds and other figures of training: see `training_figures`.

@@ -179,6 +179,7 @@ class Viewer {
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
     this.uniform = (name) => gl.getUniformLocation(program, name);
     const rows = bytes.length / 32 / ROW;
@@ -234,6 +235,7 @@ class Viewer {
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, event);
+      if (event.pointerType === "touch") words.hidden = true;  // a phone has no H
     });
     for (const end of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));

@@ -2,7 +2,7 @@
 
 Each sparse point is looked up in all photos that see it. A photo's gain is the factor by which its points are brighter
 than the same points in the other photos. Points hidden behind others are left out as far as nearer points tell; the
-rest of them spread widely, so that the mode of the differences is hardly affected. Gains are measured for the left and
+rest of them disagree with the other photos widely, and count little. Gains are measured for the left and
 the right half of each photo separately: a change of exposure moves both halves alike, reflections and shadows do not.
 """
 
@@ -27,10 +27,8 @@ DARKEST, BRIGHTEST = 0.04, 0.96
 """Values outside are noise or clipped, and tell nothing about a gain."""
 LEAST_POINTS, LEAST_VIEWS = 40, 4
 """Fewest visible points of half a photo, and fewest photos of a point, with which a gain is measured."""
-BANDWIDTHS = (0.5, 0.25, 0.15, 0.15)
-"""Of the steps towards a mode, in stops."""
-ROUNDS = 3
-"""How often points' colours and photos' gains are estimated in turn."""
+BANDWIDTHS = (0.8, 0.8, 0.4, 0.4, 0.2, 0.2, 0.15, 0.15)
+"""Differences that count, in stops, in the steps of an estimate: narrower and narrower."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +59,18 @@ def measure_exposure(scene: Scene) -> MeasuredExposure:
     often = usable.sum(0) >= LEAST_VIEWS
     usable, right = usable[:, often], right[:, often]
     colors = colors[:, often].clamp(DARKEST, BRIGHTEST)
-    brightness = colors.mean(-1).log2()
+    brightness = colors.mean(-1).log2()  # (v, n)
     halves = [usable & side for side in (~right, right)]
     known = torch.stack([half.sum(1) >= LEAST_POINTS for half in halves]).all(0)  # (v,)
     gains = torch.zeros(len(scene.train), 3)
     if int(known.sum()) < LEAST_VIEWS:
         return MeasuredExposure(gains, 0.0)
-    whole = brightness.new_zeros(len(brightness))
-    for _ in range(ROUNDS):
-        points = _modes((brightness - whole[:, None]).T, usable.T)
-        whole = _modes(brightness - points, usable)
-        whole = whole - whole[known].median()
+    weights = _agreement(brightness, usable)
+    _, points = _solve(brightness, weights)
     left, other = (_modes(brightness - points, half)[known] for half in halves)
+    left, other = left - left.median(), other - other.median()
     for channel in range(3):
-        by_channel = colors[..., channel].log2()
-        points = _modes((by_channel - whole[:, None]).T, usable.T)
-        found = _modes(by_channel - points, usable)
+        found, _ = _solve(colors[..., channel].log2(), weights)
         gains[known, channel] = (found - found[known].median())[known]
     agreed, disagreed = (_robust_deviation((left + sign * other) / 2) for sign in (1, -1))
     return MeasuredExposure(gains, math.sqrt(max(0.0, agreed**2 - disagreed**2)))
@@ -106,6 +100,29 @@ def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     cell = torch.where(inside, (CELLS * y).floor() * CELLS + (CELLS * x).floor(), 0.0).long()
     nearest = torch.full((CELLS * CELLS,), math.inf).scatter_reduce(0, cell[inside], depth[inside], "amin")
     return x, y, inside & (depth <= nearest[cell] * DEPTH_MARGIN)
+
+
+def _agreement(values: Tensor, usable: Tensor) -> Tensor:
+    """Return weights (v, n) of the usable values of photos and points: near 0 where a photo sees something else."""
+    gains = values.new_zeros(len(values))
+    points = torch.where(usable, values, math.nan).nanmedian(dim=0).values.nan_to_num()
+    weights = usable.float()
+    for bandwidth in BANDWIDTHS:
+        weights = torch.exp(-(((values - gains[:, None] - points) / bandwidth) ** 2)) * usable
+        gains, points = _solve(values, weights)
+    return weights
+
+
+def _solve(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return gains (v,) of photos and values (n,) of points whose sums are closest to values (v, n), in least squares.
+
+    Solved for all photos at once: gains carry over between photos only through those that see the same points.
+    """
+    by_point = weights.sum(0).clamp_min(1e-6)
+    means = (weights * values).sum(0) / by_point
+    system = torch.diag(weights.sum(1) + 1e-3) - (weights / by_point) @ weights.T  # a sum of all gains would be free
+    gains = torch.linalg.solve(system.double(), (weights * (values - means)).sum(1).double()).float()
+    return gains, (weights * (values - gains[:, None])).sum(0) / by_point
 
 
 def _modes(values: Tensor, usable: Tensor) -> Tensor:

@@ -52,6 +52,10 @@ def find_photos(source: Path) -> Photos:
         SceneError: there are fewer than two photos, or two would have the same name after undistortion.
         MissingExtraError: there are HEIC photos, and pillow-heif is not installed.
     """
+    if source.is_file() and source.suffix.lower() in (*SUFFIXES, *HEIC):
+        raise SceneError(
+            f"{source}: one photo, expected a folder of at least 2, better 30, or a video; give the folder"
+        )
     if source.is_file():
         return Photos(source.parent, {}, source)
     if not source.is_dir():

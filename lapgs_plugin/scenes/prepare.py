@@ -145,8 +145,10 @@ def prepare_scene(
     if masks is not None and not masks.is_dir():
         raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
     found = find_photos(photos)
-    if frames is not None and (found.clip is None or frames < 2):
-        raise UserInputError(f"--frames {frames}: expected at least 2, and a video instead of {photos}")
+    if frames is not None and frames < 2:
+        raise UserInputError(f"--frames {frames}: expected at least 2")
+    if frames is not None and found.clip is None:
+        raise UserInputError(f"--frames {frames}: it picks frames from a video, and {photos} is a folder; leave it out")
     settings = {
         "photos": _stats(found),
         "--matcher": matcher,

@@ -30,7 +30,7 @@ from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 
 ITERATIONS = 3000
@@ -145,6 +145,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSetti
         sh_degree=sh_degree,
         sh_every=1,
         sh_rate_factor=1.0,
+        exposure=OFF,  # what the run learned of its photos' exposure is part of its images
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
         densification=Densification(until=0, reset_every=0),

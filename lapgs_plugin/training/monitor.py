@@ -52,10 +52,16 @@ class Monitor:
 
 
 class ProgressMonitor(Monitor):
-    """Show a progress bar for each stage: rate, time left, loss, Gaussians, held-out PSNR. Use as a context manager."""
+    """Show a progress bar for each stage: rate, time left, loss, Gaussians, held-out PSNR. Use as a context manager.
 
-    def __init__(self, console: Console, levels: int) -> None:
-        self._levels = levels
+    Args:
+        console: to print to.
+        levels: of the run.
+        advice: print lines of text too, which name options of `lapgs train`.
+    """
+
+    def __init__(self, console: Console, levels: int, advice: bool = True) -> None:
+        self._levels, self._advice = levels, advice
         self._progress = LoggingProgress(
             TextColumn("{task.description}", table_column=Column(no_wrap=True)),
             BarColumn(bar_width=None, table_column=Column(ratio=1)),
@@ -99,4 +105,5 @@ class ProgressMonitor(Monitor):
         self._progress.update(self._task, completed=tick.iteration, figures=figures)
 
     def say(self, text: str) -> None:
-        self._progress.console.print(text)
+        if self._advice:
+            self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -46,8 +46,8 @@ def require_views_to_set_aside(count: int) -> None:
     """Raise a UserInputError if there are too few training views to set some aside."""
     if count < LEAST_VIEWS:
         raise UserInputError(
-            f"--keep best: sets training views aside, and the scene has {count}, expected at least {LEAST_VIEWS}; "
-            "leave it out"
+            f"--keep best: sets training views aside, and the scene has {count} of them, expected at least "
+            f"{LEAST_VIEWS}; leave it out"
         )
 
 
@@ -58,15 +58,22 @@ def copied(state: Any) -> Any:
     return {key: copied(value) for key, value in state.items()} if isinstance(state, dict) else state
 
 
-def few_views_line(views: int, iterations: int) -> str | None:
-    """Return a line for a user whose photos are few for the iterations of a run; None if they are enough."""
+def few_views_line(views: int, iterations: int, held_out: bool) -> str | None:
+    """Return a line for a user whose photos are few for the iterations of a run; None if they are enough.
+
+    Args:
+        views: that are trained on.
+        iterations: of all stages.
+        held_out: whether other views are measured during the run.
+    """
     passes = iterations // views
     if views >= FEW_VIEWS or passes <= MANY_PASSES:
         return None
     keep = " or --keep best" if views >= LEAST_VIEWS else ""
+    shows = "the held-out PSNR" if held_out else "--eval"
     return (
         f"{views} training views are few for {iterations:,} iterations, {passes} passes over them: new views may get "
-        f"worse late in the run; --eval shows it, and fewer --iterations{keep} may help"
+        f"worse late in the run; {shows} shows it, and fewer --iterations{keep} may help"
     )
 
 

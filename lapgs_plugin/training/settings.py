@@ -34,8 +34,7 @@ MOST_VIEWS = 8
 LAST, BEST = "last", "best"
 """Choices of --keep."""
 ON, OFF = "on", "off"
-EXPOSURES = (AUTO, ON, OFF)
-"""Choices of --exposure."""
+"""Choices of --exposure, beside auto."""
 
 ANTIALIASING = "antialiasing"
 """Key of `TrainSettings.raster` for rasterizers and manifests."""
@@ -239,8 +238,8 @@ class TrainSettings(HierarchySettings):
 
     def _check_exposure(self) -> None:
         """Refuse unknown choices, and transforms of an image that is not compared with the photo."""
-        if self.exposure not in EXPOSURES:
-            raise UserInputError(f"--exposure {self.exposure}: expected {', '.join(EXPOSURES)}")
+        if self.exposure not in (AUTO, ON, OFF):
+            raise UserInputError(f"--exposure {self.exposure}: expected {AUTO}, {ON} or {OFF}")
         if self.keep not in (LAST, BEST):
             raise UserInputError(f"--keep {self.keep}: expected {LAST} or {BEST}")
         if self.exposure == ON and not SUPERVISIONS[self.supervision].composes:

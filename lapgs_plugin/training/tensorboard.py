@@ -18,6 +18,8 @@ FIGURES: Mapping[str, str] = {
     "num_gaussians": "training/gaussians",
     "rate": "training/iterations a second",
     "psnr": "held out/PSNR",
+    "sampled_psnr": "held out/PSNR of some views",
+    "sampled_fitted_psnr": "held out/PSNR of some views after a colour fit",
 }
 """Names of a tick's figures in TensorBoard, by its attributes."""
 

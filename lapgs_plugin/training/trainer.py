@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
+from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -28,6 +29,7 @@ from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.ops import densification_statistics
 from lapgs_plugin.ops.adam import StepScale
+from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
@@ -219,8 +221,9 @@ class Trainer:
                 residuals = any(stage.signed for stage in self.plan)
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
-                if not resume and (line := few_views_line(len(self.scene.train), self.plan.iterations)):
-                    self.monitor.say(line)
+                few = few_views_line(len(self.scene.train), self.plan.iterations, bool(self.scene.test))
+                if few is not None and not resume:
+                    self.monitor.say(few)
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels and self._to_extend(stage) is None:
                         continue
@@ -493,7 +496,7 @@ class Trainer:
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
         due_sample = run.reached(self._samples)
-        due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
+        due_tick = run.passed(max(1, self.settings.iterations // LOG_TICKS))
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
         measured = self._held_out(run, due_test, due_sample and self.test_every is None)
@@ -542,7 +545,9 @@ class Trainer:
         some = spread_views(self.scene.test, SAMPLED_VIEWS) if self.scene.test and sample else []
         views = self.scene.test if every else some
         with self._overhead.timed("evaluation") if views else nullcontext():
-            found = {view.name: self._psnr(run, view) for view in views}
+            learned = None if run.exposures is None else run.exposures.archived()
+            exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
+            found = {view.name: self._psnr(run, view, exposures.get(view.name)) for view in views}
         measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
         if some:
             plain, fitted = zip(*(found[view.name] for view in some), strict=True)
@@ -550,14 +555,20 @@ class Trainer:
         return measured
 
     @torch.no_grad()
-    def _psnr(self, run: StageRun, view: View) -> tuple[float, float]:
-        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, as it is and fitted."""
+    def _psnr(self, run: StageRun, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
+        """Return the PSNR in dB of a view, composed so far and upsampled to full resolution, and after a colour fit.
+
+        Args:
+            exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
+        """
         camera = level_camera(view.camera, run.stage.level)
         image = self.rasterizer(run.model.field, camera, background=run.background).image
         cached = None if self._test_cache is None else self._test_cache.get
         predict = cached if run.joint is None else run.joint.predict
         image = add_prediction(image, None if predict is None else predict(view.name))
         whole = to_full_size(image, view.camera, run.stage.level, self._pyramid)
+        if exposure is not None:
+            whole = transform_colors(whole, exposure.to(self.device))
         mask = None if view.mask is None else view.mask.to(self.device)
         photo = view.image.to(self.device)
         return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)

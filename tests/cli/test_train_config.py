@@ -6,10 +6,13 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.training import tensorboard
 from lapgs_plugin.untrusted import read_json_lines, read_toml
 from tests.cli.commands import succeeding
@@ -29,6 +32,16 @@ def test_a_run_folder_has_the_file_that_makes_it_again(scene: Path, tmp_path: Pa
     assert [second.field_path(level).read_bytes() for level in (0, 1)] == [
         first.field_path(level).read_bytes() for level in (0, 1)
     ]
+
+
+def test_masks_are_found_again_from_another_folder(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for view in load_scene(scene).train:
+        write_image(tmp_path / "white" / f"{view.name}.png", torch.ones_like(view.image))
+    monkeypatch.chdir(tmp_path)
+    lapgs("train", scene, "-o", "run", "--masks", "white", "--levels", 1, *SHORT)
+    assert read_toml(tmp_path / "run" / "run.toml")["masks"] == str(tmp_path / "white")
 
 
 def test_the_command_line_comes_before_the_file(scene: Path, tmp_path: Path) -> None:
@@ -91,6 +104,8 @@ def test_tensorboard_has_the_figures_of_the_history(scene: Path, tmp_path: Path)
     assert [event.step for event in losses] == steps
     assert [event.value for event in losses] == pytest.approx([entry["loss"] for entry in entries], rel=1e-6)
     assert len(events.Scalars("held out/PSNR")) == 2
+    sampled = [event.value for event in events.Scalars("held out/PSNR of some views")]
+    assert sampled == pytest.approx([entry["sampled_psnr"] for entry in entries if "sampled_psnr" in entry], rel=1e-6)
 
 
 def test_without_tensorboard_nothing_is_written(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ The figures are those of SorenZhang574/Laplacian-GS, commit acfc560, read from `
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,7 @@ def test_the_releases_rate_of_sh_and_no_pruning_by_size(scene: Path, tmp_path: P
         model = adapter.train.GaussianModel
         densify = model.densify_and_prune
 
+        @wraps(densify)  # density control is known by what it does
         def densify_and_prune(
             self: Any, max_grad: float, min_opacity: float, extent: float, max_screen_size: Any, radii: Any
         ) -> None:

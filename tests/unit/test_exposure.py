@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,14 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.evaluation.exposure import predicted_exposures
+from lapgs_plugin.evaluation.figures import evaluate_run
+from lapgs_plugin.evaluation.lpips import LpipsRequest
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
+from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.exposure import measure_exposure
@@ -25,6 +30,7 @@ from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains,
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.trainer import Trainer
+from tests.cli.run_folder import write_run, write_scene
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
 STOPS = (0.0, 0.9, -0.7, 0.4, -0.5, 0.2)
@@ -237,3 +243,39 @@ def test_several_views_are_transformed_as_each_is() -> None:
     torch.testing.assert_close(together, torch.stack(each), atol=1e-6, rtol=0)
     torch.testing.assert_close(by_all, by_each, atol=1e-6, rtol=0)
     assert by_all[1].abs().max() == 0
+
+
+def transforms_of(stops: Sequence[float]) -> dict[str, list[list[float]]]:
+    """Return transforms that multiply by 2 to the power of stops, by names in their order."""
+    return {f"{2 * index:03d}.jpg": (2.0**stop * np.eye(3, 4)).tolist() for index, stop in enumerate(stops)}
+
+
+def test_neighbours_predict_exposure_that_changes_slowly() -> None:
+    slow = transforms_of(np.sin(np.arange(30) / 5))
+    found = predicted_exposures(slow, ["013.jpg", "000.jpg", "999.jpg"])
+    expected = (np.array(slow["012.jpg"]) + np.array(slow["014.jpg"])) / 2
+    np.testing.assert_allclose(found["013.jpg"], expected, rtol=1e-6)
+    np.testing.assert_allclose(found["000.jpg"], slow["000.jpg"], rtol=1e-6)  # a training photo has its own
+    np.testing.assert_allclose(found["999.jpg"], slow["058.jpg"], rtol=1e-6)  # behind the last one
+
+
+def test_neighbours_say_nothing_where_exposure_jumps() -> None:
+    assert predicted_exposures(transforms_of(0.5 * (-1.0) ** np.arange(30)), ["013.jpg"]) == {}
+    assert predicted_exposures(transforms_of([0.1, 0.2]), ["001.jpg"]) == {}
+
+
+def test_evaluation_measures_renders_with_the_predicted_exposure(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path)
+    run = write_run(tmp_path / "run", scene)
+    plain = evaluate_run(RunArchive.open(run), rasterizer="cpu", lpips=LpipsRequest(()))
+    learned = {f"photos/{name}.png": (1.25 * np.eye(3, 4)).tolist() for name in ("01", "07", "09", "10")}
+    (run / "level_0" / "exposure.json").write_text(json.dumps(learned))
+    archive = RunArchive.open(run)
+    brighter = evaluate_run(archive, rasterizer="cpu", lpips=LpipsRequest(()))
+    assert brighter["exposure_predicted"]
+    assert not plain["exposure_predicted"]
+    renderer, (view,) = run_renderer(archive, "cpu", "cpu"), run_scene(archive).test[:1]
+    image = 1.25 * renderer.render(view.camera).composed[0].numpy()
+    error = np.square(np.clip(image, 0, 1) - view.image.numpy()).mean()
+    (figures,) = (each for each in brighter["views"] if each["name"] == view.name)
+    assert figures["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)

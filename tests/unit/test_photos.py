@@ -166,6 +166,11 @@ def test_videos_that_cannot_be_used_are_one_line(clip: Path, tmp_path: Path, mon
     (tmp_path / "cut.mp4").write_bytes(clip.read_bytes()[:1000])
     refused(SceneError, r"cut\.mp4: the video cannot be decoded", tmp_path / "cut.mp4")
     refused(UserInputError, "--frames 1: expected at least 2", clip, frames=1)
+    photos = tmp_path / "photos"
+    for index in range(2):
+        write_image(photos / f"{index}.png", torch.ones(3, 64, 80))
+    refused(UserInputError, "--frames 9: it picks frames from a video, and .* is a folder", photos, frames=9)
+    refused(SceneError, r"0\.png: one photo, expected a folder", photos / "0.png")
     monkeypatch.setattr(clip_module, "find_spec", lambda name: None)
     refused(MissingExtraError, r"needs imageio-ffmpeg: pip install 'lapgs_plugin\[video\]'", clip)
 

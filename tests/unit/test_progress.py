@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 
 import pytest
 from rich.console import Console
@@ -10,6 +11,7 @@ from rich.progress import TextColumn
 
 from lapgs_plugin import progress
 from lapgs_plugin.progress import LoggingProgress
+from lapgs_plugin.training.monitor import ProgressMonitor
 
 
 def lines_of(monkeypatch: pytest.MonkeyPatch, items: int, seconds_each: float, figures: str = "") -> list[str]:
@@ -52,3 +54,21 @@ def test_a_terminal_has_a_bar_and_no_lines(monkeypatch: pytest.MonkeyPatch) -> N
         bar.update(bar.add_task("Reading", total=2), completed=2)
     assert "of 2 images" not in shown.getvalue()
     assert "Reading" in shown.getvalue()
+
+
+def test_what_a_run_says_is_one_line_or_left_out() -> None:
+    shown = io.StringIO()
+    text = "10 training views are few for 7,000 iterations " * 5 + "[in /runs/a]"
+    for advice in (True, False):
+        with ProgressMonitor(Console(file=shown, width=80), 1, advice) as monitor:
+            monitor.say(text)
+    assert shown.getvalue() == f"{text}\n"
+
+
+def test_tracked_work_without_a_terminal_is_counted_to_its_end() -> None:
+    shown = io.StringIO()
+    with LoggingProgress(TextColumn("{task.description}"), console=Console(file=shown), unit="views") as bar:
+        for _ in bar.track(range(2), description="Rendering"):
+            time.sleep(0.15)  # longer than rich waits between two refreshes
+    (line,) = shown.getvalue().splitlines()
+    assert line.startswith("Rendering 2 of 2 views (100 %) ")

@@ -166,16 +166,18 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
 
 
 def test_few_views_for_many_iterations_are_named() -> None:
-    assert few_views_line(24, 30_000) is few_views_line(12, 1200) is None
-    line = few_views_line(15, 7000)
+    assert few_views_line(24, 30_000, True) is few_views_line(12, 1200, True) is None
+    line = few_views_line(15, 7000, held_out=False)
     assert line is not None
     assert line.startswith("15 training views are few for 7,000 iterations, 466 passes over them")
     assert "--keep best" in line
-    assert "--keep best" not in str(few_views_line(8, 7000))  # too few to set some aside
+    assert "--eval shows it" in line
+    assert "the held-out PSNR shows it" in str(few_views_line(15, 7000, held_out=True))
+    assert "--keep best" not in str(few_views_line(8, 7000, held_out=True))  # too few to set some aside
 
 
 def test_keep_best_needs_views_to_set_aside() -> None:
-    with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 6, expected at least 12"):
+    with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 6 of them, expected at least 12"):
         make_plan((56, 40), TrainSettings(keep="best"), 6)
     with pytest.raises(UserInputError, match="--keep first: expected last or best"):
         TrainSettings(keep="first")

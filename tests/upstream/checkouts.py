@@ -31,6 +31,7 @@ with cuda_on_cpu(variant):
 COUNTING = """
 import json, sys
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from lapgs_plugin.runner import driver
 from lapgs_plugin.cli import main
@@ -42,6 +43,7 @@ def counted(replacement):
     calls.append(entry)
     def make(original):
         made = replacement.make(original)
+        @wraps(made)  # renderers are asked for their parameters
         def call(*args, **kwargs):
             entry[1] += 1
             return made(*args, **kwargs)
