@@ -147,7 +147,7 @@ MISTAKES = [
     (THEIRS, 'fused_adam = "no"', ['variants.3.options.fused_adam = "no"', "expected true or false"]),
     (THEIRS, 'images_on = "tape"', ['variants.3.options.images_on = "tape"', "expected auto, gpu"]),
     (THEIRS, 'prediction_precision = "int4"', ['options.prediction_precision = "int4"', "expected auto, float32"]),
-    (THEIRS, 'backbone = "slow"', ['variants.3.options.backbone = "slow"', "expected fastgs"]),
+    (THEIRS, 'backbone = "slow"', ['variants.3.options.backbone = "slow"', "--backbone slow: expected "]),
     (THEIRS, 'device = "tpu"', ['variants.3.options.device = "tpu"', "expected auto, cuda or cpu"]),
     (THEIRS, "test_every = 0", ["variants.3.options.test_every = 0", "expected at least 1"]),
     ("sh_degree = 1", "sh_degree = -1", ["backbones.cpu.options.sh_degree = -1", "expected 0, 1, 2 or 3"]),
