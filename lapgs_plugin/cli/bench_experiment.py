@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lapgs_plugin.errors import LapgsError, MissingExtraError, TrainingStoppedError, UserInputError
+from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
@@ -351,7 +351,10 @@ def _write(
         for run in planned
         if run.spec.run_id in records
     ]
-    table = make_table(experiment, planned, records)
+    try:
+        table = make_table(experiment, planned, records)
+    except RunFolderError as error:
+        raise RunFolderError(f"{folder.store}: {error}") from None
     text = markdown(table)
     exports.write_csv(folder.path / exports.CSV, rows)
     exports.write_text(folder.path / exports.MARKDOWN, text)

@@ -195,13 +195,13 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     Raises:
         UserInputError: not more iterations than it has, or others than those of its interrupted extension.
     """
-    from lapgs_plugin.runs.archive import CHECKPOINT, FORGET_EXTENSION
+    from lapgs_plugin.runs.archive import CHECKPOINT
 
     begun, done, run = archive.extends_to, settings.iterations, archive.path()
     if asked is not None and begun not in (None, asked):
         raise UserInputError(
             f"--iterations {asked}: the run in {run} is being extended to {begun}; leave the option out to continue "
-            f"that, or, with the checkpoint {archive.path(CHECKPOINT)}: {FORGET_EXTENSION}"
+            f"that, or delete {archive.path(CHECKPOINT)} to extend the finished run anew"
         )
     if asked is not None and asked <= done:
         raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.expansion import PlannedRun
 from lapgs_plugin.experiments.schema import Experiment, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
+from lapgs_plugin.untrusted import shortened
 
 Row = Mapping[str, Any]
 """Row of results, see `rows`."""
@@ -367,17 +368,30 @@ def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: PaperFigure | N
 
 
 def _value(row: Row, column: Column) -> tuple[float, ...]:
-    """Return a row's figure, or one for each level, coarsest first; empty without one."""
+    """Return a row's figure, or one for each level, coarsest first; empty without one.
+
+    Raises:
+        RunFolderError: a figure is not a number.
+    """
     for source in column.sources:
         if not source.endswith(LEVELS):
-            value = row.get(source)
-            if value is not None:
-                return (column.scale * value,)
+            if row.get(source) is not None:
+                return (column.scale * _number(row, source),)
             continue
         levels = sorted((int(name.removeprefix(source)) for name in row if name.startswith(source)), reverse=True)
         if levels:
-            return tuple(column.scale * row[f"{source}{level}"] for level in levels)
+            return tuple(column.scale * _number(row, f"{source}{level}") for level in levels)
     return ()
+
+
+def _number(row: Row, name: str) -> float:
+    value = row[name]
+    if not isinstance(value, int | float):
+        raise RunFolderError(
+            f"the results of {row.get('run_id', 'a run')} have {name} {shortened(value)}, expected a number; run the "
+            "experiment again in another folder"
+        )
+    return value
 
 
 LEVELS = "_level_"

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.errors import DeviceMemoryError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, LapgsError, TrainingDivergedError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
@@ -251,6 +251,8 @@ class ActiveStage:
         try:
             with self.record.after_archive("evaluation"):
                 self._measure_held_out(gaussians, self.stage.iterations)
+        except LapgsError:  # the run folder cannot be written
+            raise
         except Exception as error:
             logger.warning(
                 "held-out views of level %d could not be measured (%s: %s); the level is in the run folder, and `lapgs "

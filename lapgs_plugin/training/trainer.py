@@ -496,7 +496,7 @@ class Trainer:
         last = iteration == run.stage.iterations
         due_test = last if self.test_every is None else run.passed(self.test_every)
         due_sample = run.reached(self._samples)
-        due_tick = run.passed(max(1, self.plan.iterations // LOG_TICKS))
+        due_tick = run.passed(max(1, self.settings.iterations // LOG_TICKS))
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
         measured = self._held_out(run, due_test, due_sample and self.test_every is None)

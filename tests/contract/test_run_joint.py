@@ -270,7 +270,8 @@ def test_a_run_killed_while_it_archives_them_ends_as_others(
         assert plys(three_levels(odd, folder)) == plys(whole)
         assert {path.name for path in folder.glob("level_*/*.ply")} == {"input.ply", "point_cloud.ply"}
         left += 1
-    assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
+    # The manifest is written again when the held-out views are measured.
+    assert left == 18, "three PLYs and two manifests in three steps each, two renamings, and a run that went well"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -62,7 +62,7 @@ FORKS = {
     "LAPGS_3DGS_MCMC": Fork("graphdeco", options="--cap_max 3000 --init_type sfm"),
     # It shrinks photos in another way than `lapgs eval`, so the figures of full-size photos alone are comparable.
     "LAPGS_ABSGS": Fork("generic", same=False),
-    "LAPGS_PIXEL_GS": Fork("generic"),
+    "LAPGS_PIXEL_GS": Fork("graphdeco"),
     "LAPGS_2DGS": Fork("generic", residuals=False, same=False),
     "LAPGS_FASTER_GS": Fork("generic", options="--disable_viewer", residuals=False),
 }
