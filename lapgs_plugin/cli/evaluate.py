@@ -152,7 +152,9 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
     from rich import box
     from rich.table import Table
 
-    table = Table("level", "size", "steps", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD)
+    table = Table(
+        "level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD
+    )
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]
         table.add_row(

@@ -37,7 +37,9 @@ def export(
             "approximation for other viewers. Prints the PSNR that it keeps.",
         ),
     ] = False,
-    iterations: Annotated[int | None, typer.Option(min=1, help="With --merge: views to fit to. Default: 3000.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="With --merge: iterations of the fit, one view each. Default: 3000.")
+    ] = None,
     html: Annotated[
         bool,
         typer.Option(

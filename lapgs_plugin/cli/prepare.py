@@ -21,7 +21,7 @@ def prepare(
         typer.Option(
             help="Pairs of photos to match. exhaustive: all pairs, for up to a few hundred photos. sequential: "
             "neighbours in name order, for frames of a video. retrieval: each photo with those that look most like it. "
-            "auto: sequential for a video, retrieval from 500 photos on, else exhaustive."
+            "auto: sequential for a video, retrieval for more than 500 photos, else exhaustive."
         ),
     ] = "auto",
     mapper: Annotated[

@@ -47,8 +47,8 @@ _Result = TypeVar("_Result")
 
 AUTO = "auto"
 MATCHERS = (AUTO, "exhaustive", "sequential", "retrieval")
-RETRIEVAL_FROM = 500
-"""Photos from which on only pairs that look alike are compared, unless a matcher was chosen."""
+MOST_EXHAUSTIVE = 500
+"""Most photos of which all pairs are compared, unless a matcher was chosen; of more, those that look alike."""
 SIMILAR = 40
 """Photos that each photo is compared with by the matcher "retrieval"."""
 HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
@@ -207,7 +207,7 @@ class _Job:
             return self.asked_matcher
         if self.found.clip is not None:
             return "sequential"
-        return "retrieval" if len(self.names) > RETRIEVAL_FROM and HAS_VOCABULARY else "exhaustive"
+        return "retrieval" if len(self.names) > MOST_EXHAUSTIVE and HAS_VOCABULARY else "exhaustive"
 
     @property
     def camera_model(self) -> str:
