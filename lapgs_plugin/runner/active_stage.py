@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
-from lapgs_plugin.errors import DeviceMemoryError, LapgsError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
@@ -55,6 +55,7 @@ class ActiveStage:
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         self._gaussians: Any = None
         self._scene_files: Path | None = None
+        self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
 
     @property
     def keeps_schedule(self) -> bool:
@@ -126,7 +127,8 @@ class ActiveStage:
         self.record.count(iteration, count)
         if self._context.hooks:
             self._context.hooks.iteration_begins(iteration)
-        self.record.write_progress(count)
+        if self.record.write_progress(count) and self._diverged_at is None:
+            self._note_divergence(gaussians, iteration - 1)
 
     def densified(self, gaussians: Any) -> None:
         """Call hooks after density control.
@@ -164,12 +166,13 @@ class ActiveStage:
         """Archive the field after the stage's last iteration.
 
         Raises:
-            LapgsError: training left nothing to archive.
+            LapgsError: training left nothing to archive, or NaN or inf.
         """
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
         gaussians, self._gaussians = self._gaussians, None
         field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
+        self._require_finite(field)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
         self.record.archive(result, None if self._joint is None else self._joint.export_fields())
         if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
@@ -219,6 +222,27 @@ class ActiveStage:
 
     def _archived_levels(self) -> str:
         return ", ".join(map(str, self._archive.available_levels)) or "none"
+
+    def _note_divergence(self, gaussians: Any, iteration: int) -> None:
+        """Warn if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
+        if bool(torch.isfinite(gaussians._xyz.detach()).all()):
+            return
+        self._diverged_at = iteration
+        logger.warning(
+            "level %d has positions of NaN or inf after iteration %d; while it has, it cannot be archived",
+            *(self.stage.level, iteration),
+        )
+
+    def _require_finite(self, field: GaussianField) -> None:
+        try:
+            field.require_finite()
+        except FieldError as error:
+            seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
+            raise TrainingDivergedError(
+                f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
+                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
+                "again with lower learning rates, or see whether `lapgs run --off` diverges too"
+            ) from error
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
         """Return the fields that are being optimized, by level."""

@@ -60,10 +60,12 @@ class StageRecord:
         self.peak = max(self.peak, gaussians)
         self._gaussian_steps += gaussians
 
-    def write_progress(self, gaussians: int) -> None:
-        """Add the running iteration to the history if it is one of about `HISTORY_ENTRIES`."""
-        if self.iteration % max(1, self._window.total // HISTORY_ENTRIES) == 0:
+    def write_progress(self, gaussians: int) -> bool:
+        """Add the running iteration to the history if it is one of about `HISTORY_ENTRIES`; return whether it is."""
+        due = self.iteration % max(1, self._window.total // HISTORY_ENTRIES) == 0
+        if due:
             self._write_history(self.iteration, {"elapsed": self.elapsed(), "num_gaussians": gaussians})
+        return due
 
     def write_quality(self, iteration: int, quality: Mapping[str, float], elapsed: float | None = None) -> None:
         """Add the quality of held-out views after an iteration to the history."""

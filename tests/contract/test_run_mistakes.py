@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 import re
 import shutil
 import subprocess
@@ -222,6 +223,27 @@ def test_a_field_that_is_pruned_away_is_one_line(name: str, scene: Path, tmp_pat
             drive_residuals(adapter)
     assert "finished levels (1) are kept" in one_line(caught.value)
     assert RunArchive.open(folder).available_levels == (1,)
+
+
+def test_a_field_that_diverges_is_one_line(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A position becomes NaN before iteration 11 of the first level."""
+    folder = tmp_path / "run"
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, folder, "--densify_until_iter", 0) as adapter:
+        model = adapter.profile.model
+        original = model.update_learning_rate
+
+        @wraps(original)
+        def spy(self: Any, iteration: int) -> Any:
+            if iteration == 10:
+                self._xyz.data[3, 0] = math.nan
+            return original(self, iteration)
+
+        model.update_learning_rate = spy
+        with pytest.raises(TrainingDivergedError, match="level 1, iteration 30 of 30, first seen after") as caught:
+            drive(adapter, split="1/3,2/3")
+    assert "after iteration 10: x is NaN or inf for 1 of" in one_line(caught.value)
+    assert caplog.text.count("positions of NaN or inf after iteration 10;") == 1
+    assert RunArchive.open(folder).available_levels == ()
 
 
 def test_options_of_the_hierarchy_are_checked_before_anything_is_read() -> None:
