@@ -330,6 +330,27 @@ class BackboneAdapter(ABC):
                 "--convert_SHs_python: this checkout's render passes on SH that it has not read with that option, and "
                 "fails without lapgs too; leave it out"
             )
+        self._try_lpips(call)
+
+    def _try_lpips(self, call: TrainingCall) -> None:
+        """Compute an LPIPS if reports will: the first one downloads networks, and would do so hours into training."""
+        import torch
+
+        due = [i for i in call.values.get("testing_iterations") or () if 0 < i <= call.opt.iterations]
+        lpips = getattr(self.train, "lpips", None)
+        if not due or not inspect.isfunction(lpips):  # a module of that name has classes of its own
+            return
+        image = torch.zeros(1, 3, 64, 64)
+        try:
+            with torch.no_grad(), torch.random.fork_rng():  # initial weights are random
+                lpips(image, image, net_type="vgg")
+        except Exception as error:  # a missing package, a failed download, a damaged file: any would stop training
+            raise UserInputError(
+                f"--test_iterations {' '.join(map(str, due))}: the checkout computes LPIPS then, which fails now "
+                f"already ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}); "
+                "mend that, or leave these reports out with --test_iterations -1 if the script adds none of its own: "
+                "`lapgs eval` measures the run"
+            ) from error
 
     def _passes_dc_apart(self, call: TrainingCall) -> bool:
         """Return whether the checkout's render passes the first SH coefficient (DC) as an input of its own."""

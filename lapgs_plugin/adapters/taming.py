@@ -77,30 +77,11 @@ class Adapter(generic.Adapter):
 
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         super().refuse(call, levels, hierarchy)
-        self._try_lpips(call)
         if levels > 1 and hierarchy is Hierarchy.LAPLACIAN and call.values["args"].benchmark_dir:
             raise UserInputError(
                 f"--benchmark_dir {call.values['args'].benchmark_dir}: the checkout would write every stage's timings "
                 "over the last one's; leave it out, the manifest holds the time of each stage"
             )
-
-    def _try_lpips(self, call: TrainingCall) -> None:
-        """Compute an LPIPS if reports will: the first one downloads networks, and would do so hours into training."""
-        import torch
-
-        due = [i for i in call.values["testing_iterations"] if 0 < i <= call.opt.iterations]
-        if not due or not hasattr(self.train, "lpips"):
-            return
-        image = torch.zeros(1, 3, 64, 64)
-        try:
-            with torch.no_grad(), torch.random.fork_rng():  # initial weights are random
-                self.train.lpips(image, image, net_type="vgg")
-        except Exception as error:  # a missing package, a failed download, a damaged file: any would stop training
-            raise UserInputError(
-                f"--test_iterations {' '.join(map(str, due))}: the checkout computes LPIPS then, which fails now "
-                f"already ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}); "
-                "mend that, or leave these reports out with --test_iterations -1: `lapgs eval` measures the run"
-            ) from error
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)

@@ -182,8 +182,9 @@ def test_sparse_adam_that_is_not_installed(stub: Stub, scene: Path, tmp_path: Pa
     assert nothing_written(tmp_path / "run")
 
 
-def test_lpips_of_a_report_is_tried_before_training(scene: Path, tmp_path: Path) -> None:
-    """Taming-3DGS downloads its networks at the first report; without a connection hours of training would be lost."""
+@pytest.mark.parametrize("name", ["taming", "graphdeco"])
+def test_lpips_of_a_report_is_tried_before_training(name: str, scene: Path, tmp_path: Path) -> None:
+    """Networks are downloaded at the first report; without a connection hours of training would be lost."""
     tried: list[str] = []
 
     def lpips(image: torch.Tensor, photo: torch.Tensor, net_type: str) -> torch.Tensor:
@@ -192,7 +193,7 @@ def test_lpips_of_a_report_is_tried_before_training(scene: Path, tmp_path: Path)
         raise OSError("no route to host\nsecond line")
 
     more = ("--test_iterations", 7_000, 60)
-    with captured(tmp_path, []), loaded(STUBS["taming"], scene, tmp_path / "run", *more) as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *more) as adapter:
         vars(adapter.train)["lpips"] = lpips
         with pytest.raises(UserInputError, match=r"--test_iterations 60: .*OSError: no route to host") as caught:
             drive(adapter)
