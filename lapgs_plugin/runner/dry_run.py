@@ -29,6 +29,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -133,8 +134,8 @@ class DryRun:
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)
         if stage.record.iteration == 0:
             raise UserInputError(
-                f"{place}: {stage.call.function.__name__}() called no update_learning_rate, expected one call an "
-                f"iteration; {OFF}"
+                f"{place}: {stage.call.function.__name__}() began no iteration, expected one call of {CLOCK}, "
+                f"or one step of the positions, an iteration; {OFF}"
             )
 
     @property
@@ -252,7 +253,7 @@ class _DryRecord:
 class _DryStage:
     """Answer the replaced symbols for one iteration; see `ActiveStage`."""
 
-    resets_opacities = True
+    resets_opacities = has_more = True
 
     def __init__(
         self,

@@ -26,7 +26,6 @@ class StageReplacements:
         context: shared objects of the run.
         running: returns the running stage, None between stages.
         train: called in place of the script's `training`.
-
     """
 
     def __init__(

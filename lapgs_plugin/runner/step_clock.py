@@ -8,8 +8,6 @@ from typing import Any
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
-from lapgs_plugin.runner.active_stage import ActiveStage
-
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
 
@@ -22,15 +20,15 @@ def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
 
     Args:
         model: class of the Gaussians.
-        running: returns the running stage.
+        running: returns the running stage, or that of the dry run; None between stages.
     """
     if hasattr(model, CLOCK):
         yield
         return
 
-    def stage_of(optimizer: Optimizer) -> ActiveStage | None:
+    def stage_of(optimizer: Optimizer) -> Any:
         stage = running()
-        if not isinstance(stage, ActiveStage) or stage.gaussians is None:
+        if stage is None or stage.gaussians is None:
             return None
         positions = stage.gaussians._xyz
         steps = any(each is positions for group in optimizer.param_groups for each in group["params"])

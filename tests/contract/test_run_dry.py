@@ -40,7 +40,7 @@ FAILURES = {
         "train.py",
         "        gaussians.update_learning_rate(iteration)\n",
         "",
-        r"train.py:\d+: training\(\) called no update_learning_rate, expected one call an iteration",
+        r"train.py:\d+: training\(\) began no iteration, expected one call of update_learning_rate",
     ),
     "residuals at another size": (
         "gaussian_renderer/__init__.py",
