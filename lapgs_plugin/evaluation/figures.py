@@ -30,7 +30,7 @@ from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
     *("psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
-    *("train_seconds", "overhead_seconds", "breakdown_seconds", "gpu_busy_seconds"),
+    *("train_seconds", "overhead_seconds", "breakdown_seconds"),
     *("num_gaussians", "weighted_gaussians"),
     *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
     *("rasterizer", "versions"),

@@ -22,7 +22,11 @@ SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
-NEGATIONS = {"fused-adam": ["--no-fused-adam"], "prune-by-size": ["--no-prune-by-size"]}
+NEGATIONS = {
+    "dry-run": ["--no-dry-run"],
+    "fused-adam": ["--no-fused-adam"],
+    "prune-by-size": ["--no-prune-by-size"],
+}
 """Words that switch off options which are on by default."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""

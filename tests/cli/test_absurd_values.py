@@ -34,7 +34,7 @@ HUGE = "1000000000000000000"
         (f"bench raster --json {LONG}/x", "expected a file in a folder that exists"),
         ("bench raster --dtype float16", "--dtype float16: expected float32 or float64"),
         ("conformance --rasterizer nothing", "--rasterizer nothing: expected one that this machine can run"),
-        ("doctor 5", "unexpected extra argument"),
+        ("doctor 5", "expected the root of a 3DGS checkout"),
         ("sample s --size 0x0", "--size 0x0: expected at least 16x16"),
         ("sample s --size=-1x4", "--size '-1x4': expected WIDTHxHEIGHT"),
         ("sample s --size 99999x99999", "--size 99999x99999: expected at most 8192x8192"),

@@ -174,7 +174,7 @@ def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"exposure": "yes"}, "--exposure yes: expected auto, on, off"),
+        ({"exposure": "yes"}, "--exposure yes: expected auto, on or off"),
         ({"exposure": "on", "supervision": "gt_laplacian"}, "--exposure on with --supervision gt_laplacian"),
         ({"exposure": "on", "protocol": "paper"}, "--exposure on with --protocol paper"),
     ],
