@@ -102,9 +102,11 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
     from lapgs_plugin.environment.findings import Finding
 
     inputs = frozenset[str]().union(*(use.inputs for use in source.rasterizers))
-    nested = Finding("nested", "ok", "one call of the checkout's own training; the dry run of `lapgs run` says more")
+    more = "the dry run of `lapgs run` says more"
+    nested = Finding("nested", "ok", f"one call of the checkout's own training; {more}")
     if inputs & COLORS:
-        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {' and '.join(sorted(inputs & COLORS))}")]
+        takes = " and ".join(sorted(inputs & COLORS))
+        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}; {more}")]
     why = f"its rasterizer takes neither {' nor '.join(sorted(COLORS))}, by which a residual has colours of both signs"
     return [nested, Finding("laplacian", "absent", why)]
 

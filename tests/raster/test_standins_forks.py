@@ -213,6 +213,28 @@ def test_surfels_are_flat_gaussians_with_depths_and_normals() -> None:
     assert radii.shape == (40,)
 
 
+def test_gradients_of_surfels_are_finite_where_nothing_is_blended() -> None:
+    """The checkout divides the depth by alpha and replaces NaN, whose gradient stays NaN in empty pixels."""
+    case = small_case()
+    given = activated(case)
+    means = given["means3D"].detach().clone().requires_grad_()
+    module = module_of("2dgs")
+    settings = settings_of(module, case.camera, case.background, 3)
+    scales = (given["scales"][:, :2] / 4).contiguous()  # small ones leave gaps
+    _, _, maps = module.GaussianRasterizer(settings)(
+        means2D=torch.zeros(40, 3), **(given | {"means3D": means, "scales": scales})
+    )
+    assert bool((maps[1] == 0).any())
+    above: list[Tensor] = []
+    depth = maps[0] / maps[1]
+    depth.register_hook(above.append)
+    torch.nan_to_num(depth, 0, 0).sum().backward()
+    assert not bool((above[0] / maps[1].detach()).isfinite().all())
+    assert means.grad is not None
+    assert bool(means.grad.isfinite().all())
+    assert float(means.grad.norm()) > 0
+
+
 @pytest.mark.parametrize("copies", [1, 2, 5])
 def test_relocated_copies_have_the_opacity_and_the_light_of_one(copies: int) -> None:
     """Equation 9: n copies of opacity 1 - (1 - o)^(1/n) cover what one covered; one copy stays as it is."""
