@@ -21,7 +21,7 @@ class Script:
     """Hold a script whose definitions have been executed.
 
     Attributes:
-        path: absolute path of the script; its folder is the checkout.
+        path: absolute path of the script.
         module: the script's namespace, `__main__` while it is loaded.
         tree: syntax tree of the whole script.
     """
@@ -30,11 +30,6 @@ class Script:
     module: ModuleType
     tree: ast.Module
     _main: CodeType
-
-    @property
-    def checkout(self) -> Path:
-        """Folder of the checkout."""
-        return self.path.parent
 
     def function(self, name: str) -> ast.FunctionDef | None:
         """Return the syntax tree of a function of the script."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
@@ -29,7 +30,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
-from lapgs_plugin.runner.step_clock import CLOCK
+from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
 logger = logging.getLogger(__name__)
 
@@ -121,14 +122,21 @@ class DryRun:
 
     def _iterate(self, stage: _DryStage, works: str) -> None:
         """Run the first iteration of the script's loop."""
+
+        def stepped(optimizer: Optimizer, *_: Any) -> None:
+            if stage.record.iteration == 0 and steps_positions(optimizer, stage.gaussians):
+                raise _Enough  # the loop would run to its end
+
         self._context.wrapper.stage = stage.rendering
         self._activate(stage)
+        watching = register_optimizer_step_post_hook(stepped)
         try:
             with self._step("the first iteration", "one as without lapgs", works):
                 stage.call.run()
         except _Enough:
             pass
         finally:
+            watching.remove()
             self._context.wrapper.stage = None
             self._activate(None)
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)

@@ -12,6 +12,13 @@ CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
 
 
+def steps_positions(optimizer: Optimizer, gaussians: Any) -> bool:
+    """Return whether an optimizer steps the positions of a checkout's model, which is None before its scene is made."""
+    if gaussians is None:
+        return False
+    return any(each is gaussians._xyz for group in optimizer.param_groups for each in group["params"])
+
+
 @contextmanager
 def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
     """Begin an iteration after each step of the running stage's positions, unless the model has the method `CLOCK`.
@@ -28,11 +35,7 @@ def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
 
     def stage_of(optimizer: Optimizer) -> Any:
         stage = running()
-        if stage is None or stage.gaussians is None:
-            return None
-        positions = stage.gaussians._xyz
-        steps = any(each is positions for group in optimizer.param_groups for each in group["params"])
-        return stage if steps else None
+        return stage if stage is not None and steps_positions(optimizer, stage.gaussians) else None
 
     def before(optimizer: Optimizer, *_: Any) -> None:
         stage = stage_of(optimizer)

@@ -79,7 +79,7 @@ def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
     modules |= {
         name: module
         for name, module in sys.modules.items()
-        if str(getattr(module, "__file__", None) or "").startswith(str(adapter.script.checkout))
+        if str(getattr(module, "__file__", None) or "").startswith(str(adapter.script.path.parent))
     }
     found = {}
     for name, module in modules.items():
@@ -118,9 +118,9 @@ def test_process_state_is_that_of_before(scene: Path, tmp_path: Path) -> None:
     argv, path, stdout, main, modules = sys.argv, sys.path[:], sys.stdout, sys.modules["__main__"], set(sys.modules)
     with captured(tmp_path, []), loaded(STUBS["fastgs"], scene, tmp_path / "run") as adapter:
         assert sys.argv[0].endswith("train.py")
-        assert sys.path[0] == str(adapter.script.checkout)
+        assert sys.path[0] == str(adapter.script.path.parent)
         assert sys.modules["__main__"] is adapter.train
-        assert sys.modules["scene"].__file__ == str(adapter.script.checkout / "scene" / "__init__.py")
+        assert sys.modules["scene"].__file__ == str(adapter.script.path.parent / "scene" / "__init__.py")
     assert sys.argv is argv
     assert sys.path == path
     assert sys.stdout is stdout
