@@ -88,13 +88,23 @@ class CheckoutSource:
 
     @classmethod
     def read(cls, script: Path) -> CheckoutSource:
-        """Read the sources that a training script imports.
+        """Read the sources that a training script imports; again only if a file or folder of theirs has changed.
 
         Raises:
             UserInputError: it is not Python, or not the training script of a 3DGS checkout; the line says what is
                 missing.
         """
         script = script.absolute()
+        known, changed = _READ.get(script, (None, {}))
+        if known is not None and _times(changed) == changed:
+            return known
+        source = cls._read(script)
+        files = {script, *source.modules.values()}
+        _READ[script] = source, _times({*files, *(file.parent for file in files)})
+        return source
+
+    @classmethod
+    def _read(cls, script: Path) -> CheckoutSource:
         tree = _parse(script)
         near = ""
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
@@ -126,6 +136,15 @@ class CheckoutSource:
     def rasterizer_modules(self) -> tuple[str, ...]:
         """Modules of rasterizers, in the order in which they are imported."""
         return tuple(dict.fromkeys(use.module for use in self.rasterizers))
+
+
+_READ: dict[Path, tuple[CheckoutSource, dict[Path, int]]] = {}
+"""Sources by script, with the times at which their files and folders had changed: experiments read one many times."""
+
+
+def _times(paths: Iterable[Path]) -> dict[Path, int]:
+    """Return the times of the last changes of paths that exist."""
+    return {path: path.stat().st_mtime_ns for path in paths if path.exists()}
 
 
 def training_scripts(folder: Path) -> list[Path]:

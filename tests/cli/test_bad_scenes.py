@@ -69,7 +69,7 @@ def test_names_with_escape_sequences(
 def test_the_table_of_views_prints_names_as_they_are_spelt(capsys: pytest.CaptureFixture[str]) -> None:
     from rich.console import Console
 
-    view = {"name": "[red]a\x1b[2J\nb.png", "psnr": 20.0, "ssim": 0.5}
+    view = {"name": "[red]a\x1b[2J\nb.png", "psnr": 20.0, "fitted_psnr": 20.0, "ssim": 0.5}
     _print_views(Console(file=sys.stdout, width=100), {"views": [view], "lpips_missing": {}})
     assert r"[red]a\x1b[2J\nb.png" in capsys.readouterr().out
 

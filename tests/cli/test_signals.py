@@ -157,7 +157,9 @@ def test_a_signal_in_the_middle_of_a_command(
     assert half_written(tmp_path) == []
 
 
-@pytest.mark.parametrize("gap", [0.02, 0.2, 0.7])
+@pytest.mark.parametrize(
+    "gap", [pytest.param(0.02, marks=pytest.mark.slow), 0.2, pytest.param(0.7, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("delay", [0.1, 5.0])
 def test_a_second_ctrl_c_ends_as_the_first(delay: float, gap: float, scene: Path, run: Path, tmp_path: Path) -> None:
     words = commands(scene, run, tmp_path)["train"]
