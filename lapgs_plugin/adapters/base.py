@@ -43,7 +43,7 @@ SPARSE_ADAM = "SparseGaussianAdam"
 """Name that the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
 
 FAMILY_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
-"""Files of every checkout of the family, relative to its root."""
+"""Files of most checkouts of the family, relative to their roots."""
 
 FAMILY_EXTENSIONS = {"simple_knn._C": "nearest neighbours", "fused_ssim": "fast SSIM"}
 """Compiled modules besides the rasterizer that training scripts of the family import, each with its purpose."""
@@ -98,6 +98,7 @@ class BackboneInfo:
         densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
             them by their names.
         own_files: files of its checkout that tell it from other code bases, relative to the checkout's root.
+        family_files: files of its checkout that other code bases have, too.
         fork_of: names of backbones that may recognise its checkout, too, because it has files of theirs.
         density_scores: functions of its script or utilities whose scores density control uses.
         raster_defaults: settings of the rasterizer that its options have by default, where these change the image and
@@ -113,6 +114,7 @@ class BackboneInfo:
     color_rates: tuple[str, ...] = ()
     densify_thresholds: tuple[str, ...] = ()
     own_files: tuple[str, ...] = ()
+    family_files: tuple[str, ...] = FAMILY_FILES
     fork_of: tuple[str, ...] = ()
     density_scores: tuple[str, ...] = ()
     raster_defaults: Mapping[str, Any] = field(default_factory=dict)
@@ -122,7 +124,7 @@ class BackboneInfo:
     @property
     def files(self) -> tuple[str, ...]:
         """Files that a checkout must have to be recognised."""
-        return (*FAMILY_FILES, *self.own_files)
+        return (*self.family_files, *self.own_files)
 
     @property
     def extensions(self) -> Mapping[str, str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.adapters import generic
@@ -32,12 +31,9 @@ class Adapter(generic.Adapter):
         rasterizer="diff_gaussian_rasterization",
         stand_in="graphdeco-aa",
         own_files=("train_dash.py", "utils/schedule_utils.py"),
+        family_files=(),
         fork_of=("graphdeco",),
     )
-
-    @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        return all((folder / name).is_file() for name in cls.info.own_files)
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)

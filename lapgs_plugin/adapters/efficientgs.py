@@ -26,16 +26,17 @@ class Adapter(generic.Adapter):
         title="EfficientGS",
         rasterizer="diff_gaussian_rasterization",
         stand_in="efficientgs",
-        own_files=("scene/renderer.py", "train.py"),
+        own_files=("scene/renderer.py",),
+        family_files=("train.py",),
         fork_of=("graphdeco",),
         unscaled=("oneupSHdegree_from_iter",),
     )
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        renderer = folder / "scene" / "renderer.py"
-        if not all((folder / name).is_file() for name in cls.info.own_files):
+        if not super().recognises(folder):
             return False
+        renderer = folder / "scene" / "renderer.py"
         return "sparse_shs_degree" in renderer.read_text(encoding="utf-8", errors="replace")
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.adapters import generic
@@ -35,13 +34,10 @@ class Adapter(generic.Adapter):
         rasterizer="diff_gaussian_rasterization_ms",
         stand_in="mini-splatting",
         own_files=("ms/train.py",),
+        family_files=(),
         fork_of=("graphdeco",),
         unscaled=SIMPLIFICATIONS,
     )
-
-    @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        return all((folder / name).is_file() for name in cls.info.own_files)
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         self._degree = call.dataset.sh_degree

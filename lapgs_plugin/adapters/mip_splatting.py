@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
@@ -24,13 +23,10 @@ class Adapter(generic.Adapter):
         rasterizer="diff_gaussian_rasterization",
         stand_in="mip-splatting",
         own_files=("create_fused_ply.py",),
+        family_files=("train.py",),
         fork_of=("graphdeco",),
         raster_defaults={"kernel_size": 0.1},
     )
-
-    @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        return all((folder / name).is_file() for name in ("train.py", *cls.info.own_files))
 
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
         import torch

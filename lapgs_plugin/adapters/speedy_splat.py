@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.adapters import generic
@@ -20,13 +19,10 @@ class Adapter(generic.Adapter):
         rasterizer="diff_gaussian_rasterization",
         stand_in="speedy-splat",
         own_files=("compute_scene_metrics.py",),
+        family_files=("train.py",),
         fork_of=("graphdeco",),
         density_scores=("score_func",),
     )
-
-    @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        return all((folder / name).is_file() for name in ("train.py", *cls.info.own_files))
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         return [
