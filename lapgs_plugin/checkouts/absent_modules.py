@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import MissingExtraError
 
-__all__ = ["absent_modules"]
+__all__ = ["NoLog", "absent_modules"]
 
 Item = TypeVar("Item")
 
@@ -35,7 +35,7 @@ def absent_modules(logs: bool = False) -> dict[str, ModuleType]:
     """
     found: dict[str, ModuleType] = {}
     if logs and find_spec("tensorboard") is None:
-        found[_LOGS] = _AbsentModule(_LOGS, "tensorboard", {"SummaryWriter": _NoLog})
+        found[_LOGS] = _AbsentModule(_LOGS, "tensorboard", {"SummaryWriter": NoLog})
     for package, (distribution, modules) in _PACKAGES.items():
         if package in sys.modules or find_spec(package) is not None:
             continue
@@ -133,16 +133,14 @@ def _dump(value: object, path: str) -> None:
     Path(path).write_bytes(pickle.dumps(value))
 
 
-class _NoLog:
+class NoLog:
     """Take the place of TensorBoard's SummaryWriter, and write nothing."""
 
     def __init__(self, *_: object, **__: object) -> None:
         """Take the arguments of the class."""
 
-    def add_scalar(self, *_: object, **__: object) -> None:
-        """Do nothing."""
-
-    add_histogram = add_images = add_image = close = flush = add_scalar
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *_, **__: None
 
 
 _LOGS = "torch.utils.tensorboard"

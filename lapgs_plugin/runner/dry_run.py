@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
 from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -339,14 +340,4 @@ def _silent_writer(train: Any) -> Any:
     """Replace TensorBoard's writer in a script, whose thread would outlive the folder."""
     if "SummaryWriter" not in vars(train):
         return nullcontext()
-    return Attachment([Replacement(train, "SummaryWriter", lambda _: _NoWriter, None, "training()")])
-
-
-class _NoWriter:
-    """Take the place of a writer of logs."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Take any arguments."""
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        return lambda *args, **kwargs: None
+    return Attachment([Replacement(train, "SummaryWriter", lambda _: NoLog, None, "training()")])

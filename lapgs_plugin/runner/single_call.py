@@ -28,10 +28,8 @@ from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
-
 SOON = 500
-"""Iterations after a change of level in which an error may be about it: what runs seldom, such as densification, has
-run by then."""
+"""Iterations after a change of level during which it may be the cause of an error: densification, too, runs in them."""
 
 
 class NestedStage(ActiveStage):

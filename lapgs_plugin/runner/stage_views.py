@@ -67,9 +67,8 @@ class StageViews:
         keys = {id(view): key for key, view in self._views.items()}
 
         def prefetch(view: Any) -> None:
-            if (
-                rendering := self._context.wrapper.stage
-            ) is not None:  # of the running stage: views may outlive this one
+            rendering = self._context.wrapper.stage  # of the running stage: views may outlive this one
+            if rendering is not None:
                 rendering.prefetch(keys[id(view)])
 
         return PrefetchingViews(views, prefetch)
