@@ -92,6 +92,7 @@ def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experime
     assert [each["scene"] for each in rows] == ["mine", "torn"]
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_two_others_go_on_and_share_the_work(experiment: Path) -> None:
     sample = 'sample = { size = "48x32", views = 8, points = 100 }'
     text = EXPERIMENT.replace('path = "scene"', sample)

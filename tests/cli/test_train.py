@@ -134,6 +134,7 @@ def test_residuals_are_trained_on_request(scene: Path, tmp_path: Path) -> None:
     assert (manifest.inherit, manifest.settings["joint"]) == ("xyz:0.5", 0.25)
 
 
+@pytest.mark.slow
 def test_runs_from_before_nesting_continue_with_residuals(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), finished=1)
     manifest = json.loads((run / MANIFEST).read_text())

@@ -565,6 +565,7 @@ for command in planners:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: Path, tmp_path: Path) -> None:
     checkout = rasterizer.parents[1]
