@@ -123,6 +123,10 @@ class StagePlan:
     def iterations(self) -> int:
         return sum(stage.iterations for stage in self.stages)
 
+    def iterations_before(self, level: int) -> int:
+        """Return the iterations of all stages before that of a level."""
+        return sum(stage.iterations for stage in self.stages if stage.level > level)
+
     def __iter__(self) -> Iterator[Stage]:
         return iter(self.stages)
 

@@ -150,7 +150,7 @@ class DryRun:
     @property
     def _window(self) -> StageWindow | None:
         """The residual's stage; None for levels that keep the checkout's own schedule."""
-        start = sum(stage.iterations for stage in self._plan if stage.level > self._stage.level)
+        start = self._plan.iterations_before(self._stage.level)
         window = StageWindow(self._stage, start, self._plan.iterations, self._plan.levels, 1.0, 1.0)
         return window if self._stage.signed else None
 

@@ -77,4 +77,4 @@ class TensorboardMonitor(Monitor):
 
     def _step(self, level: int, iteration: int) -> int:
         """Return the number of iterations of the run up to one of a stage."""
-        return iteration + sum(stage.iterations for stage in self._plan.stages if stage.level > level)
+        return iteration + self._plan.iterations_before(level)

@@ -265,7 +265,7 @@ class Trainer:
                 start = self._first_exposures()
         if start is None:
             return None
-        done = sum(each.iterations for each in self.plan if each.level > stage.level)
+        done = self.plan.iterations_before(stage.level)
         return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
 
     def _first_exposures(self) -> Tensor | None:
@@ -361,7 +361,7 @@ class Trainer:
 
     def _prepare(self, stage: Stage, model: TrainableField, checkpoint: dict[str, Any] | None) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
-        coarser = sum(each.iterations for each in self.plan if each.level > stage.level)
+        coarser = self.plan.iterations_before(stage.level)
         batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         schedule = StageSchedule.create(
             self.settings,
