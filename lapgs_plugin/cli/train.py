@@ -151,7 +151,7 @@ def _resume(
     from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.trainer import check_storage
+    from lapgs_plugin.training.planning import check_storage
 
     archive = RunArchive.open(out, resume=True)
     try:
@@ -229,7 +229,7 @@ def _create(
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.trainer import check_storage, make_plan
+    from lapgs_plugin.training.planning import check_storage, make_plan
 
     RunArchive.require_room(out, overwrite)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
@@ -260,8 +260,9 @@ def _run(
     from lapgs_plugin.scenes.masks import share_inside
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import Monitor, ProgressMonitor
+    from lapgs_plugin.training.planning import make_plan
     from lapgs_plugin.training.tensorboard import TensorboardMonitor
-    from lapgs_plugin.training.trainer import Trainer, make_plan
+    from lapgs_plugin.training.trainer import Trainer
 
     if control.threads is not None:
         torch.set_num_threads(control.threads)

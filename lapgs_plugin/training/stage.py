@@ -28,7 +28,7 @@ from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.manifest import LevelRecord
-from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
+from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.exposure import ViewExposures
@@ -205,6 +205,12 @@ class StageRun:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
         along = () if self.joint is None else self.joint.models.values()
         return len(self.model) + sum(len(model) for model in along)
+
+    @property
+    def fields(self) -> dict[int, GaussianField]:
+        """The fields under training by level, without gradients."""
+        joint = {} if self.joint is None else self.joint.fields
+        return {**joint, self.stage.level: self.model.field.detach()}
 
     @property
     def _device(self) -> torch.device:
@@ -526,12 +532,8 @@ class StageRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a result of `state`; the model must have been made from it already."""
+        """Continue from a result of `state`; model and breakdown must have been made from it already."""
         self.progress = StageProgress(**state["progress"])
-        if self.breakdown.measures:
-            # Without a measurement from the first iteration on, the parts would not add up to the whole.
-            spent = state.get("breakdown")
-            self.breakdown = breakdown_on(self._device, spent) if spent else Breakdown()
         self.densifier.state = {
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()
