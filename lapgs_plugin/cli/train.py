@@ -13,6 +13,7 @@ import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, extend_config, write_config
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -72,7 +73,6 @@ def train(
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
     """
-    from rich.console import Console
     from rich.markup import escape
 
     from lapgs_plugin.runs.gpu_busy import require_cuda
@@ -98,7 +98,7 @@ def train(
         require_tensorboard()
     if control.gpu_busy:
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
