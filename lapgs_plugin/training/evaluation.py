@@ -69,7 +69,7 @@ class StageEvaluation:
             run.model.field, level_camera(view.camera, level), background=run.background
         ).image
         cached = None if cache is None else cache.get
-        predict = cached if run.joint is None else run.joint.predict
+        predict = cached if run.coarser.joint is None else run.coarser.joint.predict
         image = add_prediction(image, None if predict is None else predict(view.name))
         whole = to_full_size(image, view.camera, level, self.context.pyramid)
         if exposure is not None:
@@ -115,7 +115,8 @@ class StageEvaluation:
         if best is None or best["iteration"] == run.stage.iterations:
             return
         run.model = self.context.restored_model(best["model"])
-        assert run.unfreeze is not None
-        run.joint = None if best["joint"] is None else run.unfreeze(best["joint"])
+        run.coarser.joint = None
+        if best["joint"] is not None:
+            run.coarser.restore(best["joint"])
         if run.exposures is not None:
             run.exposures.restore(best["exposure"])

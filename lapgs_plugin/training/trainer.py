@@ -23,6 +23,7 @@ from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.between_steps import BetweenSteps, CheckpointTimer
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_exposure
+from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.joint import JointFields
@@ -38,8 +39,9 @@ from lapgs_plugin.training.quality import (
 )
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, TrainSettings
-from lapgs_plugin.training.stage import StageProgress, StageRun
+from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_images import StageImages
+from lapgs_plugin.training.stage_progress import StageProgress
 from lapgs_plugin.training.stage_start import first_exposures, first_model, joint_fields
 from lapgs_plugin.training.views import level_views
 from lapgs_plugin.training.warm_up import warm_up
@@ -238,6 +240,7 @@ class Trainer:
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         context, before = self._context, self._context.record_to_extend(stage)
+        breakdown = self._breakdown(before, checkpoint)
 
         def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
             memory.note(images.bytes_on_device)
@@ -250,17 +253,17 @@ class Trainer:
             settings=self.settings,
             views=level_views(context.scene.train, stage.level),
             images=images.targets,
-            accumulated=images.train_predictions,
             background=torch.zeros(3, device=self.device) if stage.signed else context.background,
             extent=context.scene.extent,
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
             densifier=self.settings.strategy_of(stage).density_control(schedule, context.scene.extent),
-            joint_from=self.settings.joint_from(stage),
-            unfreeze=unfreeze,
+            coarser=CoarserLevels(
+                images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
+            ),
             exposures=first_exposures(context, stage, checkpoint, overhead),
-            breakdown=self._breakdown(before, checkpoint),
+            breakdown=breakdown,
             progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
@@ -307,7 +310,8 @@ class Trainer:
             breakdown_seconds=run.breakdown.seconds(),
             gpu_busy_seconds=run.busy.seconds(),
         )
-        along = {} if run.joint is None else run.joint.fields
+        joint = run.coarser.joint
+        along = {} if joint is None else joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
         if before is None:
             inherited = stage.level > 0 and self.settings.inherit_mode == "full"

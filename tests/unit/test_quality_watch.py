@@ -144,8 +144,8 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
         assert run.exposures is not None
         place = run.stage.level, run.progress.iteration
         fields[place] = run.model.field.means.detach().clone()
-        if run.joint is not None:
-            along[place] = run.joint.fields[1].means.clone()
+        if run.coarser.joint is not None:
+            along[place] = run.coarser.joint.fields[1].means.clone()
         return 0.0, 20.0 + (place in {(1, 16), (0, 36)})
 
     monkeypatch.setattr(StageEvaluation, "_psnr", invented)
