@@ -1,6 +1,7 @@
 """Run the real checkouts in processes of their own on the CPU stand-ins, at a tiny size.
 
-Paths of the checkouts are in LAPGS_FASTGS, LAPGS_TAMING and LAPGS_GRAPHDECO; tests of others are skipped.
+The folder in LAPGS_UPSTREAM holds checkouts called fastgs, taming, graphdeco, dashgaussian, mini_splatting and so on;
+LAPGS_FASTGS and the like name one elsewhere. Tests of checkouts that are not there are skipped.
 """
 
 from __future__ import annotations
@@ -90,11 +91,12 @@ class Done:
 
 
 def checkout(variable: str) -> Path:
-    """Return the folder in an environment variable; skip the test without it."""
-    named = os.environ.get(variable)
-    if not named:
-        pytest.skip(f"needs a checkout of the backbone: set {variable} to its folder")
-    return Path(named).resolve()
+    """Return the folder in an environment variable, or that of LAPGS_UPSTREAM; skip the test without it."""
+    name = variable.removeprefix("LAPGS_").lower()
+    folder = Path(os.environ.get(variable) or Path(os.environ.get("LAPGS_UPSTREAM", "nowhere"), name))
+    if not folder.is_dir():
+        pytest.skip(f"needs a checkout of the backbone: {variable}, or the folder {name} in LAPGS_UPSTREAM")
+    return folder.resolve()
 
 
 def knows_antialiasing(folder: Path) -> bool:
