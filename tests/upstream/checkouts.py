@@ -17,6 +17,10 @@ from typing import Any
 
 import pytest
 
+from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.runs.archive import RunArchive
+
 BARE = """
 import runpy, sys
 from pathlib import Path
@@ -114,6 +118,14 @@ def run_lapgs(script: Path, options: list[str], arguments: list[str], folder: Pa
     calls = folder.with_name(f"{folder.name}-calls.json")
     progress = _python(COUNTING, calls, "--device", "cpu", *options, script, *arguments, "-m", folder)
     return Done(folder, progress, tuple((label, count) for label, count in json.loads(calls.read_text())))
+
+
+def assert_same_quality(archive: RunArchive) -> None:
+    """Compare the held-out PSNR of the checkout's own renders with that of the archived fields."""
+    (measured,) = [entry["psnr"] for entry in archive.history() if "psnr" in entry and entry["level"] == 0]
+    renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
+    pairs = ((renderer.render(view.camera).composed[0], view.image) for view in run_scene(archive).test)
+    assert mean_quality(pairs)["psnr"] == pytest.approx(measured, abs=0.05)
 
 
 def _python(code: str, *arguments: Any) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.runs.archive import RunArchive
-from tests.upstream.checkouts import Done, checkout, knows_antialiasing, run_bare, run_lapgs
+from tests.upstream.checkouts import Done, assert_same_quality, checkout, knows_antialiasing, run_bare, run_lapgs
 
 pytestmark = pytest.mark.upstream
 
@@ -63,6 +63,7 @@ def test_two_levels(variable: str, hierarchy: str, scene: Path, tmp_path: Path) 
     # Worst seen: 0.905, and where levels are nested 0.987, as one field goes on.
     assert finest[-2] < (0.95 if hierarchy == "laplacian" else 1.0) * finest[0]
     assert {label.rpartition(".")[2] for label, count in done.calls if count == 0} <= NOT_CALLED[variable]
+    assert_same_quality(archive)
 
 
 @pytest.mark.parametrize("variable", VARIABLES)
