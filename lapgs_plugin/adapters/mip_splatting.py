@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall, logits_of
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -39,7 +39,7 @@ class Adapter(generic.Adapter):
             return field.with_parameters(
                 {
                     "log_scales": torch.log(gaussians.get_scaling_with_3D_filter),
-                    "opacity_logits": torch.logit(opacities.clamp(1e-6, 1 - 1e-6)),
+                    "opacity_logits": logits_of(opacities),
                 }
             )
 

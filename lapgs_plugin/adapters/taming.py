@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall, logits_of
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
@@ -50,10 +50,8 @@ class Adapter(generic.Adapter):
     def saved_logits(stored: Tensor) -> Tensor:
         if not bool((stored > LOW_LOGIT).all()):
             return stored
-        import torch
-
         # Half way through training it replaces the sigmoid by the absolute value, and saves the value before that.
-        return torch.logit(stored.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
+        return logits_of(stored.abs())
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"
