@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gsplat.strategy.ops import remove
@@ -35,8 +35,10 @@ from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
+from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
@@ -113,6 +115,7 @@ class StageRun:
         unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
         joint: finished fields while they are trained jointly; None before.
         exposures: colour transforms of the training views; None without compensation of exposure.
+        poses: corrections of the training views' poses; None without refinement.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
@@ -137,6 +140,7 @@ class StageRun:
     unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
     joint: JointFields | None = None
     exposures: ViewExposures | None = None
+    poses: ViewPoses | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
@@ -217,8 +221,12 @@ class StageRun:
 
     @cached_property
     def _batching(self) -> BatchRasterizer | None:
-        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow."""
-        return self.rasterizer if isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch else None
+        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow.
+
+        The gradient by a pose needs the Gaussians' gradients of each view alone.
+        """
+        able = self.poses is None and isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+        return cast(BatchRasterizer, self.rasterizer) if able else None
 
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""
@@ -257,8 +265,8 @@ class StageRun:
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.joint is not None:
             self.joint.step(means_rate, rest, scale)
-        if self.exposures is not None:
-            self.exposures.after_step(last, len(iterations))
+        for transforms in self._transforms:
+            transforms.after_step(last, len(iterations))
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -298,8 +306,13 @@ class StageRun:
         for model in models:
             for param in model.params.values():
                 param.grad = None
-        if self.exposures is not None:
-            self.exposures.forget_gradients()
+        for transforms in self._transforms:
+            transforms.forget_gradients()
+
+    @property
+    def _transforms(self) -> list[ViewTransforms]:
+        """What is learned of the training views."""
+        return [transforms for transforms in (self.exposures, self.poses) if transforms is not None]
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
@@ -307,13 +320,14 @@ class StageRun:
         if self._is_joint(last) and self.joint is None:
             assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
             self.joint = self.unfreeze(None)
+            self.joint.poses = self.poses
         views = [self._view(iteration) for iteration in iterations]
         names = [view.name for view in views]
         losses_of = self._plain_losses(names) if self._is_plain else self._hooked_losses(iterations, names)
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
-        rendered, result = self._render(gaussians, [view.camera for view in views], last)
+        rendered, result = self._render(self._watched(gaussians, names), [view.camera for view in views], last)
         self.breakdown.mark("loss")
         losses = losses_of(rendered)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
@@ -415,6 +429,20 @@ class StageRun:
             return result.image, result
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
+    def _watched(self, gaussians: GaussianField, names: Sequence[str]) -> GaussianField:
+        """Return the field for a render of some views, with gradients by their poses where these are refined.
+
+        Beside a prediction from the cache they stay as they were when it was rendered.
+        """
+        if self.poses is None or (self.accumulated is not None and self.joint is None):
+            return gaussians
+        (name,) = names
+        return self.poses.watched(name, gaussians)
+
+    def _at_pose(self, view: LevelView) -> LevelView:
+        """Return a view at its refined pose."""
+        return view if self.poses is None else replace(view, camera=self.poses.camera(view.name, view.camera))
+
     def _exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
         """Return the composed image of a view, or images of several, at the exposure of their photos."""
         return image if self.exposures is None else self.exposures.apply(names, image)
@@ -424,7 +452,7 @@ class StageRun:
         return self.joint_from is not None and iteration >= self.joint_from
 
     def _view(self, iteration: int) -> LevelView:
-        return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
+        return self._at_pose(self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)])
 
     def _prediction(self, names: Sequence[str]) -> Tensor | None:
         """Return the upsampled prediction of the finished levels for a view, or for several; None for the base."""
@@ -474,7 +502,7 @@ class StageRun:
                 render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
             )
 
-        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        views = (asked(self._at_pose(self.views[index])) for index in chosen[:SCORED_VIEWS].tolist())
         return view_scores(views, grey, threshold)
 
     def _grey(self) -> tuple[GaussianField, Tensor]:
@@ -486,7 +514,8 @@ class StageRun:
     def _prune(self, share: float) -> None:
         """Remove Gaussians with negligible visibility in the training views."""
         plain, grey = self._grey()
-        images = (render_image(self.rasterizer, plain, view.camera, self.background, 0) for view in self.views)
+        cameras = (self._at_pose(view).camera for view in self.views)
+        images = (render_image(self.rasterizer, plain, camera, self.background, 0) for camera in cameras)
         pixels = blended_pixels(images, grey)
         remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))
 
@@ -521,6 +550,7 @@ class StageRun:
             "densifier": self.densifier.state,
             "joint": None if self.joint is None else self.joint.state(),
             "exposure": None if self.exposures is None else self.exposures.state(),
+            "poses": None if self.poses is None else self.poses.state(),
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -539,9 +569,15 @@ class StageRun:
         if (joint := state.get("joint")) is not None:
             assert self.unfreeze is not None
             self.joint = self.unfreeze(joint)
-        if (exposure := state.get("exposure")) is not None:
-            assert self.exposures is not None, "the trainer looks for it"
-            self.exposures.restore(exposure)
+            self.joint.poses = self.poses
+        self.restore_transforms(state)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)
+
+    def restore_transforms(self, state: Mapping[str, Any]) -> None:
+        """Take what is learned of the training views from a result of `state`."""
+        for transforms, name in ((self.exposures, "exposure"), (self.poses, "poses")):
+            if (found := state.get(name)) is not None:
+                assert transforms is not None, "the trainer looks for it"
+                transforms.restore(found)

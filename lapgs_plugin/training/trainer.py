@@ -34,6 +34,7 @@ from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.run import refined
 from lapgs_plugin.runs.archive import CACHE, CHECKPOINT, OPTIMIZER, RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
@@ -44,11 +45,12 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_exposure, check_moments
+from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_moments, check_transforms
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.quality import (
     SAMPLED_VIEWS,
     SAMPLES_OF_A_STAGE,
@@ -268,6 +270,15 @@ class Trainer:
         done = self.plan.iterations_before(stage.level)
         return ViewExposures.create(names, start, self.device, done, self.plan.iterations)
 
+    def _poses(self, stage: Stage) -> ViewPoses | None:
+        """Return the corrections of poses that a stage starts with; None if the run does not refine poses."""
+        if not self.settings.refine_poses:
+            return None
+        levels, done = self.archive.available_levels, self.plan.iterations_before(stage.level)
+        start = (self.archive.poses(levels[-1]) if levels else None) or {}
+        total = self.plan.iterations
+        return ViewPoses.create(self.scene.train, start, self.scene.extent, self.device, done, total)
+
     def _first_exposures(self) -> Tensor | None:
         """Return the colour transforms (v, 3, 4) that the run starts with, as --exposure says and the photos differ."""
         choice = self.settings.exposure
@@ -302,8 +313,9 @@ class Trainer:
         if checkpoint is not None:
             path = self.archive.path(CHECKPOINT)
             check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
-            views = None if run.exposures is None else len(run.exposures.names)
-            check_exposure(checkpoint.get("exposure"), views, path)
+            for name, learned in (("exposure", run.exposures), ("poses", run.poses)):
+                shape = None if learned is None else learned.transforms.shape
+                check_transforms(checkpoint.get(name), shape, name, path)
             run.restore(checkpoint)
         if self.breakdown and not run.breakdown.measures:
             self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
@@ -363,6 +375,7 @@ class Trainer:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         coarser = self.plan.iterations_before(stage.level)
         batches = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+        batches = batches and not self.settings.refine_poses
         schedule = StageSchedule.create(
             self.settings,
             stage,
@@ -398,6 +411,7 @@ class Trainer:
             joint_from=self.settings.joint_from(stage),
             unfreeze=self._unfreeze,
             exposures=self._exposures(stage, checkpoint),
+            poses=self._poses(stage),
             breakdown=self._breakdown(before),
             progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
@@ -452,8 +466,10 @@ class Trainer:
         cache = self._stores(views, where).make_upsampled(coarser, precision, name, self._pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(self.archive, self.rasterizer, self.device)
+            at_full_size = {view.name: view.camera for view in views}
+            cameras = refined(self.archive, at_full_size) if name == TRAIN else at_full_size
             for view in views:
-                camera = level_camera(view.camera, stage.level)
+                camera = level_camera(cameras[view.name], stage.level)
                 cache.put(view.name, renderer.images([view.camera], coarser)[0], (camera.height, camera.width))
         return cache
 
@@ -580,7 +596,7 @@ class Trainer:
             found = fmean(self._psnr(run, view)[fitted] for view in self._aside)
             if self._best is None or found > self._best["psnr"]:
                 state = run.state()
-                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure")}
+                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure", "poses")}
                 self._best = {"psnr": found, "iteration": run.progress.iteration, **parts}
             if run.progress.iteration == run.stage.iterations and self._best["iteration"] < run.stage.iterations:
                 self.monitor.say(
@@ -599,8 +615,7 @@ class Trainer:
             best["model"], settings.rates, self.scene.extent, device=self.device, sparse=settings.sparse_adam
         )
         run.joint = None if best["joint"] is None else self._unfreeze(best["joint"])
-        if run.exposures is not None:
-            run.exposures.restore(best["exposure"])
+        run.restore_transforms(best)
 
     def _watch_quality(self, run: StageRun, measured: Mapping[str, float]) -> None:
         """Say it if held-out views got worse while the training loss fell."""
@@ -646,11 +661,12 @@ class Trainer:
         moments = run.model.optimizer_moments() if self._next_stage_inherits_moments(run.stage) else None
         along = None if run.joint is None else run.joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
+        poses = None if run.poses is None else run.poses.archived()
         if before is None:
-            self.archive.finish_level(record, field, moments, along, exposure)
+            self.archive.finish_level(record, field, moments, along, exposure, poses)
         else:
             extended = {"iterations": self.settings.iterations, "extended": self.settings.extended}
-            self.archive.finish_extension(record, {**(along or {}), run.stage.level: field}, exposure, extended)
+            self.archive.finish_extension(record, {**(along or {}), run.stage.level: field}, exposure, poses, extended)
         self.watcher.stage_finished(run.stage, lambda: _fields(run))
 
     @property
