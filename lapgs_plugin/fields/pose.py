@@ -104,7 +104,8 @@ def _generators(dtype: torch.dtype, device: torch.device) -> Tensor:
     directions = torch.randn(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     directions = torch.nn.functional.normalize(directions, dim=1)
     leaf = directions.clone().requires_grad_()
-    slopes = torch.autograd.functional.jacobian(lambda at: sh_basis(at, MAX_SH_DEGREE).sum(0), leaf)  # (16, 100, 3)
+    slopes: Tensor  # (16, 100, 3)
+    slopes = torch.autograd.functional.jacobian(lambda at: sh_basis(at, MAX_SH_DEGREE).sum(0), leaf)  # type: ignore[no-untyped-call]  # torch's
     turned = torch.linalg.cross(directions.expand_as(slopes), slopes).permute(1, 0, 2)  # (100, 16, 3)
     found: Tensor = torch.linalg.lstsq(sh_basis(directions, MAX_SH_DEGREE), turned.flatten(1)).solution
     return found.view(16, 16, 3).permute(2, 1, 0).to(device, dtype)  # from j, k, axis

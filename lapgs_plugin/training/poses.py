@@ -21,7 +21,7 @@ from lapgs_plugin.runs.archive import Poses
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.view_transforms import ViewTransforms
 
-FIRST_RATE, LAST_RATE = 0.2, 0.01
+FIRST_RATE, LAST_RATE = 0.1, 0.005
 """Adam's step size at the start and the end of a run, in pixels of the full image that a turn shifts it by."""
 LEAST_VARIATION = 1e-6
 """Similarity transforms that move cameras less than this, relative to the others, are not removed."""

@@ -226,6 +226,10 @@ class Trainer:
                 few = few_views_line(len(self.scene.train), self.plan.iterations, bool(self.scene.test))
                 if few is not None and not resume:
                     self.monitor.say(few)
+                if self.settings.refine_poses and self.device.type == "cuda":
+                    self.monitor.say(
+                        "--refine-poses: each view is rendered alone, which takes longer than several at once"
+                    )
                 for stage in self.plan:
                     if stage.level in self.archive.available_levels and self._to_extend(stage) is None:
                         continue
