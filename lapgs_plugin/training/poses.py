@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from lapgs_plugin.runs.archive import Poses
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.view_transforms import ViewTransforms
 
-FIRST_RATE, LAST_RATE = 0.1, 0.005
+FIRST_RATE, LAST_RATE = 0.1, 0.002
 """Adam's step size at the start and the end of a run, in pixels of the full image that a turn shifts it by."""
 LEAST_VARIATION = 1e-6
 """Similarity transforms that move cameras less than this, relative to the others, are not removed."""
@@ -35,6 +35,8 @@ class ViewPoses(ViewTransforms):
         cameras: of the views as they came, by name, at full size.
         extent: of the scene, in world units.
     """
+
+    STARTS_AT: ClassVar[float] = 0.2  # a field that still takes shape draws poses anywhere
 
     cameras: Mapping[str, Camera]
     extent: float

@@ -430,11 +430,8 @@ class StageRun:
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
     def _watched(self, gaussians: GaussianField, names: Sequence[str]) -> GaussianField:
-        """Return the field for a render of some views, with gradients by their poses where these are refined.
-
-        Beside a prediction from the cache they stay as they were when it was rendered.
-        """
-        if self.poses is None or (self.accumulated is not None and self.joint is None):
+        """Return the field for a render of some views, with gradients by their poses if these are refined."""
+        if self.poses is None:
             return gaussians
         (name,) = names
         return self.poses.watched(name, gaussians)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -25,6 +25,9 @@ class ViewTransforms(ABC):
         transforms: (v, ...) parameter, on the training device.
         done, total: iterations of the run before this stage, and of all stages, for the step size.
     """
+
+    STARTS_AT: ClassVar[float] = 0.0
+    """Share of the run's iterations before the first step."""
 
     names: Sequence[str]
     transforms: torch.nn.Parameter  # (v, ...)
@@ -55,7 +58,11 @@ class ViewTransforms(ABC):
         """
         if iteration % len(self.names) >= views:
             return
-        (first, last), progress = self._rates, min(1.0, (self.done + iteration) / self.total)
+        progress = min(1.0, (self.done + iteration) / self.total)
+        if progress < self.STARTS_AT:
+            self.forget_gradients()
+            return
+        first, last = self._rates
         self._adam.param_groups[0]["lr"] = first * (last / first) ** progress
         self._step()
 

@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from typer.testing import CliRunner
 
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -19,7 +21,9 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import refined, run_cameras, run_scene
 from lapgs_plugin.runs.archive import Poses, RunArchive
-from lapgs_plugin.scenes.scene import Scene, load_cameras
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import poses
+from lapgs_plugin.training.checkpoint import TransformsState, check_transforms
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
@@ -84,16 +88,98 @@ def test_what_a_similarity_transform_of_the_scene_explains_is_removed() -> None:
             centre = view.camera.position
             moved = torch.linalg.cross(turn, centre) + shift + growth * centre
             start[view.name] = (row + torch.cat([-turn, moved])).tolist()
-        poses = ViewPoses.create(scene.train, start, scene.extent, torch.device("cpu"), 0, 100)
-        poses.transforms.grad = torch.zeros_like(poses.transforms)
-        poses.after_step(7, 1)
-        return torch.tensor([*poses.archived().values()])
+        return torch.tensor([*without_common_part(scene, start).values()])
 
-    assert left(torch.zeros(7, 6)).abs().max() < 1e-7  # worst seen 4e-9
+    assert left(torch.zeros(7, 6)).abs().max() < 1e-7  # worst seen 3e-9
     remaining = left(own)
     assert (remaining - own).abs().max() > 1e-3  # they have something in common, too
     torch.testing.assert_close(left(remaining), remaining, atol=1e-7, rtol=0)
     torch.testing.assert_close(remaining[:, 3:].mean(0), torch.zeros(3), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
+def test_run_refines_poses_and_resumes_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
+    scene = perturbed(ring_scene(train=8, test=0), 0.02)
+    settings = TrainSettings(iterations=96, hierarchy=hierarchy, sh_degree=1, refine_poses=True)
+    whole = train(scene, settings, tmp_path / "whole")
+    refined_to = [whole.poses(level) for level in (1, 0)]
+    assert all(each is not None and max(map(abs, each["view_0.png"])) > 0 for each in refined_to)
+    assert refined_to[0] != refined_to[1]  # the base's corrections were refined further
+    for stop_at in ((1, 30), (0, 45)):  # level 0 trains jointly from its iteration 36 on
+        folder = tmp_path / f"stopped_{stop_at[0]}"
+        with pytest.raises(TrainingStoppedError):
+            train(scene, settings, folder, stop_at)
+        again = train(scene, settings, folder, resume=True)
+        assert [again.poses(level) for level in (1, 0)] == refined_to
+        assert all((again.field(level).means == whole.field(level).means).all() for level in (0, 1))
+
+
+def test_refinement_finds_true_poses_and_sharpens_held_out_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poses, "FIRST_RATE", 0.15)  # a short run of tiny images
+    truth = ring_scene(train=16, test=2, size=(32, 24))
+    scene = perturbed(truth, 0.03)
+    psnr, shift = {}, {}
+    for refine in (False, True):
+        settings = TrainSettings(iterations=700, levels=1, sh_degree=0, gather=1, refine_poses=refine)
+        archive = train(scene, settings, tmp_path / str(refine))
+        psnr[refine], shift[refine] = archive.history()[-1]["psnr"], shift_of_points(scene, truth, archive)
+    assert shift[False] == shift_of_points(scene, truth) > 1.0
+    assert shift[True] < 0.5 * shift[False]
+    assert psnr[True] > psnr[False] + 1.0
+
+
+def test_archived_corrections_move_training_cameras_and_no_others(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path)
+    run = write_run(tmp_path / "run", folder)
+    train_before, test_before = run_cameras(RunArchive.open(run))
+    name = next(iter(train_before))
+    moved = {name: [0.0, 0.0, 0.0, 0.5, -0.25, 1.0], next(iter(test_before)): [0.1] * 6}
+    (run / "level_0" / "poses.json").write_text(json.dumps(moved))
+    archive = RunArchive.open(run)
+    train_after, test_after = run_cameras(archive)
+    shift = train_after[name].position - train_before[name].position
+    torch.testing.assert_close(shift, torch.tensor([0.5, -0.25, 1.0]), atol=5e-6, rtol=0)  # worst seen 1e-7
+    loaded = run_scene(archive)
+    for views, cameras in ((loaded.train, train_after), (loaded.test, test_after)):
+        assert all((view.camera.world_to_camera == cameras[view.name].world_to_camera).all() for view in views)
+    others = {**train_before, **test_before}
+    del others[name]
+    for other, camera in others.items():
+        assert ({**train_after, **test_after}[other].world_to_camera == camera.world_to_camera).all()
+
+
+def test_damaged_corrections_are_refused(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path))
+    (run / "level_0" / "poses.json").write_text(json.dumps({"01.png": [0.0, 0.0]}))
+    with pytest.raises(RunFolderError, match=r"poses\.json.*train again with --overwrite"):
+        run_cameras(RunArchive.open(run))
+
+
+def test_a_checkpoint_of_other_views_is_refused(tmp_path: Path) -> None:
+    shape, path = torch.Size([8, 6]), tmp_path / "checkpoint.pt"
+    state = TransformsState(transforms=torch.zeros(7, 6), gradient=None, moments={})
+    for found in (state, None):
+        with pytest.raises(RunFolderError, match="poses is not the state of transforms for 8 views"):
+            check_transforms(found, shape, "poses", path)
+    check_transforms({**state, "transforms": torch.zeros(8, 6)}, shape, "poses", path)
+
+
+def test_refinement_is_refused_where_it_is_not_offered(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="--refine-poses True with --protocol paper"):
+        TrainSettings(refine_poses=True, protocol="paper")
+    error = CliRunner().invoke(app, ["run", "--refine-poses", "train.py", "-s", "scene"]).exception
+    assert isinstance(error, UserInputError)
+    assert str(error) == "no such option: --refine-poses; see `lapgs run --help`"
+
+
+def without_common_part(scene: Scene, start: Poses) -> Poses:
+    """Corrections after a step without a gradient."""
+    views = ViewPoses.create(scene.train, start, scene.extent, torch.device("cpu"), 0, len(scene.train))
+    views.transforms.grad = torch.zeros_like(views.transforms)
+    views.after_step(len(scene.train), 1)
+    return views.archived()
 
 
 def perturbed(scene: Scene, noise: float) -> Scene:
@@ -101,10 +187,7 @@ def perturbed(scene: Scene, noise: float) -> Scene:
     count = len(scene.train)
     rows = noise * torch.randn(count, 6, generator=torch.Generator().manual_seed(5))
     start = {view.name: row.tolist() for view, row in zip(scene.train, rows, strict=True)}
-    poses = ViewPoses.create(scene.train, start, scene.extent, torch.device("cpu"), 0, 1)
-    poses.transforms.grad = torch.zeros_like(poses.transforms)
-    poses.after_step(count, 1)
-    wrong = poses.archived()
+    wrong = without_common_part(scene, start)
     return replace(
         scene, train=tuple(replace(view, camera=corrected(view.camera, wrong[view.name])) for view in scene.train)
     )
