@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 from lapgs_plugin.cli.bench_blend import blend
 from lapgs_plugin.cli.bench_experiment import bench_experiment
 from lapgs_plugin.cli.bench_raster import raster
+from lapgs_plugin.cli.output import make_console
 
 EXPERIMENT = "run"
 """The default subcommand: `lapgs bench smoke.toml`."""
@@ -43,7 +44,6 @@ def ops(
         raise UserInputError(f"--device {device}: expected auto, cpu or cuda")
     import torch
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.ops.benchmark import benchmark
@@ -62,7 +62,7 @@ def ops(
         name = "" if found.op == shown else found.op
         table.add_row(name, found.version, f"{found.milliseconds:.2f}", f"{found.ratio:.2f}", f"{found.difference:.0e}")
         shown = found.op
-    Console().print(table)
+    make_console().print(table)
 
 
 bench_app = typer.Typer(

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from lapgs_plugin.cli.output import make_console
+
 
 def blend(
     sizes: Annotated[
@@ -34,7 +36,6 @@ def blend(
     """
     import torch
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.errors import UserInputError
@@ -70,4 +71,4 @@ def blend(
                     f"{found.difference:.0e}",
                 )  # fmt: skip
                 shown = ""
-    Console().print(table)
+    make_console().print(table)

@@ -107,7 +107,7 @@ class _Check(Rehearsal):
 
     def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
         from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-        from lapgs_plugin.training.trainer import check_storage, make_plan
+        from lapgs_plugin.training.planning import check_storage, make_plan
 
         if self.size is not None:
             make_plan(self.size(reference.resolution) or ANY_SIZE, settings)

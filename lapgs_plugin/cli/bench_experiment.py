@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.limits import LONGEST_NAME
 
@@ -126,7 +127,6 @@ def bench_experiment(
 
         lapgs bench benchmarks/split.toml --path mipnerf360=/data/360 --path fastgs=~/FastGS --scene bonsai
     """
-    from rich.console import Console
 
     from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.aggregate import check_table
@@ -138,7 +138,7 @@ def bench_experiment(
     from lapgs_plugin.experiments.schema import load_experiment
     from lapgs_plugin.experiments.store import ResultStore
 
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     mistakes = Mistakes(experiment)
     loaded = load_experiment(experiment, _option_names())
     with mistakes.at("table"):
@@ -325,7 +325,6 @@ def _write(
     """
     import shlex
 
-    from rich.console import Console
     from rich.markdown import Markdown
     from rich.markup import escape
 
@@ -363,7 +362,7 @@ def _write(
         exports.write_parquet(folder.path / exports.PARQUET, rows)
     except MissingExtraError as error:
         messages.print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
-    console = Console()
+    console = make_console()
     console.print(Markdown(text)) if console.is_terminal else print(text)
     others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
     if others:

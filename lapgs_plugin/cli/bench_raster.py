@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.output import make_console
+
 if TYPE_CHECKING:
     import torch
 
@@ -110,7 +112,6 @@ def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> li
 
 def _print_results(results: Sequence[CaseResult]) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.evaluation.bench_raster import FAST, machine
@@ -133,7 +134,7 @@ def _print_results(results: Sequence[CaseResult]) -> None:
         times.add_section()
         memory = "" if result.peak_memory is None else f"{result.peak_memory / 1e6:.0f}"
         parts.add_row(case.size, *(f"{ms:.1f}" for ms in result.parts.values()), f"{result.loss_share:.0%}", memory)
-    console = Console()
+    console = make_console()
     console.print(times, parts)
     for result in results:
         if result.gsplat_tile_loop is not None:

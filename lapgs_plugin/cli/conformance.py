@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.output import make_console
+
 if TYPE_CHECKING:
     from lapgs_plugin.evaluation.conformance import Outcome, Subject
 
@@ -115,12 +117,11 @@ def _chosen(names: Sequence[str]) -> list[Subject]:
 
 
 def _print(subject: Subject, outcomes: Sequence[Outcome]) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     failed = [outcome for outcome in outcomes if outcome.problems]
-    console = Console()
+    console = make_console()
     table = Table(title=subject.name, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("case")
     for title in COLUMNS.values():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from lapgs_plugin.cli.output import make_console
 
 if TYPE_CHECKING:
     from lapgs_plugin.environment.findings import Finding
@@ -131,7 +134,6 @@ def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Findin
 
 
 def _print(sections: dict[str, list[Finding]]) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -144,4 +146,8 @@ def _print(sections: dict[str, list[Finding]]) -> None:
         for finding in found:
             advice = f"\n[yellow]{escape(finding.advice)}[/yellow]" if finding.advice else ""
             table.add_row(MARKS[finding.status], escape(finding.name), escape(finding.detail) + advice)
-    Console().print(table)
+    console = make_console()
+    with console.capture() as shown:
+        console.print(table)
+    # Each row is padded to the longest: where lines are not cut, a narrow window would show the spaces as empty lines.
+    print(re.sub(" +$", "", shown.get(), flags=re.MULTILINE), end="")

@@ -24,12 +24,13 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         path: its root, its training script, or a folder of scripts in it.
 
     Raises:
-        UserInputError: it is no 3DGS checkout; the line says what is missing.
+        UserInputError: it is no 3DGS checkout, and the line says what is missing; or it has several training scripts
+            and none of them is `train.py` in its root.
     """
     from lapgs_plugin.adapters.registry import adapter_class
     from lapgs_plugin.environment.findings import Finding
 
-    source = _source(path)
+    source, others = _source(path)
     adapter = adapter_class(source.root)
     parameters = ", ".join(argument.arg for argument in source.training.args.args)
     return {
@@ -37,6 +38,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             Finding("Root", "ok", str(source.root)),
             Finding("Adapter", "ok", f"{adapter.info.title} (--backbone {adapter.info.name})"),
             Finding("Training", "ok", f"{source.place(source.training)}: {source.training.name}({parameters})"),
+            *_others(path, others),
             Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
         ],
         "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [_no_rasterizer(source)],
@@ -46,19 +48,39 @@ def describe(path: Path) -> dict[str, list[Finding]]:
     }
 
 
-def _source(path: Path) -> CheckoutSource:
+def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
+    """Return the sources of the training script to describe, and the names of other training scripts."""
     from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
 
     if path.is_file():
-        return CheckoutSource.read(path)
-    scripts = training_scripts(path.absolute())
-    problem = UserInputError(f"{path} has no train*.py, expected the root of a 3DGS checkout, or its training script")
-    for script in scripts:
+        return CheckoutSource.read(path), []
+    found: dict[str, CheckoutSource] = {}
+    problems: list[UserInputError] = []
+    for script in training_scripts(path.absolute()):
         try:
-            return CheckoutSource.read(script)
+            found[str(script.relative_to(path.absolute()))] = CheckoutSource.read(script)
         except UserInputError as error:
-            problem = error
-    raise problem
+            problems.append(error)
+    if not found:
+        missing = f"{path} has no train*.py, expected the root of a 3DGS checkout, or its training script"
+        raise problems[0] if problems else UserInputError(missing)
+    names = list(found)
+    if len(names) > 1 and names[0] != "train.py":
+        raise UserInputError(
+            f"{path} has several training scripts: {', '.join(names)}; expected one of them, as in "
+            f"`lapgs doctor {path / names[0]}`"
+        )
+    return found[names[0]], names[1:]
+
+
+def _others(path: Path, scripts: list[str]) -> list[Finding]:
+    from lapgs_plugin.environment.findings import Finding
+
+    if not scripts:
+        return []
+    return [
+        Finding("Other scripts", "ok", f"{', '.join(scripts)}; describe one with `lapgs doctor {path / scripts[0]}`")
+    ]
 
 
 def _rasterizer(use: RasterizerUse) -> Finding:
@@ -101,12 +123,16 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 def _kinds(source: CheckoutSource) -> list[Finding]:
     from lapgs_plugin.environment.findings import Finding
 
-    inputs = frozenset[str]().union(*(use.inputs for use in source.rasterizers))
+    taken = {module: set[str]() for module in source.rasterizer_modules}
+    for use in source.rasterizers:
+        taken[use.module] |= use.inputs & COLORS
     more = "the dry run of `lapgs run` says more"
     nested = Finding("nested", "ok", f"one call of the checkout's own training; {more}")
-    if inputs & COLORS:
-        takes = " and ".join(sorted(inputs & COLORS))
-        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}; {more}")]
+    blind = [module for module, inputs in taken.items() if not inputs]
+    if len(blind) < len(taken):
+        takes = " and ".join(sorted(set[str]().union(*taken.values())))
+        but = f", but {' and '.join(blind)} does not" if blind else ""
+        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}{but}; {more}")]
     why = f"its rasterizer takes neither {' nor '.join(sorted(COLORS))}, by which a residual has colours of both signs"
     return [nested, Finding("laplacian", "absent", why)]
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import printable
 
@@ -90,7 +91,6 @@ def evaluate(
 def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | None, options: RenderOptions) -> None:
     """Measure flicker along a path and print it."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.evaluation.stability import evaluate_stability
@@ -106,7 +106,7 @@ def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | 
     table = Table("", "mean difference", "PSNR (dB)", box=box.SIMPLE_HEAD)
     for name, each in figures["flicker"].items():
         table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")
-    console = Console()
+    console = make_console()
     width, height = figures["size"]
     console.print(
         f"[bold]Flicker[/bold] along {trajectory}: {figures['frames']} frames of {width}x{height}, each against the "
@@ -118,9 +118,8 @@ def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | 
 
 
 def _print(metrics: dict[str, Any]) -> None:
-    from rich.console import Console
 
-    console = Console()
+    console = make_console()
     _print_views(console, metrics)
     _print_levels(console, metrics)
     if metrics["breakdown_seconds"]:

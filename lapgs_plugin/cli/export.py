@@ -43,7 +43,9 @@ def export(
     html: Annotated[
         bool,
         typer.Option(
-            "--html", help="Write scene.html instead: a viewer with the scene in one file, which opens offline."
+            "--html",
+            help="Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
+            "level_<l>_base.html or level_<l>_field.html.",
         ),
     ] = False,
     scene: Annotated[
@@ -86,8 +88,7 @@ def export(
         folder.mkdir(parents=True, exist_ok=True)
     for each, field in fields.items():
         note = _note(archive, each)
-        kind = "base" if each == archive.manifest.levels - 1 else "residual" if field.signed else "field"
-        path = folder / f"level_{each}_{kind}.{file_format}"
+        path = folder / f"{_level_name(archive, each)}.{file_format}"
         _write_field(field, path, note)
         print(
             f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
@@ -130,7 +131,7 @@ def _write_one(
             f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
             "field to the run"
         )
-    path = folder / (PAGE if html else f"{MERGED}.{file_format}")
+    path = folder / _one_name(archive, level, html, file_format)
     cameras = list(run_cameras(archive, scene)[0].values()) if html else []
     with one_line_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -140,6 +141,13 @@ def _write_one(
         _write_field(field, path, f"one field fitted to the images of {archive.path().name}")
     opens = ", opens in a browser without a network" if html else ""
     print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{opens}")
+
+
+def _one_name(archive: RunArchive, level: int | None, html: bool, file_format: str) -> str:
+    """Return the name of the one file to write: pages of several levels can lie beside each other."""
+    if not html:
+        return f"{MERGED}.{file_format}"
+    return PAGE if level is None else f"{_level_name(archive, level)}.html"
 
 
 def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> GaussianField:
@@ -176,6 +184,13 @@ def _levels(archive: RunArchive, level: int | None) -> tuple[int, ...]:
         archive.manifest.record(archive.manifest.levels - 1)  # raises if no level is finished
         return archive.available_levels
     return (archive.manifest.record(level).level,)
+
+
+def _level_name(archive: RunArchive, level: int) -> str:
+    """Return the name of a level's files, without suffix."""
+    if level == archive.manifest.levels - 1:
+        return f"level_{level}_base"
+    return f"level_{level}_{'residual' if archive.manifest.record(level).signed else 'field'}"
 
 
 def _note(archive: RunArchive, level: int) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import UserInputError
 
@@ -200,7 +201,6 @@ def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
 
 def _print_speeds(renderer: HierarchyRenderer, cameras: Sequence[Camera], level: int, size: str | None) -> None:
     """Print frames per second over these cameras, at another size if one is given."""
-    from rich.console import Console
     from rich.table import Table
 
     from lapgs_plugin.rendering.clip import parse_size
@@ -217,7 +217,7 @@ def _print_speeds(renderer: HierarchyRenderer, cameras: Sequence[Camera], level:
             f"{speed.milliseconds:.2f}",
             f"{speed.fps:.1f}",
         )
-    Console().print(table)
+    make_console().print(table)
 
 
 def _write_views(

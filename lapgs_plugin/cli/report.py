@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rendering import RenderOptions, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
 
@@ -85,7 +86,6 @@ def _newest(folder: Path) -> Path:
 
 def _print(runs: Sequence[MeasuredRun]) -> None:
     from rich import box
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -96,7 +96,7 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     for row in comparison_rows([each.metrics for each in runs]):
         cells = ["\n".join([cell.text, *(f"[dim]{part}[/dim]" for part in cell.parts)]) for cell in row.cells]
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))
-    console = Console()
+    console = make_console()
     console.print(table)
     if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
         console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}", highlight=False)

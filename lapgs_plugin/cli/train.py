@@ -13,6 +13,7 @@ import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, extend_config, write_config
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
@@ -72,7 +73,6 @@ def train(
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
     """
-    from rich.console import Console
     from rich.markup import escape
 
     from lapgs_plugin.runs.gpu_busy import require_cuda
@@ -98,7 +98,7 @@ def train(
         require_tensorboard()
     if control.gpu_busy:
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     if resume:
         given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
@@ -151,7 +151,7 @@ def _resume(
     from lapgs_plugin.rendering.run import require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.trainer import check_storage
+    from lapgs_plugin.training.planning import check_storage
 
     archive = RunArchive.open(out, resume=True)
     try:
@@ -229,7 +229,7 @@ def _create(
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.trainer import check_storage, make_plan
+    from lapgs_plugin.training.planning import check_storage, make_plan
 
     RunArchive.require_room(out, overwrite)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
@@ -260,8 +260,9 @@ def _run(
     from lapgs_plugin.scenes.masks import share_inside
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import Monitor, ProgressMonitor
+    from lapgs_plugin.training.planning import make_plan
     from lapgs_plugin.training.tensorboard import TensorboardMonitor
-    from lapgs_plugin.training.trainer import Trainer, make_plan
+    from lapgs_plugin.training.trainer import Trainer
 
     if control.threads is not None:
         torch.set_num_threads(control.threads)

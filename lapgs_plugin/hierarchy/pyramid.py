@@ -18,7 +18,6 @@ rendered on that grid, "mixed", which is not offered for training.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 
@@ -123,13 +122,6 @@ class Pyramid:
         images = self.gaussian(image, levels)
         residuals = [fine - self.up(coarse, _size(fine)) for fine, coarse in pairwise(images)]
         return [*residuals, images[-1]]
-
-    def reconstruct(self, pyramid: Sequence[Tensor]) -> Tensor:
-        """Return the image of a Laplacian pyramid, finest level first: I^l = Up(I^(l+1)) + R^l, down to level 0."""
-        image = pyramid[-1]
-        for residual in reversed(pyramid[:-1]):
-            image = self.up(image, _size(residual)) + residual
-        return image
 
     def _coarse_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
         """Return where coarse samples lie among the fine ones: first position, spacing, count."""

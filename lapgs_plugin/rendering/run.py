@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, wa
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.masks import ALPHA, NONE
-from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
+from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene
 from lapgs_plugin.scenes.source import is_folder
 
 PATHS = ("orbit", "spline")
@@ -68,8 +68,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         background=reference.background,
     )
     require_same_scene(archive, scene.path, scene.smallest_size)
-    cameras = refined(archive, {view.name: view.camera for view in scene.train})
-    return replace(scene, train=tuple(replace(view, camera=cameras[view.name]) for view in scene.train))
+    return replace(scene, train=refined_views(archive, scene.train))
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
@@ -98,6 +97,12 @@ def refined(archive: RunArchive, cameras: Mapping[str, Camera]) -> dict[str, Cam
         name: corrected(camera, corrections[name]) if name in corrections else camera
         for name, camera in cameras.items()
     }
+
+
+def refined_views(archive: RunArchive, views: Sequence[View]) -> tuple[View, ...]:
+    """Return training views with `refined` cameras."""
+    cameras = refined(archive, {view.name: view.camera for view in views})
+    return tuple(replace(view, camera=cameras[view.name]) for view in views)
 
 
 def path_cameras(

@@ -17,8 +17,9 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
-from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher

@@ -30,7 +30,7 @@ from lapgs_plugin.hierarchy.plan import StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
-from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
 logger = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
 
 if TYPE_CHECKING:
-    from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+    from lapgs_plugin.runner.stage_rendering import StageRendering
 
 
 class HookCaller:

@@ -21,8 +21,8 @@ from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.runner.context import FinishedStage, RunContext, TrainingRun
-from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
 from lapgs_plugin.runner.stage_images import StageImages
+from lapgs_plugin.runner.stage_rendering import StageRendering
 
 COLORS = ("f_dc", "f_rest")
 

@@ -25,7 +25,8 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper, StageRendering
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 
 logger = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import TrainingCall
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.rasterizer_wrapper import StageRendering
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 
 

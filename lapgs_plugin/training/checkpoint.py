@@ -32,7 +32,7 @@ Moments = dict[str, dict[str, Tensor]]
 
 
 class ProgressState(TypedDict):
-    """State of a `stage.StageProgress`; the loss is NaN before the first iteration."""
+    """State of a `stage_progress.StageProgress`; the loss is NaN before the first iteration."""
 
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     iteration: NonNegativeInt

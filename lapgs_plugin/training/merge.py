@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -16,7 +15,6 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import render_image
-from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -28,7 +26,6 @@ from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
@@ -88,16 +85,15 @@ def merge_levels(
         placed = training_rasterizer(choose_rasterizer(AUTO), settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
         with RunArchive.create(Path(scratch) / "run", empty) as fitted:
-            trainer = _Distillation(
+            Trainer(
                 scene=teacher,
                 settings=settings,
                 archive=fitted,
                 rasterizer=placed.rasterizer,
                 device=placed.device,
                 monitor=monitor or Monitor(),
-            )
-            trainer.start = start
-            trainer.run()
+                first_field=start,
+            ).run()
             field = fitted.field(0)
         return _measured(field, teacher, scene, placed)
 
@@ -126,16 +122,6 @@ def first_field(fields: dict[int, GaussianField]) -> GaussianField:
 def _padded(sh: torch.Tensor, count: int) -> torch.Tensor:
     """Return coefficients (n, k, 3) with zeros up to (n, count, 3)."""
     return torch.cat([sh, sh.new_zeros(len(sh), count - sh.shape[1], 3)], dim=1)
-
-
-class _Distillation(Trainer):
-    """Train one field that starts from a given one."""
-
-    start: GaussianField
-
-    def _first_model(self, stage: Stage, checkpoint: dict[str, Any] | None) -> TrainableField:
-        rates, extent = self.settings.rates, self.scene.extent
-        return TrainableField.create(self.start.to(self.device), rates, extent, sparse=self.settings.sparse_adam)
 
 
 def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSettings:

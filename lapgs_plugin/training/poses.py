@@ -7,7 +7,7 @@ common, a similarity transform of the scene, is removed, so that held-out views 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any, ClassVar
 
@@ -20,6 +20,7 @@ from lapgs_plugin.fields.pose import corrected, turned_gradient, with_pose_gradi
 from lapgs_plugin.runs.archive import Poses
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.view_transforms import ViewTransforms
+from lapgs_plugin.training.views import LevelView
 
 FIRST_RATE, LAST_RATE = 0.1, 0.002
 """Adam's step size at the start and the end of a run, in pixels of the full image that a turn shifts it by."""
@@ -114,6 +115,11 @@ class ViewPoses(ViewTransforms):
     def _recentre(self) -> None:
         flat = self.transforms.view(-1)
         flat.sub_(self._common @ (self._common.T @ flat))
+
+
+def at_pose(view: LevelView, poses: ViewPoses | None) -> LevelView:
+    """Return a view at its refined pose, or as it came."""
+    return view if poses is None else replace(view, camera=poses.camera(view.name, view.camera))
 
 
 def _similarities(centres: Sequence[Tensor], extent: float) -> Tensor:

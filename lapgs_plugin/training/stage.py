@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -17,27 +17,23 @@ from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, render_image
-from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.ops.composition import add_prediction
-from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.level_images import LevelImages
-from lapgs_plugin.runs.manifest import LevelRecord
-from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
-from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.exposure import ViewExposures
-from lapgs_plugin.training.joint import JointFields
+from lapgs_plugin.training.losses import ViewLosses
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
-from lapgs_plugin.training.poses import ViewPoses
+from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
+from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.stage_progress import StageProgress
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, view_index
 
@@ -45,36 +41,6 @@ FINITE_CHECK_EVERY = 100
 """Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
 LOSSES_READ_EVERY = 50
 """Losses that are read together on a GPU: each reading waits until the GPU has caught up with the processor."""
-LOSS_SMOOTHING = 0.95
-"""Weight of earlier losses in the loss that is shown and logged: single views differ too much to show a trend."""
-
-
-@dataclass
-class StageProgress:
-    """Hold what a stage changes besides the field, for checkpoints.
-
-    Attributes:
-        iteration: the last finished one, from 1 within the stage; 0 before the first.
-        seconds: optimization time of this stage so far.
-        loss: smoothed loss, NaN before the first iteration.
-        peak_gaussians: most Gaussians optimized at once in this stage.
-        gaussian_steps: Gaussians optimized, summed over the iterations.
-        most_views: views in one launch that fit into the GPU's memory; None as long as all have.
-    """
-
-    iteration: int = 0
-    seconds: float = 0.0
-    loss: float = math.nan
-    peak_gaussians: int = 0
-    gaussian_steps: int = 0
-    most_views: int | None = None
-
-    @classmethod
-    def of(cls, record: LevelRecord) -> StageProgress:
-        """Return the progress at the end of a finished stage, whose smoothed loss is not kept."""
-        mean = record.num_gaussians if record.mean_gaussians is None else record.mean_gaussians
-        steps = round(mean * record.iterations)
-        return cls(record.iterations, record.train_seconds, math.nan, record.peak_gaussians, steps)
 
 
 @dataclass(frozen=True)
@@ -106,14 +72,11 @@ class StageRun:
         stage, schedule, settings: of the stage and the run.
         views: the training views at the stage's level.
         images: their targets.
-        accumulated: Up of the previous level's prediction by view name; None for the base.
         background: (3,) behind the base; residuals are rendered over zero.
         extent: scene extent in world units.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        joint_from: the iteration from which finished fields are trained jointly; None if they never are.
-        unfreeze: makes finished fields trainable, from their state in a checkpoint or, given None, from the archive.
-        joint: finished fields while they are trained jointly; None before.
+        coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
         breakdown: measures the parts of iterations.
@@ -129,16 +92,13 @@ class StageRun:
     settings: TrainSettings
     views: Sequence[LevelView]
     images: LevelImages
-    accumulated: UpsampledImages | None
     background: Tensor
     extent: float
     rasterizer: Rasterizer
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
-    joint_from: int | None = None
-    unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
-    joint: JointFields | None = None
+    coarser: CoarserLevels = field(default_factory=CoarserLevels)
     exposures: ViewExposures | None = None
     poses: ViewPoses | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
@@ -148,6 +108,14 @@ class StageRun:
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
+
+    def __post_init__(self) -> None:
+        self._losses = ViewLosses(
+            self.stage, self.images, self.coarser, self.hooks, self.exposures, self.settings.ssim_weight
+        )
+        self._scoring = FieldScoring(
+            self.rasterizer, self.views, self._losses, self.poses, self.background, self.settings.seed, self.breakdown
+        )
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
         """Train to the end of the stage, from the iteration in `progress`. An iteration is a view, a step one or more.
@@ -207,8 +175,13 @@ class StageRun:
     @property
     def num_optimized(self) -> int:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
-        along = () if self.joint is None else self.joint.models.values()
-        return len(self.model) + sum(len(model) for model in along)
+        return len(self.model) + sum(map(len, self.coarser.models))
+
+    @property
+    def fields(self) -> dict[int, GaussianField]:
+        """The fields under training by level, without gradients."""
+        joint = self.coarser.joint
+        return {**({} if joint is None else joint.fields), self.stage.level: self.model.field.detach()}
 
     @property
     def _device(self) -> torch.device:
@@ -223,7 +196,7 @@ class StageRun:
     def _batching(self) -> BatchRasterizer | None:
         """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow.
 
-        The gradient by a pose needs the Gaussians' gradients of each view alone.
+        The gradient by a pose follows from the Gaussians' gradients of that view alone.
         """
         able = self.poses is None and isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
         return cast(BatchRasterizer, self.rasterizer) if able else None
@@ -239,7 +212,7 @@ class StageRun:
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for iteration in iterations:
             camera, degree = self._view(iteration).camera, self.schedule.active_sh_degree(iteration)
-            key = (self._is_joint(iteration), camera.width, camera.height, degree)
+            key = (self.coarser.is_joint(iteration), camera.width, camera.height, degree)
             alike.setdefault(key, []).append(iteration)
         launches = []
         for (_, width, height, _), group in alike.items():
@@ -263,8 +236,8 @@ class StageRun:
         means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
-        if self.joint is not None:
-            self.joint.step(means_rate, rest, scale)
+        if self.coarser.joint is not None:
+            self.coarser.joint.step(means_rate, rest, scale)
         for transforms in self._transforms:
             transforms.after_step(last, len(iterations))
         self.breakdown.mark("densification")
@@ -302,8 +275,7 @@ class StageRun:
 
     def _forget_gradients(self) -> None:
         self._context = None
-        models = [self.model] if self.joint is None else [self.model, *self.joint.models.values()]
-        for model in models:
+        for model in (self.model, *self.coarser.models):
             for param in model.params.values():
                 param.grad = None
         for transforms in self._transforms:
@@ -317,17 +289,15 @@ class StageRun:
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
         last = iterations[-1]
-        if self._is_joint(last) and self.joint is None:
-            assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
-            self.joint = self.unfreeze(None)
-            self.joint.poses = self.poses
+        self.coarser.start_if_joint(last)
         views = [self._view(iteration) for iteration in iterations]
         names = [view.name for view in views]
-        losses_of = self._plain_losses(names) if self._is_plain else self._hooked_losses(iterations, names)
+        losses_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_losses(iterations, names)
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
-        rendered, result = self._render(self._watched(gaussians, names), [view.camera for view in views], last)
+        shown = gaussians if self.poses is None else self.poses.watched(names[0], gaussians)
+        rendered, result = self._render(shown, [view.camera for view in views], last)
         self.breakdown.mark("loss")
         losses = losses_of(rendered)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
@@ -345,73 +315,13 @@ class StageRun:
         self.breakdown.mark("other")
         return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
 
-    @cached_property
-    def _is_plain(self) -> bool:
-        """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
-        return self.images.weights is None and self.hooks.is_plain(self.stage)
-
-    def _plain_losses(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
-        """Return what computes the mean loss of some views, in a list, from their renders."""
-        target = self.images.targets.get_stored(names)
-        if self.joint is not None:
-            self.breakdown.mark("forward")
-        below = self.joint or self.accumulated
-        compose = partial(add_prediction, accumulated=None) if below is None else below.adder(names)
-
-        def losses(rendered: Tensor) -> list[Tensor]:
-            return [photometric_loss(self._exposed(names, compose(rendered)), target, self.settings.ssim_weight)]
-
-        return losses
-
     def _hooked_losses(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
-        """Return what computes the losses of some views by all hooks, from their renders."""
-        contexts = self._contexts(iterations, names)
+        """Call the hooks that come before a render; return what computes the losses of some views from it."""
+        contexts = self._losses.contexts(iterations, names)
         for context in contexts:
             self.hooks.before_render(context)
         self._context = contexts[-1]
-
-        def losses(rendered: Tensor) -> list[Tensor]:
-            parts = (
-                [(names, rendered)] if len(contexts) == 1 else zip(([name] for name in names), rendered, strict=True)
-            )
-            return [
-                self.hooks.loss(context, self._exposed(shown, self.hooks.compose(context, image)))
-                for context, (shown, image) in zip(contexts, parts, strict=True)
-            ]
-
-        return losses
-
-    def _contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
-        """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
-        several = len(names) > 1
-        target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
-        context = StageContext(
-            stage=self.stage,
-            iteration=iterations[-1],
-            view=names[-1],
-            target=target,
-            accumulated=self._prediction(names),
-            coarse_target=coarse_target,
-            weight=self.images.get_weights(names),
-        )
-        if not several or self.hooks.takes_batches:
-            return [context]
-
-        def of(images: Tensor | None, index: int) -> Tensor | None:
-            return None if images is None else images[index]
-
-        return [
-            replace(
-                context,
-                iteration=iteration,
-                view=name,
-                target=target[index],
-                accumulated=of(context.accumulated, index),
-                coarse_target=of(coarse_target, index),
-                weight=of(context.weight, index),
-            )
-            for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
-        ]
+        return self._losses.hooked(contexts, names)
 
     def _render(
         self, gaussians: GaussianField, cameras: Sequence[Camera], iteration: int
@@ -429,99 +339,37 @@ class StageRun:
             return result.image, result
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
-    def _watched(self, gaussians: GaussianField, names: Sequence[str]) -> GaussianField:
-        """Return the field for a render of some views, with gradients by their poses if these are refined."""
-        if self.poses is None:
-            return gaussians
-        (name,) = names
-        return self.poses.watched(name, gaussians)
-
-    def _at_pose(self, view: LevelView) -> LevelView:
-        """Return a view at its refined pose."""
-        return view if self.poses is None else replace(view, camera=self.poses.camera(view.name, view.camera))
-
-    def _exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
-        """Return the composed image of a view, or images of several, at the exposure of their photos."""
-        return image if self.exposures is None else self.exposures.apply(names, image)
-
-    def _is_joint(self, iteration: int) -> bool:
-        """Return whether finished fields are trained jointly in an iteration."""
-        return self.joint_from is not None and iteration >= self.joint_from
-
     def _view(self, iteration: int) -> LevelView:
-        return self._at_pose(self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)])
-
-    def _prediction(self, names: Sequence[str]) -> Tensor | None:
-        """Return the upsampled prediction of the finished levels for a view, or for several; None for the base."""
-        several = len(names) > 1
-        if self.joint is not None:
-            self.breakdown.mark("forward")
-            return self.joint.predict_batch(names) if several else self.joint.predict(names[0])
-        if self.accumulated is None:
-            return None
-        return self.accumulated.get_batch(names) if several else self.accumulated.get(names[0])
+        index = view_index(iteration, len(self.views), self.settings.seed, self.stage.level)
+        return at_pose(self.views[index], self.poses)
 
     def _prefetch(self, iterations: Sequence[int]) -> None:
         """Copy the images of the next launch to the device while this one renders."""
         for iteration in iterations[:AHEAD]:
             name = self._view(iteration).name
             self.images.prefetch(name)
-            if self.accumulated is not None and self.joint is None:
-                self.accumulated.prefetch(name)
+            self.coarser.prefetch(name)
 
     def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
         threshold = self.densifier.score_threshold(iteration)
-        scores = None if threshold is None else self._scores(iteration, threshold)
+        scores = None
+        if threshold is not None:
+            degree = self.schedule.active_sh_degree(iteration)
+            scores = self._scoring.scores(self.model.field.detach(), iteration, degree, threshold)
         changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
         if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
-            self._prune(share)
+            gone = self._scoring.least_visible(self.model.field.detach(), share)
+            remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
             changed = True
         if changed and context is not None:
             self.hooks.on_densify(context)
         self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
 
-    def _scores(self, iteration: int, threshold: float) -> ViewScores:
-        """Score Gaussians by some training views, which are a function of the seed and the iteration."""
-        place = (self.settings.seed * 1_000_003 + self.stage.level) * 1_000_003 + iteration
-        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
-        degree, (plain, grey) = self.schedule.active_sh_degree(iteration), self._grey()
-
-        def asked(view: LevelView) -> ScoredView:
-            with torch.no_grad():
-                field = self.model.field.detach()
-                image = render_image(self.rasterizer, field, view.camera, self.background, degree)
-                below, (target, _) = self._prediction([view.name]), self.images.get(view.name)
-                self.breakdown.mark("densification")
-                composed = self._exposed([view.name], image if below is None else image + below)
-                whole = fill_outside(composed, target, self.images.get_weights([view.name]))
-                loss = photometric_loss(whole, target, self.settings.ssim_weight)
-            return ScoredView(
-                render_image(self.rasterizer, plain, view.camera, self.background, 0), whole, target, loss
-            )
-
-        views = (asked(self._at_pose(self.views[index])) for index in chosen[:SCORED_VIEWS].tolist())
-        return view_scores(views, grey, threshold)
-
-    def _grey(self) -> tuple[GaussianField, Tensor]:
-        """Return the field with all colours zero, and its coefficients (n, 1, 3), which get gradients."""
-        seen = self.model.field.detach()
-        grey = seen.sh.new_zeros(len(seen), 1, 3).requires_grad_()
-        return replace(seen, sh=grey, signed=True), grey
-
-    def _prune(self, share: float) -> None:
-        """Remove Gaussians with negligible visibility in the training views."""
-        plain, grey = self._grey()
-        cameras = (self._at_pose(view).camera for view in self.views)
-        images = (render_image(self.rasterizer, plain, camera, self.background, 0) for camera in cameras)
-        pixels = blended_pixels(images, grey)
-        remove(self.model.params, self.model.optimizers, self.densifier.state, least_blended(pixels, share))
-
     def _note_loss(self, loss: float, iteration: int, views: int) -> None:
         """Add the mean loss of some views to the smoothed loss; `iteration` is that of the last view."""
         if not math.isfinite(loss):
             raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
-        past, kept = self.progress.loss, LOSS_SMOOTHING**views
-        self.progress.loss = loss if math.isnan(past) else kept * past + (1 - kept) * loss
+        self.progress.add_loss(loss, views)
 
     def _require_finite(self, iteration: int) -> None:
         try:
@@ -545,7 +393,7 @@ class StageRun:
             "breakdown": self.breakdown.seconds(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
-            "joint": None if self.joint is None else self.joint.state(),
+            "joint": None if self.coarser.joint is None else self.coarser.joint.state(),
             "exposure": None if self.exposures is None else self.exposures.state(),
             "poses": None if self.poses is None else self.poses.state(),
             "random": torch.get_rng_state(),
@@ -553,20 +401,14 @@ class StageRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a result of `state`; the model must have been made from it already."""
+        """Continue from a result of `state`; model and breakdown must have been made from it already."""
         self.progress = StageProgress(**state["progress"])
-        if self.breakdown.measures:
-            # Without a measurement from the first iteration on, the parts would not add up to the whole.
-            spent = state.get("breakdown")
-            self.breakdown = breakdown_on(self._device, spent) if spent else Breakdown()
         self.densifier.state = {
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()
         }
         if (joint := state.get("joint")) is not None:
-            assert self.unfreeze is not None
-            self.joint = self.unfreeze(joint)
-            self.joint.poses = self.poses
+            self.coarser.restore(joint)
         self.restore_transforms(state)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:

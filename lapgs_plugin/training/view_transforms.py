@@ -76,7 +76,7 @@ class ViewTransforms(ABC):
         """Drop gradients of the pass so far."""
         self._adam.zero_grad()
 
-    def archived(self) -> dict[str, Any]:
+    def archived(self) -> Any:
         """Return the transforms by view, as they are archived."""
         return dict(zip(self.names, self.transforms.detach().cpu().tolist(), strict=True))
 

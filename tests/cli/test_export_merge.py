@@ -18,7 +18,7 @@ from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.training import trainer
+from lapgs_plugin.training import stage_start
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -69,7 +69,7 @@ def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:
 def test_a_page_of_a_run_with_residuals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), hold_out=False)
     # Renders that differ in brightness are what the field shall show: they are not compensated.
-    monkeypatch.setattr(trainer, "measure_exposure", lambda _: pytest.fail("exposure was measured"))
+    monkeypatch.setattr(stage_start, "measure_exposure", lambda _: pytest.fail("exposure was measured"))
     output = lapgs_export(run, "--merge", "--html", "--iterations", 4)
     assert "of 2 views that it was not fitted to" in output
     assert "photos" not in output, "none are held out"

@@ -20,7 +20,7 @@ from lapgs_plugin.fields.splat import LAYOUT, splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
-from tests.cli.run_folder import BACKGROUND, write_run, write_scene
+from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
 from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
 from tests.training_scene import HEIGHT, WIDTH, blob_field
@@ -61,6 +61,15 @@ def test_the_page_is_one_file_with_the_splats(run: Path) -> None:
     assert not re.search(r"(src|href)=|https?://", page)
     (data,) = re.findall(r'id="splats">([A-Za-z0-9+/=]+)<', page)
     assert base64.b64decode(data) == splat_bytes(RunArchive.open(run).field(0))
+
+
+def test_the_page_of_a_level_leaves_that_of_the_scene(run: Path, tmp_path: Path) -> None:
+    lapgs_export(run, "--html", "--out", tmp_path)
+    before = (tmp_path / "scene.html").read_bytes()
+    assert "level_1_base.html: 250 Gaussians" in lapgs_export(run, "--html", "--level", 1, "--out", tmp_path)
+    assert "level_0_field.html: 200 Gaussians" in lapgs_export(run, "--html", "--level", 0, "--out", tmp_path)
+    assert files_in(tmp_path) == {"scene.html", "level_0_field.html", "level_1_base.html"}
+    assert (tmp_path / "scene.html").read_bytes() == before == (tmp_path / "level_0_field.html").read_bytes()
 
 
 def test_pages_that_cannot_be_made_are_one_line(tmp_path: Path) -> None:

@@ -134,7 +134,9 @@ def test_eval_agrees_with_numpy_on_the_rendered_files(run: Path, scene: Path) ->
 
 
 def test_eval_sums_what_training_recorded(run: Path) -> None:
-    lapgs("eval", run)
+    result = CliRunner(env={"COLUMNS": None, "FORCE_COLOR": None}).invoke(app, ["eval", str(run)])
+    headings = "level size iterations seconds Gaussians peak PSNR upsampled"
+    assert headings in [" ".join(line.split()) for line in result.stdout.splitlines()], "one line in a log"
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["split"] == "test"
     assert metrics["num_views"] == 2

@@ -234,10 +234,10 @@ def test_an_interruption_that_a_callback_loses_is_raised_again() -> None:
 
 PREPARING = """
 import os, signal, sys
-import lapgs_plugin.scenes.prepare as prepare
+from lapgs_plugin.scenes.prepare import pipeline
 from lapgs_plugin.cli import main
 signal.signal(signal.SIGINT, signal.default_int_handler)
-prepare.prepare_scene = lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+pipeline.prepare_scene = lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
 sys.argv = ["lapgs", "prepare", "photos", "scene"]
 main()
 """

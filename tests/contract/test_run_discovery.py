@@ -130,16 +130,34 @@ def test_a_script_of_no_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[s
         lapgs("doctor", tmp_path / "nowhere")
 
 
-def test_doctor_describes_a_checkout(
-    fork: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
+def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with (fork / "gaussian_renderer" / "__init__.py").open("a", encoding="utf-8") as renderer:
+        renderer.write(
+            "\n\nfrom fast_backend import rasterize\n\ndef faster(pc):\n    return rasterize(means=pc.get_xyz)\n"
+        )
     lapgs("doctor", fork)
     text = capsys.readouterr().out
     for part in (str(fork), "--backbone generic", "scripts/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
         assert part in text
+    assert "its rasterizer takes shs, but fast_backend does not;" in text
     lapgs("doctor", CHECKOUTS / "taming")
     text = capsys.readouterr().out
     assert "Taming-3DGS (--backbone taming)" in text
     assert "stand-in taming" in text
     assert "iteration == args.ho_iteration (modify_functions)" in text, "what the loop does by iteration"
+
+
+def test_doctor_says_which_training_scripts_there_are(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As Mini-Splatting has `gs/train.py` and `ms/train.py`, DashGaussian `train.py` and `train_dash.py`."""
+    shutil.copytree(fork / "scripts", fork / "more")
+    with pytest.raises(UserInputError, match=r"several training scripts: more/train.py, scripts/train.py;") as e:
+        lapgs("doctor", fork)
+    assert f"`lapgs doctor {fork / 'more/train.py'}`" in str(e.value)
+    assert "\n" not in str(e.value)
+    lapgs("doctor", fork / "scripts" / "train.py")
+    assert "Other scripts" not in capsys.readouterr().out
+    shutil.copy(fork / "more" / "train.py", fork)
+    lapgs("doctor", fork)
+    text = capsys.readouterr().out
+    assert " train.py:" in text
+    assert "more/train.py, scripts/train.py; describe one with `lapgs doctor" in text

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from lapgs_plugin.checkouts.level_views import SceneImages, make_level_view, view_key, without_depth
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.rasterizer_wrapper import GREY, RasterizerWrapper, StageRendering
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.stage_rendering import GREY, StageRendering
 
 WIDTH, HEIGHT = 8, 6
 

@@ -17,7 +17,7 @@ from lapgs_plugin.limits import FRAMES, PHOTO_PIXELS, PHOTO_SIDE, VIEW_PIXELS, L
 from lapgs_plugin.rendering.clip import parse_size
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image
-from lapgs_plugin.scenes.prepare import prepare_scene
+from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.cli.run_folder import write_scene
 

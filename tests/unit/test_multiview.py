@@ -29,8 +29,8 @@ from lapgs_plugin.training.multiview import (
     view_scores,
 )
 from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Multiview
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import blob_field, ring_camera, ring_scene
@@ -195,18 +195,20 @@ def test_runs_grow_learn_and_score_the_same_views_again(
     )
     settings = TrainSettings(iterations=160, sh_degree=1, sh_every=10, densification=density, **hierarchy)
     scored: list[tuple[int, int]] = []
-    ask = StageRun._scores
+    ask = FieldScoring.scores
 
-    def scores(run: StageRun, iteration: int, threshold: float) -> ViewScores:
-        found = ask(run, iteration, threshold)
-        again = ask(run, iteration, threshold)
+    def scores(
+        scoring: FieldScoring, field: GaussianField, iteration: int, degree: int, threshold: float
+    ) -> ViewScores:
+        found = ask(scoring, field, iteration, degree, threshold)
+        again = ask(scoring, field, iteration, degree, threshold)
         assert torch.equal(found.pixels, again.pixels), "the same views"
-        assert len(found.pixels) == len(run.model)
+        assert len(found.pixels) == len(field)
         assert float(found.blame.max()) <= 1.0
-        scored.append((run.stage.level, iteration))
+        scored.append((scoring.losses.stage.level, iteration))
         return found
 
-    monkeypatch.setattr(StageRun, "_scores", scores)
+    monkeypatch.setattr(FieldScoring, "scores", scores)
     archive = train(tmp_path / "run", settings)
     for record in archive.manifest.records:
         assert record.peak_gaussians > 100, "it grew"
@@ -218,7 +220,7 @@ def test_runs_grow_learn_and_score_the_same_views_again(
 def test_scores_of_a_residual_are_of_the_composed_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A residual of zero colour, scored before anything is learned, predicts what the base does."""
     seen: list[Tensor] = []
-    import lapgs_plugin.training.stage as module
+    import lapgs_plugin.training.scoring as module
 
     def noted(views: Any, grey: Tensor, threshold: float) -> ViewScores:
         listed = list(views)
@@ -228,7 +230,7 @@ def test_scores_of_a_residual_are_of_the_composed_image(tmp_path: Path, monkeypa
     density = Densification(start=0, until=80, every=1, strategy="multiview", options=Multiview(error_pixels=1e6))
     settings = TrainSettings(iterations=40, split="39/40,1/40", hierarchy="laplacian", densification=density)
     monkeypatch.setattr(module, "view_scores", noted)
-    monkeypatch.setattr(module.StageSchedule, "late_prunes", frozenset())
+    monkeypatch.setattr(StageSchedule, "late_prunes", frozenset())
     train(tmp_path / "run", settings)
     errors = [float(difference.abs().mean()) for difference in seen if difference.shape[-1] == 56]
     assert errors

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import imageio_ffmpeg
@@ -19,16 +21,20 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
-from lapgs_plugin.scenes import clip as clip_module
-from lapgs_plugin.scenes import left_out, load_scene
-from lapgs_plugin.scenes import photos as photos_module
-from lapgs_plugin.scenes import prepare as prepare_module
-from lapgs_plugin.scenes.clip import judge, pick_frames, sharp_and_moving, write_frames
-from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
+from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
-from lapgs_plugin.scenes.left_out import left_out_because
-from lapgs_plugin.scenes.photos import find_photos
-from lapgs_plugin.scenes.prepare import prepare_scene
+from lapgs_plugin.scenes.prepare import clip as clip_module
+from lapgs_plugin.scenes.prepare import left_out, pipeline, placement
+from lapgs_plugin.scenes.prepare import photos as photos_module
+from lapgs_plugin.scenes.prepare.clip import judge, pick_frames, sharp_and_moving, write_frames
+from lapgs_plugin.scenes.prepare.colmap import chosen_matcher
+from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
+from lapgs_plugin.scenes.prepare.inputs import one_camera
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.left_out import left_out_because
+from lapgs_plugin.scenes.prepare.photos import find_photos
+from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
+from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.sample.raycast import render
 from tests.unit.test_prepare import FOCAL, SIZE, WORLD, _arc, _centre_errors
 
@@ -61,7 +67,7 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
             picture.save(photos / f"{index:02d}.png")
         write_image(masks / f"{index:02d}_mask.png", torch.from_numpy(mask.copy()).permute(2, 0, 1))
     out = tmp_path / "scene"
-    result = prepare_scene(photos, out, matcher="retrieval", masks=masks, progress=False)
+    result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
     assert len(result.registered) == 4
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     assert _centre_errors(model).max() < 0.02  # seen 4.4e-3
@@ -94,14 +100,14 @@ def test_transparent_pixels_are_masks(tmp_path: Path, monkeypatch: pytest.Monkey
     assert np.array_equal(cv2.imread(str(made / "0.png.png"))[..., :1], alpha)
 
 
-def _stopping_before_colmap(photos: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> None:
+def _stopping_before_colmap(photos: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     def stop(*arguments: object) -> None:
         raise LapgsError("stopped")
 
     with monkeypatch.context() as patch:
-        patch.setattr(prepare_module, "_find_features", stop)
+        patch.setattr(pipeline, "find_features", stop)
         with pytest.raises(LapgsError, match="stopped"):
-            prepare_scene(photos, out, progress=False, **options)
+            prepare_scene(photos, out, PrepareSettings(**options), progress=False)
 
 
 def _write_clip(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
@@ -148,14 +154,14 @@ def test_a_video_gives_its_frames_to_colmap(
     assert "walk.mp4: 6 sharp frames, evenly spread" in caplog.text
     made = tmp_path / "scene" / ".prepare" / "photos"
     assert [file.name for file in sorted(made.iterdir())] == [f"frame_{number:06d}.jpg" for number in range(2, 24, 4)]
-    job = prepare_module._Job(made.parent, find_photos(clip), "auto", "incremental", "auto", None, False)
-    assert (job.matcher, len(job.names)) == ("sequential", 6)
+    job = Job(made.parent, find_photos(clip), PrepareSettings(), False)
+    assert (chosen_matcher(job), len(job.names)) == ("sequential", 6)
 
 
 def test_videos_that_cannot_be_used_are_one_line(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(kind: type[Exception], message: str, video: Path, **options: object) -> None:
+    def refused(kind: type[Exception], message: str, video: Path, **options: Any) -> None:
         with pytest.raises(kind, match=message) as caught:
-            prepare_scene(video, tmp_path / "scene", progress=False, **options)
+            prepare_scene(video, tmp_path / "scene", PrepareSettings(**options), progress=False)
         assert "\n" not in str(caught.value)
         assert not (tmp_path / "scene").exists()
 
@@ -213,13 +219,13 @@ def test_photos_of_several_cameras_get_cameras_of_their_own(
         with Image.open(noise / name) as picture:
             picture.load()
         picture.save(noise / name, exif=exif)
-    job = prepare_module._Job(tmp_path, find_photos(noise), "auto", "incremental", "auto", None, False)
+    job = Job(tmp_path, find_photos(noise), PrepareSettings(), False)
     sizes = dict.fromkeys(job.names, (80, 64))
     with caplog.at_level(logging.INFO):
-        assert prepare_module._one_camera(job, sizes, None) is False
+        assert one_camera(job, sizes) is False
     assert "photos of 2 cameras or sizes: 2 of 80x64 One; 1 of 80x64 Two" in caplog.text
-    assert prepare_module._one_camera(job, sizes, True) is True
-    assert prepare_module._one_camera(job, dict.fromkeys(("0.jpg", "1.jpg"), (80, 64)), None) is True
+    assert one_camera(replace(job, settings=PrepareSettings(single_camera=True)), sizes) is True
+    assert one_camera(job, dict.fromkeys(("0.jpg", "1.jpg"), (80, 64))) is True
 
 
 def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) -> None:
@@ -229,11 +235,11 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
 
     def refused(message: str) -> None:
         with pytest.raises(SceneError, match=message):
-            prepare_scene(noise, tmp_path / "scene", masks=masks, progress=False)
+            prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=masks), progress=False)
         assert not (tmp_path / "scene").exists()
 
     with pytest.raises(UserInputError, match=r"--masks .*nowhere: no such folder of masks"):
-        prepare_scene(noise, tmp_path / "scene", masks=tmp_path / "nowhere", progress=False)
+        prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=tmp_path / "nowhere"), progress=False)
     refused(r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or 2_mask\.png")
     write_image(masks / "2.png", torch.ones(3, 80, 64))
     refused(r"2\.png: the mask is 64x80 pixels, its photo 80x64 \(EXIF turns .*\); expected the same size")
@@ -273,11 +279,11 @@ def test_doubtful_lenses_are_told_and_tried_again(
         assert model in (None, "SIMPLE_RADIAL")
         return [models[mapper or ("first" if model is None else "second")]]
 
-    monkeypatch.setattr(prepare_module, "_map", mapped)
+    monkeypatch.setattr(placement, "map_photos", mapped)
     found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
-    job = prepare_module._Job(tmp_path, found, "auto", "incremental", asked, None, False)
+    job = Job(tmp_path, found, PrepareSettings(camera_model=asked), False)
     with caplog.at_level(logging.INFO):
-        (best,) = prepare_module._place_cameras(job)
+        (best,) = placement.place_cameras(job)
     assert best is models[chosen]
     assert message in caplog.text
     assert bool(message) == bool(caplog.text)
@@ -322,4 +328,4 @@ def test_reasons_for_photos_without_a_place(tmp_path: Path) -> None:
 def test_many_photos_are_matched_by_retrieval(tmp_path: Path) -> None:
     for count, matcher in ((500, "exhaustive"), (501, "retrieval")):
         found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(count)})
-        assert prepare_module._Job(tmp_path, found, "auto", "incremental", "auto", None, False).matcher == matcher
+        assert chosen_matcher(Job(tmp_path, found, PrepareSettings(), False)) == matcher

@@ -18,6 +18,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.pose import corrected, turned_gradient, with_pose_gradient
 from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import refined, run_cameras, run_scene
 from lapgs_plugin.runs.archive import Poses, RunArchive
@@ -29,6 +30,9 @@ from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
 from tests.training_scene import blob_field, ring_camera, ring_scene
 from tests.unit.test_exposure import train
+from tests.unit.test_views_per_step import GsplatOnCpu, kernels
+
+__all__ = ["kernels"]
 
 CORRECTION = (0.03, -0.05, 0.02, 0.1, -0.05, 0.03)
 
@@ -74,6 +78,39 @@ def test_gradient_by_a_pose_is_that_of_finite_differences(rasterizer: Rasterizer
     loss(at, plain).backward()
     for mine, theirs in zip(leaves.parameters.values(), plain.parameters.values(), strict=True):
         torch.testing.assert_close(mine.grad, theirs.grad, atol=0, rtol=1e-12)
+
+
+def gradient_by_pose(rasterizer: Rasterizer, device: str = "cpu") -> Tensor:
+    """Of a fixed loss of a view, by turns and shifts (6,)."""
+    generator = torch.Generator().manual_seed(1)
+    blobs = blob_field(80)
+    sh = torch.randn(80, 16, 3, generator=generator)
+    shown = blobs.with_parameters({"sh": sh, "opacity_logits": blobs.opacity_logits.clamp_max(3)}).to(device)
+    leaves = shown.with_parameters({name: each.requires_grad_() for name, each in shown.parameters.items()})
+    camera, movement = ring_camera(0.3, 40, 29), torch.zeros(6, device=device, requires_grad=True)
+    weights = torch.randn(3, 29, 40, generator=generator).to(device)
+    watched = with_pose_gradient(leaves, movement, camera.position.to(device), unit=1.0)
+    image = rasterizer(watched, camera, background=torch.zeros(3, device=device)).image
+    (image * weights).sum().backward()
+    assert movement.grad is not None
+    return movement.grad.cpu()
+
+
+@pytest.mark.usefixtures("kernels")
+@pytest.mark.parametrize("direct", [False, True])
+def test_gradient_by_a_pose_through_gsplat_is_that_of_the_oracle(direct: bool) -> None:
+    expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))
+    found = gradient_by_pose(GsplatOnCpu(direct, own_radii=True, absgrad=False))
+    assert float((found - expected).abs().max() / expected.abs().max()) < 1e-3  # worst seen 3e-5
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("options", [{}, {"direct": False}, {"packed": True}], ids=str)
+def test_gradient_by_a_pose_on_a_gpu_is_that_of_the_oracle(options: dict[str, bool]) -> None:
+    expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))
+    found = gradient_by_pose(GsplatRasterizer(**options), "cuda")  # type: ignore[arg-type]  # booleans all
+    assert float((found - expected).abs().max() / expected.abs().max()) < 2e-2
 
 
 def test_what_a_similarity_transform_of_the_scene_explains_is_removed() -> None:

@@ -12,6 +12,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,10 +27,13 @@ from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes import prepare as prepare_module
-from lapgs_plugin.scenes.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.images import write_image
-from lapgs_plugin.scenes.prepare import PrepareResult, prepare_scene
+from lapgs_plugin.scenes.prepare import colmap
+from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.pipeline import PrepareResult, prepare_scene
+from lapgs_plugin.scenes.prepare.settings import PrepareSettings
+from lapgs_plugin.scenes.prepare.writing import move_into_place
 from lapgs_plugin.scenes.sample.raycast import render
 from lapgs_plugin.scenes.sample.solids import ball, box, rod
 from lapgs_plugin.scenes.sample.world import PALETTE
@@ -209,16 +213,16 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     out = tmp_path / "scene"
-    rows = prepare_module._rows
+    rows = colmap._rows
 
-    def interrupted_rows(job: prepare_module._Job, table: str) -> int:
+    def interrupted_rows(job: Job, table: str) -> int:
         done = rows(job, table)
         if table == interrupted and done >= 3:
             raise KeyboardInterrupt
         return done
 
-    monkeypatch.setattr(prepare_module, "POLL_SECONDS", 0.02)
-    monkeypatch.setattr(prepare_module, "_rows", interrupted_rows)
+    monkeypatch.setattr(colmap, "POLL_SECONDS", 0.02)
+    monkeypatch.setattr(colmap, "_rows", interrupted_rows)
     for interrupted in ("descriptors", "two_view_geometries"):
         with caplog.at_level(logging.INFO), pytest.raises(KeyboardInterrupt):
             prepare_scene(photos, out, progress=True)
@@ -227,7 +231,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
         with sqlite3.connect(out / ".prepare" / "database.db") as database:
             assert database.execute(f"SELECT COUNT(*) FROM {interrupted}").fetchone()[0] >= 3
     with pytest.raises(UserInputError, match=r"unfinished work with other --camera-model; .* --overwrite"):
-        prepare_scene(photos, out, camera_model="RADIAL", progress=False)
+        prepare_scene(photos, out, PrepareSettings(camera_model="RADIAL"), progress=False)
     interrupted = "nothing"
     result = prepare_scene(photos, out, progress=False)
     assert result.seconds["Finding features"] < 0.5 * prepared[1].seconds["Finding features"]
@@ -258,12 +262,12 @@ def test_an_interruption_while_scenes_change_places_is_made_good(
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", until_killed)
         with pytest.raises(KeyboardInterrupt):
-            prepare_module._move_into_place(work, out)
+            move_into_place(work, out)
     texts = {name: (out / name / "file").read_text() for name in ("images", "sparse") if (out / name).exists()}
     assert "sparse" not in texts or len(set(texts.values())) == 1, "a model with images of another"
     shutil.rmtree(work / "scene")
     write(work / "scene", "new")
-    prepare_module._move_into_place(work, out)
+    move_into_place(work, out)
     assert [(out / name / "file").read_text() for name in ("images", "sparse")] == ["new", "new"]
     assert not work.exists()
 
@@ -308,19 +312,19 @@ def noise(tmp_path: Path) -> Path:
 
 def test_photos_of_nothing_in_common_are_an_error(noise: Path, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="none of the 14 photos could be placed"):
-        prepare_scene(noise, tmp_path / "scene", matcher="sequential", progress=False)
+        prepare_scene(noise, tmp_path / "scene", PrepareSettings(matcher="sequential"), progress=False)
     with sqlite3.connect(tmp_path / "scene" / ".prepare" / "database.db") as database:
         compared = database.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
     assert compared == 13 + 12 + 10 + 6  # 1, 2, 4 and 8 photos ahead
-    assert prepare_module._neighbour_pairs(14) == compared  # what the progress bar counts to
+    assert colmap._neighbour_pairs(14) == compared  # what the progress bar counts to
 
 
 def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene"
 
-    def refused(kind: type[Exception], message: str, photos: Path = noise, **options: object) -> None:
+    def refused(kind: type[Exception], message: str, photos: Path = noise, **options: Any) -> None:
         with pytest.raises(kind, match=message):
-            prepare_scene(photos, out, progress=False, **options)
+            prepare_scene(photos, out, PrepareSettings(**options), progress=False)
         assert not out.exists()
 
     refused(SceneError, "no such folder of photos", tmp_path / "nowhere")
@@ -399,7 +403,7 @@ def test_a_failure_of_colmap_is_one_line(
     noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
 ) -> None:
     (tmp_path / "worker.py").write_text(program)
-    monkeypatch.setattr(prepare_module, "WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(colmap, "WORKER", tmp_path / "worker.py")
     with pytest.raises(LapgsError, match=f"COLMAP failed at finding features .*{reason}") as caught:
         prepare_scene(noise, tmp_path / "scene", progress=False)
     assert "\n" not in str(caught.value)
@@ -409,7 +413,7 @@ def test_the_worker_ends_with_the_process_that_started_it(photos: Path, tmp_path
     job = {"step": "features", "database": str(tmp_path / "database.db"), "photos": str(photos), "max_size": None}
     job |= {"masks": None}
     job |= {"names": [file.name for file in photos.iterdir()], "camera_model": "OPENCV", "single_camera": True}
-    command = [sys.executable, str(prepare_module.WORKER)]
+    command = [sys.executable, str(colmap.WORKER)]
     worker = subprocess.run(command, input=json.dumps(job).encode() + b"\n", capture_output=True, check=False)
     assert worker.returncode == 1
     assert b"Traceback" not in worker.stderr

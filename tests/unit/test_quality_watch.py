@@ -15,7 +15,9 @@ from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import (
     FALL,
     SAMPLES_OF_A_STAGE,
@@ -27,7 +29,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.trainer import Trainer, make_plan
+from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import ring_scene
 
 
@@ -108,7 +110,7 @@ class Said(Monitor):
 
 def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = iter([30.0 - step for step in range(100)])
-    monkeypatch.setattr(Trainer, "_psnr", lambda *_: (next(values),) * 2)
+    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: (next(values),) * 2)
     scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
     monitor = Said()
     train(scene, settings, tmp_path / "run", monitor)
@@ -137,16 +139,16 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
 
-    def invented(_: Trainer, run: StageRun, view: View) -> tuple[float, float]:
+    def invented(_: StageEvaluation, run: StageRun, view: View) -> tuple[float, float]:
         assert view.name in aside
         assert run.exposures is not None
         place = run.stage.level, run.progress.iteration
         fields[place] = run.model.field.means.detach().clone()
-        if run.joint is not None:
-            along[place] = run.joint.fields[1].means.clone()
+        if run.coarser.joint is not None:
+            along[place] = run.coarser.joint.fields[1].means.clone()
         return 0.0, 20.0 + (place in {(1, 16), (0, 36)})
 
-    monkeypatch.setattr(Trainer, "_psnr", invented)
+    monkeypatch.setattr(StageEvaluation, "_psnr", invented)
     names, monitor = Names(), Said()
     whole = train(scene, settings, tmp_path / "whole", monitor, names)
     assert names.seen == {view.name for view in scene.train} - set(aside)

@@ -30,10 +30,11 @@ from lapgs_plugin.training import backend
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
+from lapgs_plugin.training.planning import check_storage
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Default, Mcmc
-from lapgs_plugin.training.trainer import Trainer, check_storage
+from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import blob_field, ring_scene
 
 SETTINGS = TrainSettings(

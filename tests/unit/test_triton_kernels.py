@@ -51,7 +51,7 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
         placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors[0])]
         write_to_stack(means.detach(), centre, sh.detach(), signed, found, placed, 30)
         for part, whole in zip((*found, colors[0]), placed, strict=True):
-            assert (whole[30 : 30 + n] == part).all()
+            close(whole[30 : 30 + n], part)  # two kernels, which may round the colours differently
             assert (whole[:30] == -7).all()
             assert (whole[30 + n :] == -7).all()
 

@@ -1,9 +1,8 @@
 """Training: the loop, its output folder and its report."""
 
 import os
-import sys
 import uuid
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from pathlib import Path
 from random import randint
 
@@ -14,9 +13,9 @@ from gaussian_renderer import network_gui_ws, render_fastgs
 from scene import GaussianModel, Scene
 from tqdm import tqdm
 from utils.fast_utils import compute_gaussian_score_fastgs, sampling_cameras
-from utils.general_utils import safe_state
 from utils.image_utils import psnr
 from utils.loss_utils import l1_loss
+from utils.plain_main import parsed, parser_of
 
 try:
     from torch.utils.tensorboard import SummaryWriter
@@ -162,25 +161,12 @@ def training_report(
 
 
 if __name__ == "__main__":
-    parser = ArgumentParser(description="Training script parameters")
-    lp = ModelParams(parser)
-    op = OptimizationParams(parser)
-    pp = PipelineParams(parser)
-    parser.add_argument("--ip", type=str, default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=6009)
-    parser.add_argument("--debug_from", type=int, default=-1)
+    parser, (lp, op, pp) = parser_of(ModelParams, OptimizationParams, PipelineParams)
     parser.add_argument("--detect_anomaly", action="store_true", default=False)
-    parser.add_argument("--test_iterations", nargs="+", type=int, default=[30_000])
-    parser.add_argument("--save_iterations", nargs="+", type=int, default=[30_000])
-    parser.add_argument("--quiet", action="store_true")
-    parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[30_000])
-    parser.add_argument("--start_checkpoint", type=str, default=None)
     parser.add_argument("--websockets", action="store_true", default=False)
     parser.add_argument("--benchmark_dir", type=str, default=None)
-    args = parser.parse_args(sys.argv[1:])
-    args.save_iterations.append(args.iterations)
-    print("Optimizing " + args.model_path)
-    safe_state(args.quiet)
+    parser.set_defaults(test_iterations=[30_000], save_iterations=[30_000], checkpoint_iterations=[30_000])
+    args = parsed(parser)
     if args.websockets:
         network_gui_ws.init(args.ip, args.port)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)

@@ -3,7 +3,7 @@
 import os
 import sys
 import uuid
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from pathlib import Path
 from random import randint
 
@@ -12,9 +12,10 @@ from arguments import ModelParams, OptimizationParams, PipelineParams
 from gaussian_renderer import network_gui, render
 from scene import GaussianModel, Scene
 from tqdm import tqdm
-from utils.general_utils import get_expon_lr_func, safe_state
+from utils.general_utils import get_expon_lr_func
 from utils.image_utils import psnr
 from utils.loss_utils import l1_loss, ssim
+from utils.plain_main import parsed, parser_of
 
 try:
     from torch.utils.tensorboard import SummaryWriter
@@ -224,24 +225,10 @@ def training_report(
 
 
 if __name__ == "__main__":
-    parser = ArgumentParser(description="Training script parameters")
-    lp = ModelParams(parser)
-    op = OptimizationParams(parser)
-    pp = PipelineParams(parser)
-    parser.add_argument("--ip", type=str, default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=6009)
-    parser.add_argument("--debug_from", type=int, default=-1)
+    parser, (lp, op, pp) = parser_of(ModelParams, OptimizationParams, PipelineParams)
     parser.add_argument("--detect_anomaly", action="store_true", default=False)
-    parser.add_argument("--test_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--save_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--quiet", action="store_true")
     parser.add_argument("--disable_viewer", action="store_true", default=False)
-    parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[])
-    parser.add_argument("--start_checkpoint", type=str, default=None)
-    args = parser.parse_args(sys.argv[1:])
-    args.save_iterations.append(args.iterations)
-    print("Optimizing " + args.model_path)
-    safe_state(args.quiet)
+    args = parsed(parser)
     if not args.disable_viewer:
         network_gui.init(args.ip, args.port)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)

@@ -2,10 +2,9 @@
 
 import os
 import random
-import sys
 import time
 import uuid
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from pathlib import Path
 from random import randint
 
@@ -16,9 +15,9 @@ from fused_ssim import fused_ssim as fast_ssim
 from gaussian_renderer import network_gui_ws, render
 from scene import GaussianModel, Scene
 from tqdm import tqdm
-from utils.general_utils import safe_state
 from utils.image_utils import psnr
 from utils.loss_utils import l1_loss
+from utils.plain_main import parsed, parser_of
 from utils.taming_utils import compute_gaussian_score, get_count_array, get_edges
 
 try:
@@ -209,19 +208,8 @@ def training_report(
 
 
 if __name__ == "__main__":
-    parser = ArgumentParser(description="Training script parameters")
-    lp = ModelParams(parser)
-    op = OptimizationParams(parser)
-    pp = PipelineParams(parser)
-    parser.add_argument("--ip", type=str, default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=6009)
-    parser.add_argument("--debug_from", type=int, default=-1)
+    parser, (lp, op, pp) = parser_of(ModelParams, OptimizationParams, PipelineParams)
     parser.add_argument("--detect_anomaly", action="store_true", default=False)
-    parser.add_argument("--test_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--save_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--quiet", action="store_true")
-    parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[30_000])
-    parser.add_argument("--start_checkpoint", type=str, default=None)
     parser.add_argument("--cams", type=int, default=10)
     parser.add_argument("--budget", type=float, default=20)
     parser.add_argument("--mode", type=str, default="multiplier", choices=["multiplier", "final_count"])
@@ -229,10 +217,8 @@ if __name__ == "__main__":
     parser.add_argument("--ho_iteration", type=int, default=15000)
     parser.add_argument("--sh_lower", action="store_true", default=False)
     parser.add_argument("--benchmark_dir", type=str, default=None)
-    args = parser.parse_args(sys.argv[1:])
-    args.save_iterations.append(args.iterations)
-    print("Optimizing " + args.model_path)
-    safe_state(args.quiet)
+    parser.set_defaults(checkpoint_iterations=[30_000])
+    args = parsed(parser)
     if args.websockets:
         network_gui_ws.init(args.ip, args.port)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)

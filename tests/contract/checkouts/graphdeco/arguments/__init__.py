@@ -1,63 +1,31 @@
-"""Options of the graphdeco repository."""
+"""Options: the 2023 release's, and those of depths, exposure, antialiasing and optimizers."""
 
-from pathlib import Path
+from utils import plain_options
 
-from utils.option_groups import ParamGroup
+__all__ = ["ModelParams", "OptimizationParams", "PipelineParams"]
 
 
-class ModelParams(ParamGroup):
+class ModelParams(plain_options.ModelParams):
     def __init__(self, parser, sentinel=False):
-        self.sh_degree = 3
-        self._source_path = ""
-        self._model_path = ""
-        self._images = "images"
         self._depths = ""
-        self._resolution = -1
-        self._white_background = False
         self.train_test_exp = False
-        self.data_device = "cuda"
-        self.eval = False
-        super().__init__(parser, "Loading Parameters", sentinel)
-
-    def extract(self, args):
-        group = super().extract(args)
-        group.source_path = str(Path(group.source_path).absolute())
-        return group
+        super().__init__(parser, sentinel)
 
 
-class PipelineParams(ParamGroup):
+class PipelineParams(plain_options.PipelineParams):
     def __init__(self, parser):
-        self.convert_SHs_python = False
-        self.compute_cov3D_python = False
-        self.debug = False
         self.antialiasing = False
-        super().__init__(parser, "Pipeline Parameters")
+        super().__init__(parser)
 
 
-class OptimizationParams(ParamGroup):
+class OptimizationParams(plain_options.OptimizationParams):
     def __init__(self, parser):
-        self.iterations = 30_000
-        self.position_lr_init = 0.00016
-        self.position_lr_final = 0.0000016
-        self.position_lr_delay_mult = 0.01
-        self.position_lr_max_steps = 30_000
-        self.feature_lr = 0.0025
-        self.opacity_lr = 0.025
-        self.scaling_lr = 0.005
-        self.rotation_lr = 0.001
         self.exposure_lr_init = 0.01
         self.exposure_lr_final = 0.001
         self.exposure_lr_delay_steps = 0
         self.exposure_lr_delay_mult = 0.0
-        self.percent_dense = 0.01
-        self.lambda_dssim = 0.2
-        self.densification_interval = 100
-        self.opacity_reset_interval = 3000
-        self.densify_from_iter = 500
-        self.densify_until_iter = 15_000
-        self.densify_grad_threshold = 0.0002
         self.depth_l1_weight_init = 1.0
         self.depth_l1_weight_final = 0.01
-        self.random_background = False
         self.optimizer_type = "default"
-        super().__init__(parser, "Optimization Parameters")
+        super().__init__(parser)
+        parser.set_defaults(opacity_lr=0.025)

@@ -1,0 +1,82 @@
+"""Find the image among the outputs of a checkout's rasterizer, and put another one in its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+
+
+@dataclass(frozen=True)
+class RasterOutputs:
+    """Hold what a rasterizer returned: an image, or an image among other outputs.
+
+    Attributes:
+        outputs: as the rasterizer returned them.
+        place: index or key of the image; None if the outputs are the image.
+        channels_last: whether the stored image is (h, w, 3).
+    """
+
+    outputs: Any
+    place: Any
+    channels_last: bool
+
+    @classmethod
+    def of(cls, outputs: Any, size: tuple[int, ...]) -> RasterOutputs:
+        """Find the image, the first output with three channels and the size (h, w) of the view, empty if unknown.
+
+        Raises:
+            UserInputError: there is none.
+        """
+        place = _image_place(outputs, size)
+        shape = (outputs if place is None else outputs[place]).shape
+        return cls(outputs, place, shape[-1] == 3 and (shape[-3] != 3 or shape[-3:-1] == size))
+
+    @property
+    def image(self) -> Tensor:
+        """The image (3, h, w)."""
+        stored = self._stored
+        image = stored.reshape(stored.shape[-3:])  # some have a leading axis for several views
+        return image.permute(2, 0, 1) if self.channels_last else image
+
+    def with_image(self, image: Tensor) -> Any:
+        """Return the outputs with another image (3, h, w) in the place and shape of the first."""
+        image = (image.permute(1, 2, 0) if self.channels_last else image).reshape(self._stored.shape)
+        return image if self.place is None else _with_item(self.outputs, self.place, image)
+
+    @property
+    def _stored(self) -> Tensor:
+        stored: Tensor = self.outputs if self.place is None else self.outputs[self.place]
+        return stored
+
+
+def _image_place(outputs: Any, size: tuple[int, ...]) -> Any:
+    """Return where the image is among a rasterizer's outputs, None if they are the image.
+
+    Three channels come before or after the axes of pixels.
+    """
+    if isinstance(outputs, Tensor):
+        return None
+    items = outputs.items() if isinstance(outputs, dict) else enumerate(outputs)
+    found = {place: tuple(v.shape) for place, v in items if isinstance(v, Tensor) and v.is_floating_point()}
+    for place, shape in found.items():
+        if 3 <= len(shape) <= 4 and all(one == 1 for one in shape[:-3]):
+            first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
+            if first or last or (not size and 3 in (shape[-3], shape[-1])):
+                return place
+    shapes = ", ".join(map(str, found.values())) or "no tensor"
+    raise UserInputError(
+        f"the checkout's rasterizer returns {shapes}, expected an image (3, h, w)"
+        f"{' of ' + 'x'.join(map(str, size[::-1])) if size else ''}; `lapgs run --off` runs the script as it is"
+    )
+
+
+def _with_item(outputs: Any, place: Any, image: Tensor) -> Any:
+    """Return a tuple, list or dict of outputs with another image."""
+    if isinstance(outputs, dict):
+        return {**outputs, place: image}
+    items = [image if i == place else value for i, value in enumerate(outputs)]
+    return type(outputs)(*items) if hasattr(outputs, "_fields") else type(outputs)(items)

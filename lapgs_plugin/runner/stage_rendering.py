@@ -1,0 +1,170 @@
+"""Render a stage through a checkout's rasterizer: recognise the view, and compose its image with coarser levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.checkouts.level_views import view_name
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.masks import fill_outside
+from lapgs_plugin.ops.composition import add_prediction
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.raster_outputs import RasterOutputs
+from lapgs_plugin.runner.raster_settings import matrix_keys, size_of, view_matrices
+from lapgs_plugin.runner.signed_calls import with_signed_colors
+from lapgs_plugin.runs.image_store import ImageStore
+from lapgs_plugin.runs.level_images import HeldImages
+
+GREY = 0.5
+"""Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
+
+
+class Predictions(Protocol):
+    """Return upsampled predictions of coarser levels by view: cached images, or renders of finished fields."""
+
+    def prefetch(self, key: str, /) -> None:
+        """Prepare for a `get` of this view."""
+
+    def get(self, key: str, /) -> Tensor:
+        """Return the prediction (3, h, w) on the device, float32, at the size of the finer level."""
+
+
+@dataclass
+class StageRendering:
+    """Describe to the rasterizer's wrapper how a stage is rendered.
+
+    Attributes:
+        signed: whether the field is a residual.
+        path: how signed colour is evaluated.
+        views: the checkout's camera of each view by key.
+        targets: I^l by key; None if images are compared with nothing.
+        accumulated: Up(I_hat^(l+1)) by key; None for the base.
+        coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
+        weights: share of each pixel inside of the view's mask by key; None without masks.
+        masked: keys of the training views, whose masks the loop's losses and scores have to honour.
+        composed: keys of the views to compose; the residuals of all others are compared with a residual.
+        on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
+            without composition); returns the image to use instead.
+        capture: keep the last composed image, before exposure or clamping, in `captured`.
+    """
+
+    signed: bool
+    path: ColorPath
+    views: Mapping[str, Any]
+    targets: ImageStore | None = None
+    accumulated: Predictions | None = None
+    coarse: Predictions | None = None
+    weights: ImageStore | HeldImages | None = None
+    masked: frozenset[str] = frozenset()
+    composed: frozenset[str] = frozenset()
+    on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
+    capture: bool = False
+    captured: Tensor | None = field(default=None, repr=False)
+    _by_matrix: dict[bytes, str] = field(default_factory=dict, repr=False)
+
+    def key(self, noted: str | None, settings: Any) -> str | None:
+        """Return the key of a view; None for any other camera.
+
+        Args:
+            noted: key of the view that a renderer was called with; None if it was called with none.
+            settings: of the rasterizer, whose matrices are compared if no view was noted and this matters.
+        """
+        if noted is not None and noted in self.views:
+            return noted
+        if noted is not None or not self.views or not (self._needs_views or self.on_image is not None):
+            return None
+        if not self._by_matrix:
+            for key, camera in self.views.items():
+                for matrix in matrix_keys(camera.world_view_transform):
+                    self._by_matrix[matrix] = key
+        found = (self._by_matrix.get(m) for value in view_matrices(settings) for m in matrix_keys(value))
+        return next((key for key in found if key is not None), None)
+
+    def _fits(self, key: str, image: Tensor) -> bool:
+        """Return whether an image has the size of a view at this level, as far as that is known."""
+        return self.accumulated is None or self.accumulated.get(key).shape == image.shape
+
+    def prefetch(self, key: str) -> None:
+        """Copy a view's images to the device while it is being rendered."""
+        if self.targets is not None:
+            self.targets.prefetch(key)
+        below = self.accumulated if key in self.composed else self._below_target
+        if below is not None:
+            below.prefetch(key)
+        if self.weights is not None:
+            self.weights.prefetch(key)
+
+    def target(self, key: str) -> Tensor:
+        """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
+        assert self.targets is not None, "a stage that is trained has targets"
+        target = self.targets.get(key)
+        if key in self.composed or self._below_target is None:
+            return target
+        return target - self._below_target.get(key)
+
+    def compose(self, key: str | None, image: Tensor) -> Tensor:
+        """Return the composed image (3, h, w) of a view, given the rendered one; `key` is None for other cameras.
+
+        Raises:
+            UserInputError: the image has another size than its level; in the backward pass: no view was recognised.
+        """
+        if key is None:
+            if not self._needs_views:
+                return image
+            image = image + (GREY if self.signed else 0)
+            if image.requires_grad:
+                image.register_hook(_refuse_unrecognised)  # type: ignore[no-untyped-call]  # torch's
+            return image
+        below = None
+        if self.accumulated is not None and key in self.composed:
+            below = self.accumulated.get(key)
+            if below.shape != image.shape:
+                raise UserInputError(
+                    f"the checkout renders view {view_name(key)} at {image.shape[2]}x{image.shape[1]}, expected "
+                    f"{below.shape[2]}x{below.shape[1]}, the size of its level; switch its own resolution schedule "
+                    "off, or train with --hierarchy nested"
+                )
+            image = add_prediction(image, below)
+        if self.on_image is not None and torch.is_grad_enabled():
+            image = self.on_image(key, image, below)
+        if self.weights is not None and key in self.masked and not self.capture:
+            # Whatever the loop's loss is, it compares the target with itself outside of the mask.
+            image = fill_outside(image, self.target(key), self.weights.get(key))
+        return image
+
+    def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
+        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image."""
+        if self.signed and self.path is ColorPath.PRECOMPUTED:
+            inputs = with_signed_colors(inputs, settings)
+        outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
+        image = outputs.image
+        key = self.key(noted, settings)
+        if noted is None and key is not None and not self._fits(key, image):
+            key = None  # a viewer's camera at the place of a photo's
+        image = self.compose(key, image)
+        if self.capture:
+            self.captured = image
+        return outputs.with_image(image)
+
+    @property
+    def _needs_views(self) -> bool:
+        """Whether training on an image of no known view would train something else."""
+        return self.signed or self.weights is not None
+
+    @property
+    def _below_target(self) -> Predictions | None:
+        """Images to subtract from targets where residuals are supervised alone."""
+        return self.accumulated if self.coarse is None else self.coarse
+
+
+def _refuse_unrecognised(_: Tensor) -> None:
+    raise UserInputError(
+        "the checkout trains on a camera that is no view of its scene: no renderer was called with one, and the "
+        "rasterizer's matrices are none of the scene's; so no residual can be composed with coarser levels, nor a "
+        "mask be applied: train with --hierarchy nested and without --masks"
+    )

@@ -1,0 +1,7 @@
+"""Make a scene from photos or a video: structure from motion and undistortion with pycolmap.
+
+OUT/images/            undistorted photos under their own names
+OUT/masks/             undistorted masks, if there are any
+OUT/sparse/0/          the model: PINHOLE cameras, poses, points with their tracks
+OUT/.prepare/          while unfinished: COLMAP's database and models, to continue an interrupted run
+"""

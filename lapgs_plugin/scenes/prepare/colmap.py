@@ -1,0 +1,193 @@
+"""Run COLMAP's steps in a process of their own: features, matches, models."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.scenes.output import check_written
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRIEVAL, SEQUENTIAL, PrepareSettings
+
+MOST_EXHAUSTIVE = 500
+"""Most photos of which all pairs are compared, unless a matcher was chosen; of more, those that look alike."""
+SIMILAR = 40
+"""Photos that each photo is compared with by the matcher "retrieval"."""
+HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
+HAS_VOCABULARY = hasattr(getattr(pycolmap, "VisualIndex", None), "build")
+LOOP_FROM, LOOP_EVERY, LOOP_SIMILAR = 40, 10, 20
+"""Sequential matching of so many photos or more also compares every tenth with those that look most like it, because
+the camera may come back to a place."""
+DEFAULT_MODEL = "OPENCV"
+"""Camera model that "auto" fits first."""
+
+POLL_SECONDS = 0.2
+WORKER = Path(__file__).with_name("colmap_worker")
+
+
+def require_colmap_for(settings: PrepareSettings) -> None:
+    """Raise a UserInputError if the installed pycolmap lacks something that the settings ask for."""
+    if settings.matcher == RETRIEVAL and not HAS_VOCABULARY:
+        raise UserInputError(
+            f"--matcher retrieval: pycolmap {pycolmap.__version__} has none; upgrade it to 4.2 or newer"
+        )
+    if settings.mapper == GLOBAL and not HAS_GLOBAL:
+        raise UserInputError(
+            f"--mapper global: pycolmap {pycolmap.__version__} has none; leave it out or upgrade pycolmap"
+        )
+
+
+def chosen_matcher(job: Job) -> str:
+    """Return the matcher that the user chose, or the one for the kind and number of photos."""
+    if job.settings.matcher != AUTO:
+        return job.settings.matcher
+    if job.found.clip is not None:
+        return SEQUENTIAL
+    return RETRIEVAL if len(job.names) > MOST_EXHAUSTIVE and HAS_VOCABULARY else EXHAUSTIVE
+
+
+def find_features(job: Job, single_camera: bool) -> None:
+    """Find the features of all photos; `single_camera`: give them one camera."""
+    asked = job.settings.camera_model
+    options = {
+        "photos": str(job.photos.absolute()),
+        "names": job.names,
+        "camera_model": DEFAULT_MODEL if asked == AUTO else asked,
+        "single_camera": single_camera,
+        "max_size": job.settings.max_size,
+        "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
+    }
+    _run_step(job, "Finding features", "photos", len(job.names), "features", options, lambda: _rows(job, "descriptors"))
+
+
+def match_pairs(job: Job) -> None:
+    """Match the features of those pairs of photos that the matcher chooses."""
+    count, matcher = len(job.names), chosen_matcher(job)
+    loops = -(-count // LOOP_EVERY) if count >= LOOP_FROM and HAS_VOCABULARY else 0
+    total = {
+        EXHAUSTIVE: count * (count - 1) // 2,
+        SEQUENTIAL: _neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
+        RETRIEVAL: count * min(SIMILAR, count - 1),  # at most: many pairs are found from both sides
+    }[matcher]
+    options = {
+        "matcher": matcher,
+        "similar": SIMILAR if matcher == RETRIEVAL else LOOP_SIMILAR,
+        "every": LOOP_EVERY if loops else 0,
+        "tree": str((job.work / "tree.bin").absolute()),
+    }
+    _run_step(job, "Matching pairs", "pairs", total, "pairs", options, lambda: _rows(job, "two_view_geometries"))
+
+
+def _neighbour_pairs(count: int) -> int:
+    """Return the number of pairs in sequential matching: each photo with those 1, 2, 4, 8, ... ahead."""
+    return sum(max(0, count - 2**power) for power in range(pycolmap.SequentialPairingOptions().overlap))
+
+
+def map_photos(
+    job: Job, title: str, folder: Path, model: str | None = None, mapper: str | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Recover models into a folder, unless it is there, and return them.
+
+    Args:
+        job: the job.
+        title: of the progress bar.
+        folder: of the models.
+        model, mapper: replace the job's.
+    """
+    if not folder.is_dir():
+        unfinished, placed = folder.with_suffix(".partial"), job.work / "placed"
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir()
+        placed.write_bytes(b"")
+        options = {
+            "photos": str(job.photos.absolute()),
+            "models": str(unfinished),
+            "placed": str(placed),
+            "mapper": mapper or job.settings.mapper,
+        }
+        if model is not None:
+            other = job.work / "simple.db"
+            shutil.copyfile(job.database, other)
+            options |= {"database": str(other.absolute()), "camera_model": model}
+        _run_step(job, title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
+        for written in unfinished.iterdir():
+            check_written(written)
+        unfinished.rename(folder)
+    models = [pycolmap.Reconstruction(each) for each in sorted(folder.iterdir())]
+    models.sort(key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
+    return models
+
+
+def _rows(job: Job, table: str) -> int:
+    """Return the number of rows in a table of COLMAP's database, also while COLMAP writes it; 0 before it exists."""
+    try:
+        connection = sqlite3.connect(f"{job.database.absolute().as_uri()}?mode=ro", uri=True, timeout=POLL_SECONDS)
+        try:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+        finally:
+            connection.close()
+    except sqlite3.Error:  # locked, or still being made
+        return 0
+
+
+def _run_step(
+    job: Job, title: str, unit: str, total: int, step: str, options: dict[str, Any], done: Callable[[], int]
+) -> None:
+    """Run a step of `colmap_worker` with a progress bar. An interruption stops it at once.
+
+    Raises:
+        LapgsError: it failed, with COLMAP's last error.
+    """
+    order = json.dumps({"step": step, "database": str(job.database.absolute()), **options})
+    log = job.work / "colmap.log"
+    with job.timed(title), job.bar(title, unit) as seen, log.open("wb") as words:
+        seen(0, total)
+        command = [sys.executable, str(WORKER)]
+        worker = subprocess.Popen(
+            command, bufsize=0, stdin=subprocess.PIPE, stdout=words, stderr=words, start_new_session=True
+        )
+        assert worker.stdin is not None
+        try:
+            with suppress(BrokenPipeError):  # reported by its exit code
+                worker.stdin.write(order.encode() + b"\n")
+            running = True
+            while running:
+                running = not _ended(worker)
+                seen(min(done(), total), total)
+        finally:
+            worker.kill()
+            worker.wait()
+            worker.stdin.close()
+        if worker.returncode == 0:
+            seen(total, total)
+    if worker.returncode != 0:
+        raise LapgsError(
+            f"{job.work.parent}: COLMAP failed at {title.lower()} ({_last_words(log, worker.returncode)}); check free "
+            f"space and memory, then repeat the command to continue, or remove {job.work} to start over"
+        )
+
+
+def _ended(worker: subprocess.Popen[bytes]) -> bool:
+    try:
+        worker.wait(POLL_SECONDS)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
+
+
+def _last_words(log: Path, code: int) -> str:
+    """Return the reason for a failure: an exception of the worker, COLMAP's last error, or the exit code."""
+    lines = log.read_text(errors="replace").splitlines()
+    reasons = [line for line in lines if re.match(r"[EF][0-9]{8} |(\w+\.)*\w*(Error|Exception): ", line)]
+    return reasons[-1].strip() if reasons else f"exit code {code}"

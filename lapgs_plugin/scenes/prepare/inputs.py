@@ -1,0 +1,106 @@
+"""Make the photos and masks that COLMAP reads, and find out whether one camera took them."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections import Counter
+from typing import Any
+
+from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.limits import VIEW_PIXELS
+from lapgs_plugin.scenes.images import check_image, has_alpha, image_size
+from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, write_mask
+from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.photos import HEIC, camera_of, convert_heic
+
+logger = logging.getLogger(__name__)
+
+
+def make_photos(job: Job) -> None:
+    """Write frames of the video, or copies of the photos with JPEG files for those in HEIC, if COLMAP needs them."""
+    found, folder = job.found, job.work / "photos"
+    if not found.made or folder.is_dir():
+        return
+    partial = job.work / "photos.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    if found.clip is not None:
+        with job.bar("Looking for sharp frames", "frames") as seen:
+            numbers = pick_frames(found.clip, job.settings.frames, seen)
+        with job.bar("Writing frames", "frames") as seen:
+            write_frames(found.clip, numbers, partial, seen)
+        logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
+    else:
+
+        def make(name: str) -> None:
+            source, target = found.files[name], partial / name
+            if source.suffix.lower() in HEIC:
+                convert_heic(source, target)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(source, target)
+
+        job.each_photo("Reading HEIC photos", make, list(found.files))
+    partial.rename(folder)
+
+
+def make_masks(job: Job) -> None:
+    """Write masks of the photos' sizes under COLMAP's names, white where nothing is known of a photo."""
+    if job.masks.is_dir():
+        return
+    given = job.settings.masks
+    files = {} if given is None else find_masks(given, job.names)
+    names = job.names if files else [name for name in job.names if has_alpha(job.photos / name)]
+    if not names:
+        return
+    partial = job.work / "masks.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+
+    def make(name: str) -> bool:
+        photo = job.photos / name
+        size = image_size(photo)
+        mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
+        if mask is not None:
+            write_mask(partial / f"{name}.png", mask)
+        return mask is not None
+
+    if sum(job.each_photo("Reading masks", make, names)):
+        partial.rename(job.masks)
+
+
+def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
+    """Return width and height of each photo by name. Photos are decoded, to find damaged ones before the long steps."""
+
+    def size(name: str) -> tuple[int, int]:
+        width, height = check_image(job.photos / name)
+        longest = max(width, height)
+        share = min(1.0, (job.settings.max_size or longest) / longest)
+        subject = f"{job.photos / name}: the photo has {width}x{height} pixels"
+        VIEW_PIXELS.check(int(width * share) * int(height * share), subject, "choose a smaller --max-size", SceneError)
+        return width, height
+
+    return dict(zip(job.names, job.each_photo("Reading photos", size, job.names), strict=True))
+
+
+def one_camera(job: Job, sizes: dict[str, tuple[int, int]]) -> bool:
+    """Return whether all photos share a camera."""
+    names, asked = {size: name for name, size in sizes.items()}, job.settings.single_camera
+    if asked and len(names) > 1:
+        (first, one), (second, other) = list(names.items())[:2]
+        raise UserInputError(
+            f"--single-camera: {job.photos / one} has {first[0]}x{first[1]} pixels and {job.photos / other} "
+            f"{second[0]}x{second[1]}, expected one size; leave the option out"
+        )
+    if asked is not None:
+        return asked
+    cameras = Counter((*size, *camera_of(job.photos / name)) for name, size in sizes.items())
+    if len(cameras) > 1:
+        logger.info("photos of %d cameras or sizes: %s", len(cameras), "; ".join(map(_camera_words, cameras.items())))
+    return len(cameras) == 1
+
+
+def _camera_words(counted: tuple[tuple[Any, ...], int]) -> str:
+    (width, height, *exif), count = counted
+    return printable(f"{count} of {' '.join(filter(None, [f'{width}x{height}', *exif[:2]]))}")

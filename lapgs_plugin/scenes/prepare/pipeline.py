@@ -1,0 +1,150 @@
+"""Make a scene, one step after the other; steps that an interrupted call had finished are not repeated."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import option_values
+from lapgs_plugin.scenes.output import check_output, one_line_errors
+from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
+from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
+from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
+from lapgs_plugin.scenes.prepare.left_out import left_out_because
+from lapgs_plugin.scenes.prepare.photos import Photos, find_photos, listed
+from lapgs_plugin.scenes.prepare.placement import place_cameras
+from lapgs_plugin.scenes.prepare.settings import SEQUENTIAL, PrepareSettings
+from lapgs_plugin.scenes.prepare.writing import move_into_place, write_scene
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PrepareResult:
+    """The outcome of `prepare_scene`.
+
+    Attributes:
+        registered: names of the photos that have a pose, sorted.
+        left_out: names of the other photos, sorted.
+        parts: number of separate models; the scene is the largest one.
+        points: number of sparse points.
+        reprojection_error: mean reprojection error in pixels of the photos before undistortion.
+        seconds: wall time of each step by name, without the steps that an interrupted run had finished.
+    """
+
+    registered: tuple[str, ...]
+    left_out: tuple[str, ...]
+    parts: int
+    points: int
+    reprojection_error: float
+    seconds: dict[str, float]
+
+
+def prepare_scene(
+    photos: Path,
+    out: Path,
+    settings: PrepareSettings | None = None,
+    *,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> PrepareResult:
+    """Find features, match them, recover cameras and points, and write undistorted photos with a PINHOLE model.
+
+    Call it again with the same photos and settings to continue an interrupted call. On one machine, photos with fewer
+    than 25,000 features in total give the same scene each time. With more features, the timing of COLMAP's threads
+    decides which photos it starts from and in which order it sums. COLMAP's GPU code is used if pycolmap has it.
+
+    Args:
+        photos: folder of at least 2 JPEG, PNG, TIFF, BMP, WebP or HEIC files, also in subfolders; or a video.
+        out: the scene folder; new, empty, with unfinished work, or with `overwrite` a scene.
+        settings: of the user; None takes the defaults.
+        overwrite: replace the scene in `out`, and discard unfinished work of other photos or settings.
+        progress: show a bar for each step on stderr.
+
+    Raises:
+        SceneError: there are too few photos, one or its mask cannot be read, or none could be registered.
+        UserInputError: a setting does not fit the photos or pycolmap, or `out` must not be written to.
+        LapgsError: the disk is full, the folder cannot be written, or COLMAP failed.
+        MissingExtraError: a package that reads videos or HEIC photos is missing.
+    """
+    settings = settings or PrepareSettings()
+    require_colmap_for(settings)
+    found = _checked_photos(photos, out, settings, overwrite)
+    with one_line_errors(out), _said_on_interruption(out):
+        job = Job(out / WORK, found, settings, progress)
+        with opened_work(job.work, _identity(found, settings), overwrite):
+            make_photos(job)
+            single_camera = one_camera(job, read_sizes(job))
+            make_masks(job)
+        find_features(job, single_camera)
+        match_pairs(job)
+        models = place_cameras(job)
+        result = _describe(job, models)
+        write_scene(job, models[0])
+        move_into_place(job.work, out)
+    return result
+
+
+def _checked_photos(photos: Path, out: Path, settings: PrepareSettings, overwrite: bool) -> Photos:
+    """Return the photos, after checks of the folders and of options that depend on them."""
+    source, target = photos.resolve(), out.resolve()
+    if source.is_relative_to(target) or target.is_relative_to(source):
+        raise UserInputError(f"{out}: one of {photos} and {out} lies in the other; write OUT somewhere else")
+    check_output(out, overwrite, WORK)
+    masks, frames = settings.masks, settings.frames
+    if masks is not None and not masks.is_dir():
+        raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
+    found = find_photos(photos)
+    if frames is not None and found.clip is None:
+        raise UserInputError(f"--frames {frames}: it picks frames from a video, and {photos} is a folder; leave it out")
+    return found
+
+
+def _identity(found: Photos, settings: PrepareSettings) -> dict[str, Any]:
+    """Return what unfinished work must agree with to be continued, as JSON: the files, the options, the version."""
+    files = {found.clip.name: found.clip} if found.clip is not None else found.files
+    stats = {name: path.stat() for name, path in files.items()}
+    options = {f"--{name.replace('_', '-')}": value for name, value in option_values(settings).items()}
+    return {
+        "photos": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()},
+        **options,
+        "--masks": None if settings.masks is None else str(settings.masks.absolute()),
+        "pycolmap": pycolmap.__version__,
+    }
+
+
+@contextmanager
+def _said_on_interruption(out: Path) -> Iterator[None]:
+    """Tell that the same command continues."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        logger.info("%s: the finished steps are kept; repeat the command to continue", out)
+        raise
+
+
+def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareResult:
+    best = models[0]
+    registered = sorted(image.name for image in best.images.values() if image.has_pose)
+    left_out = sorted(set(job.names) - set(registered))
+    if left_out:
+        logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), listed(left_out))
+        for reason, names in left_out_because(job.database, models, left_out).items():
+            logger.warning("%s: %s", listed(names), reason)
+        if chosen_matcher(job) == SEQUENTIAL and job.found.clip is None:
+            logger.warning("--matcher sequential compares neighbours by name; try --matcher exhaustive")
+    return PrepareResult(
+        registered=tuple(registered),
+        left_out=tuple(left_out),
+        parts=len(models),
+        points=best.num_points3D(),
+        reprojection_error=best.compute_mean_reprojection_error(),
+        seconds=job.seconds,
+    )

@@ -1,0 +1,85 @@
+"""Place the cameras, judge whether the lens was found, and place them again with a simpler one if it was not."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import pycolmap
+
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, map_photos
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.settings import AUTO, GLOBAL, INCREMENTAL
+
+SIMPLE_MODEL = "SIMPLE_RADIAL"
+"""Camera model that is fitted if the result with the first one is doubtful."""
+FEW = 0.5
+"""Share of photos below which so few are placed that the lens may be wrong."""
+SQUARE = 0.04
+"""Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
+
+logger = logging.getLogger(__name__)
+
+
+def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
+    """Recover the models and return them, the one with most photos first.
+
+    If the default camera model places few photos or gives focal lengths that no lens has, place the cameras again with
+    a simpler one.
+
+    Raises:
+        SceneError: no photo could be placed.
+    """
+    models = map_photos(job, "Placing cameras", job.work / "models")
+    if (doubt := _doubt(job, models)) is not None:
+        if job.settings.camera_model != AUTO:
+            logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.settings.camera_model)
+        else:
+            models = _placed_again(job, models, doubt)
+    if _placed(models) < 2:
+        raise SceneError(
+            f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of a static "
+            "scene that overlap strongly, each taken a step aside from the last"
+        )
+    return models
+
+
+def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
+    """Return the best models of doubtful ones, those of a simpler lens, and if few are placed, of the other mapper."""
+    logger.info("%s; placing the cameras again with a simpler lens", doubt)
+    again = map_photos(job, "Placing again", job.work / "models_simple", SIMPLE_MODEL)
+    if _placed(again) >= _placed(models):
+        models = again
+    if _placed(models) < FEW * len(job.names) and job.settings.mapper == INCREMENTAL and HAS_GLOBAL:
+        logger.info("only %d photos could be placed; placing all at once (--mapper global)", _placed(models))
+        whole = map_photos(job, "Placing all", job.work / "models_global", SIMPLE_MODEL, mapper=GLOBAL)
+        return whole if _placed(whole) > _placed(models) else models
+    if models is not again:
+        logger.warning(
+            "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or take more "
+            "photos from other heights and distances",
+            *(_placed(again), _placed(models), doubt),
+        )
+    return models
+
+
+def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:
+    """Return the number of photos in the largest model."""
+    return models[0].num_reg_images() if models else 0
+
+
+def _doubt(job: Job, models: Sequence[pycolmap.Reconstruction]) -> str | None:
+    """Return why the models may be wrong because the lens was not found; None if nothing says so."""
+    if _placed(models) < FEW * len(job.names):
+        return f"only {_placed(models)} of {len(job.names)} photos could be placed"
+    if (apart := _focal_difference(models[0])) > SQUARE:
+        return f"the focal lengths along x and y differ by {apart:.0%}, which no usual lens does"
+    return None
+
+
+def _focal_difference(model: pycolmap.Reconstruction) -> float:
+    """Return the largest relative difference of a used camera's focal lengths along x and y."""
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    cameras = [model.cameras[key] for key in used]
+    return max(abs(camera.focal_length_x / camera.focal_length_y - 1.0) for camera in cameras)

@@ -1,0 +1,70 @@
+"""Declare what a user can choose about a scene that is made from photos. Imports neither torch nor pycolmap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import check_bounds, option
+
+AUTO = "auto"
+EXHAUSTIVE, SEQUENTIAL, RETRIEVAL = "exhaustive", "sequential", "retrieval"
+MATCHERS = (AUTO, EXHAUSTIVE, SEQUENTIAL, RETRIEVAL)
+INCREMENTAL, GLOBAL = "incremental", "global"
+MAPPERS = (INCREMENTAL, GLOBAL)
+CAMERA_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
+MIN_SIDE = 64  # features need room
+
+
+@dataclass(frozen=True)
+class PrepareSettings:
+    """Choose how photos are matched, which cameras are fitted, and the size of the scene's images.
+
+    Raises:
+        UserInputError: a value is unknown or out of range.
+    """
+
+    matcher: str = option(
+        AUTO,
+        "Pairs of photos to match. exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours in "
+        "name order, for frames of a video. retrieval: each photo with those that look most like it. auto: sequential "
+        "for a video, retrieval for more than 500 photos, else exhaustive.",
+    )
+    mapper: str = option(INCREMENTAL, "How cameras are placed. incremental: one after the other. global: all at once.")
+    camera_model: str = option(
+        AUTO,
+        "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
+        "OPENCV, and SIMPLE_RADIAL if that places few photos or gives implausible focal lengths.",
+    )
+    single_camera: bool | None = option(
+        None,
+        "Fit one camera to all photos, or one to each group of photos with the same EXIF data. Default: one camera if "
+        "all photos have the same size and camera.",
+        names=("--single-camera/--own-cameras",),
+    )
+    max_size: int | None = option(
+        None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
+    )
+    masks: Path | None = option(  # noqa: RUF009  # ruff knows no field specifiers
+        None,
+        "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
+        "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
+    )
+    frames: int | None = option(None, "Frames to pick from a video. Default: two a second, 40 to 240.", least=2)
+
+    def __post_init__(self) -> None:
+        if self.matcher not in MATCHERS:
+            raise UserInputError(f"--matcher {self.matcher!r}: expected {', '.join(MATCHERS[:-1])} or {MATCHERS[-1]}")
+        if self.mapper not in MAPPERS:
+            raise UserInputError(f"--mapper {self.mapper!r}: expected {' or '.join(MAPPERS)}")
+        if self.camera_model != AUTO:
+            object.__setattr__(self, "camera_model", self.camera_model.upper())
+            if self.camera_model not in CAMERA_MODELS:
+                raise UserInputError(
+                    f"--camera-model {self.camera_model!r}: expected auto or one of {', '.join(CAMERA_MODELS)}"
+                )
+        check_bounds(self)

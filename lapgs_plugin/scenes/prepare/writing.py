@@ -1,0 +1,59 @@
+"""Write the scene: undistorted photos and masks with a PINHOLE model, moved into place when they are whole."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pycolmap
+import torch
+
+from lapgs_plugin.scenes.images import read_image, write_image
+from lapgs_plugin.scenes.masks import MASKS, write_mask
+from lapgs_plugin.scenes.output import write_model
+from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.photos import target_name
+from lapgs_plugin.scenes.prepare.undistort import lens_of, move_observations, undistort
+
+
+def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
+    """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes."""
+    shutil.rmtree(job.scene, ignore_errors=True)
+    lenses = {key: lens_of(camera, job.settings.max_size) for key, camera in model.cameras.items()}
+    images = [image for image in model.images.values() if image.has_pose]
+    masked = job.masks.is_dir()
+
+    def write(image: pycolmap.Image) -> None:
+        lens = lenses[image.camera_id]
+        size, target = (lens.resized.width, lens.resized.height), target_name(image.name)
+        photo = read_image(job.photos / image.name, size=size, clamp=False)
+        write_image(job.scene / "images" / target, undistort(photo, lens))
+        if not masked:
+            return
+        file = job.masks / f"{image.name}.png"
+        mask = read_image(file, size=size) if file.is_file() else torch.ones(3, size[1], size[0])
+        write_mask(job.scene / MASKS / f"{target}.png", undistort(mask, lens)[:1] > 0.5)
+
+    job.each_photo("Undistorting", write, images)
+    for image in images:
+        move_observations(image, lenses[image.camera_id])
+        image.name = target_name(image.name)
+    for key, lens in lenses.items():
+        camera = model.cameras[key]
+        camera.model, camera.width, camera.height = lens.pinhole.model, lens.pinhole.width, lens.pinhole.height
+        camera.params = list(lens.pinhole.params)
+    write_model(model, job.scene / "sparse" / "0")
+
+
+def move_into_place(work: Path, out: Path) -> None:
+    """Move the scene to `out`, the model last: a folder without one is no scene."""
+    replaced = work / "replaced"
+    shutil.rmtree(replaced, ignore_errors=True)  # left by a call that was interrupted here
+    replaced.mkdir()
+    for name in ("sparse", "images", MASKS):
+        if (out / name).exists():
+            (out / name).rename(replaced / name)
+    for name in (MASKS, "images", "sparse"):
+        if name != MASKS or (work / "scene" / name).exists():
+            (work / "scene" / name).rename(out / name)
+    shutil.rmtree(work)

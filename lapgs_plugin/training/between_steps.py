@@ -1,0 +1,124 @@
+"""Log, measure, save and stop between the steps of a stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lapgs_plugin.errors import TrainingStoppedError
+from lapgs_plugin.interrupt import StopRequest
+from lapgs_plugin.runs.watcher import Watcher
+from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.evaluation import StageEvaluation
+from lapgs_plugin.training.monitor import Tick
+from lapgs_plugin.training.stage import StageRun
+
+CHECKPOINT_SECONDS = 60.0
+"""Time between two checkpoints unless a number of iterations is given."""
+LOG_TICKS = 200
+"""Approximate number of history entries and progress updates of a run."""
+
+
+@dataclass
+class CheckpointTimer:
+    """Tell when a checkpoint is due.
+
+    Attributes:
+        every: iterations between two; None for one every minute, over all stages.
+    """
+
+    every: int | None
+    _last: float = field(default_factory=time.monotonic)
+
+    def due(self, run: StageRun) -> bool:
+        """Return whether the last step made a checkpoint due."""
+        if self.every is not None:
+            return run.progress.iteration % self.every < run.step_views
+        return time.monotonic() - self._last >= CHECKPOINT_SECONDS
+
+    def saved(self) -> None:
+        """Note that a checkpoint was written."""
+        self._last = time.monotonic()
+
+
+@dataclass
+class BetweenSteps:
+    """Do what the last step made due; none of it counts as optimization time.
+
+    Attributes:
+        context: of the run.
+        evaluation: of the stage.
+        checkpoints: tells when one is due.
+        watcher: looks at the fields.
+        stop: of the user.
+        samples: iterations of the stage after which some views are measured.
+        test_every: as `Trainer` takes it.
+        last_tick: seconds and iteration of the last tick, or of the start.
+    """
+
+    context: RunContext
+    evaluation: StageEvaluation
+    checkpoints: CheckpointTimer
+    watcher: Watcher
+    stop: StopRequest
+    samples: Collection[int]
+    test_every: int | None
+    last_tick: tuple[float, int]
+
+    def __call__(self, run: StageRun) -> None:
+        """Act on a step that has just ended.
+
+        Raises:
+            TrainingStoppedError: the user asked to stop; a checkpoint was written.
+        """
+        evaluation, stop = self.evaluation, self.stop
+        iteration = run.progress.iteration
+        due_test = iteration == run.stage.iterations if self.test_every is None else run.passed(self.test_every)
+        due_sample = run.reached(self.samples)
+        due_tick = run.passed(max(1, self.context.settings.iterations // LOG_TICKS))
+        if due_test or due_sample or due_tick or stop.requested:
+            run.settle()  # so that the iterations in progress do not count as the time of what follows
+        measured = evaluation.held_out(run, due_test, due_sample and self.test_every is None)
+        if due_sample and self.context.aside:
+            evaluation.note_best(run)
+        if measured or due_tick:
+            self._tick(run, measured)
+        evaluation.warn_of_a_fall(run, measured)
+        if self.watcher.wants_look():
+            run.settle()
+            with evaluation.overhead.timed("view"):
+                self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: stop.requested)
+        if stop.requested or self.checkpoints.due(run):
+            self._save_checkpoint(run)
+        if stop.requested:
+            raise TrainingStoppedError(
+                f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
+                f"a checkpoint is in {self.context.archive.path()}, the same command with --resume continues"
+            )
+
+    def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
+        before_seconds, before_iteration = self.last_tick
+        archive, progress = self.context.archive, run.progress
+        self.last_tick = (progress.seconds, progress.iteration)
+        finished = sum(record.train_seconds for record in archive.manifest.records if record.level != run.stage.level)
+        tick = Tick(
+            level=run.stage.level,
+            iteration=progress.iteration,
+            elapsed=finished + progress.seconds,
+            loss=progress.loss,
+            num_gaussians=run.num_optimized,
+            rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
+            **measured,
+        )
+        archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
+        self.context.monitor.tick(run.stage, tick)
+
+    def _save_checkpoint(self, run: StageRun) -> None:
+        best, overhead = self.evaluation.best, self.evaluation.overhead
+        with overhead.timed("checkpoints"):
+            kept: dict[str, Any] = {} if best is None else {"best": best}
+            state = {**run.state(), **kept, "overhead": dict(overhead)}
+            self.context.archive.save_checkpoint(state, extends_to=self.context.settings.iterations)
+        self.checkpoints.saved()

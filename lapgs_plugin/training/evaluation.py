@@ -1,0 +1,121 @@
+"""Measure views during a stage: held-out ones for the log, and those that were set aside to keep the best state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.evaluation.exposure import predicted_exposures
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.ops.color_transform import transform_colors
+from lapgs_plugin.ops.composition import add_prediction, to_full_size
+from lapgs_plugin.runs.profiling import Overhead
+from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.quality import SAMPLED_VIEWS, QualityWatch, copied, spread_views
+from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.stage_images import StageImages
+
+
+@dataclass
+class StageEvaluation:
+    """Measure views of a stage, composed so far and upsampled to full resolution.
+
+    Attributes:
+        context: of the run.
+        images: of the stage, with the predictions of the coarser levels.
+        overhead: gets the seconds that this takes.
+        watch: compares the measurements of all stages.
+        best: the stage's best state so far, see `checkpoint.BestState`; None before the first measurement.
+    """
+
+    context: RunContext
+    images: StageImages
+    overhead: Overhead
+    watch: QualityWatch
+    best: dict[str, Any] | None = None
+
+    def held_out(self, run: StageRun, every: bool, sample: bool) -> dict[str, float]:
+        """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
+        test = self.context.scene.test
+        some = spread_views(test, SAMPLED_VIEWS) if test and sample else []
+        views = test if every else some
+        with self.overhead.timed("evaluation") if views else nullcontext():
+            learned = None if run.exposures is None else run.exposures.archived()
+            exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
+            found = {view.name: self._psnr(run, view, exposures.get(view.name)) for view in views}
+        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
+        if some:
+            plain, fitted = zip(*(found[view.name] for view in some), strict=True)
+            measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}
+        return measured
+
+    @torch.no_grad()
+    def _psnr(self, run: StageRun, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
+        """Return the PSNR in dB of a view, and after a colour fit.
+
+        Args:
+            exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
+        """
+        level, device, cache = run.stage.level, self.context.device, self.images.test_predictions
+        image = self.context.rasterizer(
+            run.model.field, level_camera(view.camera, level), background=run.background
+        ).image
+        cached = None if cache is None else cache.get
+        predict = cached if run.coarser.joint is None else run.coarser.joint.predict
+        image = add_prediction(image, None if predict is None else predict(view.name))
+        whole = to_full_size(image, view.camera, level, self.context.pyramid)
+        if exposure is not None:
+            whole = transform_colors(whole, exposure.to(device))
+        mask = None if view.mask is None else view.mask.to(device)
+        photo = view.image.to(device)
+        return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
+
+    def warn_of_a_fall(self, run: StageRun, measured: Mapping[str, float]) -> None:
+        """Tell the user if held-out views got worse while the training loss fell."""
+        key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
+        found, level = measured.get(key), run.stage.level
+        if found is None or not self.watch.falls(level, found, run.progress.loss):
+            return
+        helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
+        if run.exposures is None and self.context.supervision.composes:
+            helps.insert(0, "--exposure on if brightness or colours of the photos change")
+        self.context.monitor.say(
+            f"level {level}, iteration {run.progress.iteration}: held-out PSNR fell to {found:.1f} dB from "
+            f"{self.watch.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
+        )
+
+    def note_best(self, run: StageRun) -> None:
+        """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
+        aside, iteration = self.context.aside, run.progress.iteration
+        with self.overhead.timed("evaluation"):
+            fitted = run.exposures is not None
+            found = fmean(self._psnr(run, view)[fitted] for view in aside)
+            if self.best is None or found > self.best["psnr"]:
+                state = run.state()
+                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure", "poses")}
+                self.best = {"psnr": found, "iteration": iteration, **parts}
+            if iteration == run.stage.iterations and self.best["iteration"] < run.stage.iterations:
+                self.context.monitor.say(
+                    f"level {run.stage.level}: archives the state after iteration {self.best['iteration']} of "
+                    f"{run.stage.iterations}, {self.best['psnr'] - found:.2f} dB better than the last one on "
+                    f"{len(aside)} training views that were set aside"
+                )
+
+    def return_to_best(self, run: StageRun) -> None:
+        """Give a finished stage its best state."""
+        best = self.best
+        if best is None or best["iteration"] == run.stage.iterations:
+            return
+        run.model = self.context.restored_model(best["model"])
+        run.coarser.joint = None
+        if best["joint"] is not None:
+            run.coarser.restore(best["joint"])
+        run.restore_transforms(best)

@@ -1,0 +1,107 @@
+"""Compute the losses of a stage's views from their renders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from torch import Tensor
+
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hooks import HookDispatcher, StageContext
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.training.coarser import CoarserLevels
+from lapgs_plugin.training.exposure import ViewExposures
+
+
+@dataclass
+class ViewLosses:
+    """Compose the renders of views with the coarser levels, and compare them with the targets.
+
+    Attributes:
+        stage: in training.
+        images: the targets.
+        coarser: predict the views.
+        hooks: compose, and compute losses.
+        exposures: colour transforms of the views; None without compensation of exposure.
+        ssim_weight: share of SSIM in a loss.
+    """
+
+    stage: Stage
+    images: LevelImages
+    coarser: CoarserLevels
+    hooks: HookDispatcher
+    exposures: ViewExposures | None
+    ssim_weight: float
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
+        return self.images.weights is None and self.hooks.is_plain(self.stage)
+
+    def plain(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
+        """Return what computes the mean loss of some views, in a list, from their renders."""
+        target = self.images.targets.get_stored(names)
+        compose = self.coarser.adder(names)
+
+        def losses(rendered: Tensor) -> list[Tensor]:
+            return [photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)]
+
+        return losses
+
+    def hooked(self, contexts: Sequence[StageContext], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
+        """Return what computes the losses of some views by all hooks, from their renders.
+
+        Args:
+            contexts: result of `contexts`.
+            names: of the views.
+        """
+
+        def losses(rendered: Tensor) -> list[Tensor]:
+            parts = (
+                [(names, rendered)] if len(contexts) == 1 else zip(([name] for name in names), rendered, strict=True)
+            )
+            return [
+                self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
+                for context, (shown, image) in zip(contexts, parts, strict=True)
+            ]
+
+        return losses
+
+    def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
+        """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
+        several = len(names) > 1
+        target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
+        context = StageContext(
+            stage=self.stage,
+            iteration=iterations[-1],
+            view=names[-1],
+            target=target,
+            accumulated=self.coarser.prediction(names),
+            coarse_target=coarse_target,
+            weight=self.images.get_weights(names),
+        )
+        if not several or self.hooks.takes_batches:
+            return [context]
+
+        def of(images: Tensor | None, index: int) -> Tensor | None:
+            return None if images is None else images[index]
+
+        return [
+            replace(
+                context,
+                iteration=iteration,
+                view=name,
+                target=target[index],
+                accumulated=of(context.accumulated, index),
+                coarse_target=of(coarse_target, index),
+                weight=of(context.weight, index),
+            )
+            for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
+        ]
+
+    def exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
+        """Return the composed image of a view, or images of several, at the exposure of their photos."""
+        return image if self.exposures is None else self.exposures.apply(names, image)

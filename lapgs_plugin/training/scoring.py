@@ -1,0 +1,84 @@
+"""Score the Gaussians of a stage by its training views: their part in errors, and their visibility."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.hierarchy.masks import fill_outside
+from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.training.losses import ViewLosses
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
+from lapgs_plugin.training.poses import ViewPoses, at_pose
+from lapgs_plugin.training.views import LevelView
+
+
+@dataclass
+class FieldScoring:
+    """Render the field once more, also without colours, to see what each Gaussian does.
+
+    Attributes:
+        rasterizer: renders the field.
+        views: the training views at the stage's level.
+        losses: of the stage.
+        poses: refined poses of the views; None without refinement.
+        background: (3,) behind the field.
+        seed: of the run.
+        breakdown: gets the time that this takes.
+    """
+
+    rasterizer: Rasterizer
+    views: Sequence[LevelView]
+    losses: ViewLosses
+    poses: ViewPoses | None
+    background: Tensor
+    seed: int
+    breakdown: Breakdown
+
+    def scores(self, field: GaussianField, iteration: int, degree: int, threshold: float) -> ViewScores:
+        """Score Gaussians by some training views, which are a function of the seed and the iteration.
+
+        Args:
+            field: without gradients.
+            iteration: of the stage.
+            degree: of the SH that are active in it.
+            threshold: as `view_scores` takes it.
+        """
+        images, ssim_weight = self.losses.images, self.losses.ssim_weight
+        place = (self.seed * 1_000_003 + self.losses.stage.level) * 1_000_003 + iteration
+        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
+        plain, grey = _grey(field)
+
+        def asked(view: LevelView) -> ScoredView:
+            with torch.no_grad():
+                image = render_image(self.rasterizer, field, at_pose(view, self.poses).camera, self.background, degree)
+                below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
+                self.breakdown.mark("densification")
+                composed = self.losses.exposed([view.name], image if below is None else image + below)
+                whole = fill_outside(composed, target, images.get_weights([view.name]))
+                loss = photometric_loss(whole, target, ssim_weight)
+            return ScoredView(self._render(plain, view), whole, target, loss)
+
+        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        return view_scores(views, grey, threshold)
+
+    def least_visible(self, field: GaussianField, share: float) -> Tensor:
+        """Return a mask (n,) of Gaussians with negligible visibility in the training views; see `least_blended`."""
+        plain, grey = _grey(field)
+        return least_blended(blended_pixels((self._render(plain, view) for view in self.views), grey), share)
+
+    def _render(self, plain: GaussianField, view: LevelView) -> Tensor:
+        return render_image(self.rasterizer, plain, at_pose(view, self.poses).camera, self.background, 0)
+
+
+def _grey(field: GaussianField) -> tuple[GaussianField, Tensor]:
+    """Return a field with all colours zero, and its coefficients (n, 1, 3), which get gradients."""
+    grey = field.sh.new_zeros(len(field), 1, 3).requires_grad_()
+    return replace(field, sh=grey, signed=True), grey

@@ -1,0 +1,53 @@
+"""Compile and load every kernel before the clock of training starts."""
+
+from __future__ import annotations
+
+import torch
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
+from lapgs_plugin.hierarchy.inheritance import field_from_points
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops import densification_statistics
+from lapgs_plugin.ops.adam import StepScale
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.upsample import upsample_add
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.settings import TrainSettings
+
+
+def warm_up(
+    rasterizer: Rasterizer,
+    settings: TrainSettings,
+    device: torch.device | str = "cpu",
+    *,
+    residuals: bool = False,
+    joint: bool = False,
+) -> None:
+    """Run every kernel of an iteration once, so that compilation is not measured as training."""
+    ahead = torch.tensor([[0.0, 0.0, 1.0]])
+    first = field_from_points(ahead, ahead, settings.sh_degree).to(device)
+    model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
+    camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
+    result = rasterizer(model.field, camera, background=black)
+    # Kernels of the loss are compiled for the types that targets and predictions are stored in.
+    on_gpu = torch.device(device).type == "cuda"
+    target_types = (torch.uint8, torch.float16) if on_gpu else (result.image.dtype,)
+    coarse = torch.zeros(3, 8, 8, device=device)
+    rendered = [result.image, render_image(rasterizer, model.field, camera, black)]
+    if residuals:
+        rendered.append(upsample_add(Pyramid(), coarse.to(target_types[-1]), rendered[1]))
+    if joint:
+        below = torch.zeros(8, 8, 3, device=device, requires_grad=True).permute(2, 0, 1)  # interleaved as renders are
+        rendered.append(upsample_add(Pyramid(), below, rendered[1]))
+    targets = [torch.zeros(3, 16, 16, dtype=each, device=device) for each in target_types]
+    losses = [photometric_loss(image, target) for image in rendered for target in targets]
+    torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+    model.step(means_rate=0.0, active_coefficients=1)
+    if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch:
+        images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
+        none = torch.zeros(images.shape, dtype=target_types[0], device=device)
+        photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
+        model.step(0.0, 1, scale=StepScale.of(2))
+    if on_gpu:
+        densification_statistics.triton_works()
