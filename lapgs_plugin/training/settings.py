@@ -179,6 +179,12 @@ class TrainSettings(HierarchySettings):
         "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
         panel=SCHEDULE,
     )
+    refine_poses: bool = option(
+        False,
+        "Refine the pose of each training photo with the field, for poses that are not accurate. Views are then "
+        "rendered one by one, which takes longer on a GPU.",
+        panel=SCHEDULE,
+    )
     keep: str = option(
         LAST,
         "State that each level archives: last, or best by a few training views, which are then not trained on.",
@@ -306,7 +312,7 @@ class TrainSettings(HierarchySettings):
         """See `HierarchySettings.paper_settings`."""
         return {
             **super().paper_settings,
-            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF},
+            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF, "refine_poses": False},
         }
 
     def sh_degree_of(self, stage: Stage) -> int:
@@ -407,7 +413,7 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
     **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
-    **{"protocol": "default", "exposure": OFF, "keep": LAST, "extended": 0},
+    **{"protocol": "default", "exposure": OFF, "keep": LAST, "extended": 0, "refine_poses": False},
 }
 """Settings that older manifests do not name, with the values they had."""
 
