@@ -286,10 +286,16 @@ class BackboneAdapter(ABC):
         """Return where the CUDA module departs from the oracle by design; None if another backbone describes it."""
         return None
 
-    @staticmethod
-    def saved_logits(stored: Tensor) -> Tensor:
-        """Return the logits of opacities (n,), given the property "opacity" (n,) of a PLY that the backbone wrote."""
-        return stored
+    @classmethod
+    def saved_field(cls, path: Path) -> GaussianField:
+        """Return the field in a PLY that the backbone wrote, as its own render shows it.
+
+        Raises:
+            FieldError: as `GaussianField.load_ply`.
+        """
+        from lapgs_plugin.fields.gaussian_field import GaussianField
+
+        return GaussianField.load_ply(path)
 
     @property
     def train(self) -> ModuleType:
