@@ -123,12 +123,16 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 def _kinds(source: CheckoutSource) -> list[Finding]:
     from lapgs_plugin.environment.findings import Finding
 
-    inputs = frozenset[str]().union(*(use.inputs for use in source.rasterizers))
+    taken = {module: set[str]() for module in source.rasterizer_modules}
+    for use in source.rasterizers:
+        taken[use.module] |= use.inputs & COLORS
     more = "the dry run of `lapgs run` says more"
     nested = Finding("nested", "ok", f"one call of the checkout's own training; {more}")
-    if inputs & COLORS:
-        takes = " and ".join(sorted(inputs & COLORS))
-        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}; {more}")]
+    blind = [module for module, inputs in taken.items() if not inputs]
+    if len(blind) < len(taken):
+        takes = " and ".join(sorted(set[str]().union(*taken.values())))
+        but = f", but {' and '.join(blind)} does not" if blind else ""
+        return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}{but}; {more}")]
     why = f"its rasterizer takes neither {' nor '.join(sorted(COLORS))}, by which a residual has colours of both signs"
     return [nested, Finding("laplacian", "absent", why)]
 

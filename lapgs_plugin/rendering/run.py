@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.pose import corrected
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rasterizers.choice import rasterizer_for
@@ -15,7 +18,7 @@ from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, wa
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.masks import ALPHA, NONE
-from lapgs_plugin.scenes.scene import Scene, load_cameras, load_scene
+from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene
 from lapgs_plugin.scenes.source import is_folder
 
 PATHS = ("orbit", "spline")
@@ -65,7 +68,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         background=reference.background,
     )
     require_same_scene(archive, scene.path, scene.smallest_size)
-    return scene
+    return replace(scene, train=refined_views(archive, scene.train))
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
@@ -79,7 +82,27 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     cameras = [*train.values(), *test.values()]
     smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
     require_same_scene(archive, path, smallest)
-    return train, test
+    return refined(archive, train), test
+
+
+def refined(archive: RunArchive, cameras: Mapping[str, Camera]) -> dict[str, Camera]:
+    """Return training cameras by view name, at the poses to which the run refined them, if it did.
+
+    Raises:
+        RunFolderError: the file of its corrections is damaged.
+    """
+    levels = archive.available_levels
+    corrections = (archive.poses(levels[-1]) if levels else None) or {}
+    return {
+        name: corrected(camera, corrections[name]) if name in corrections else camera
+        for name, camera in cameras.items()
+    }
+
+
+def refined_views(archive: RunArchive, views: Sequence[View]) -> tuple[View, ...]:
+    """Return training views with `refined` cameras."""
+    cameras = refined(archive, {view.name: view.camera for view in views})
+    return tuple(replace(view, camera=cameras[view.name]) for view in views)
 
 
 def path_cameras(

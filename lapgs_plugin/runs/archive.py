@@ -4,6 +4,7 @@
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/level_<l>/exposure.json    colour transforms of the training photos after that level, if exposure is compensated
+    RUN/level_<l>/poses.json       corrections of the training photos' poses after that level, if these are refined
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
     RUN/preview.jpg                an image that the viewer shows until it can render
@@ -54,7 +55,7 @@ logger = logging.getLogger(__name__)
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
-PLY, OPTIMIZER, EXPOSURE = "point_cloud.ply", "optimizer.pt", "exposure.json"
+PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "exposure.json", "poses.json"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 FORGET_EXTENSION = "delete it to extend the run anew"
@@ -64,6 +65,8 @@ EXTENDED = "extended_{}.{}"
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Exposures = dict[str, Annotated[list[Row], Field(min_length=3, max_length=3)]]
 """Affine colour transforms by photo, three rows of four numbers each: colours of the scene to colours of the photo."""
+Poses = dict[str, Annotated[list[float], Field(min_length=6, max_length=6)]]
+"""Corrections of poses by photo, as `fields.pose` describes them: a rotation vector, and a shift in world units."""
 
 
 class RunArchive:
@@ -241,6 +244,7 @@ class RunArchive:
         optimizer_state: dict[str, Any] | None = None,
         trained_along: Mapping[int, GaussianField] | None = None,
         exposure: Exposures | None = None,
+        poses: Poses | None = None,
     ) -> None:
         """Write a trained level: first its PLY, then the manifest that lists it; remove its checkpoint.
 
@@ -255,6 +259,7 @@ class RunArchive:
                 until that one is finished.
             trained_along: finished fields after joint training, by level, each with as many Gaussians as before.
             exposure: colour transforms of the training photos by name; None without compensation.
+            poses: corrections of their poses; None without refinement.
 
         Raises:
             FieldError: a field holds NaN or inf; nothing is written.
@@ -275,8 +280,9 @@ class RunArchive:
             with one_line_errors(path, training=True):
                 path.parent.mkdir(exist_ok=True)
                 field.save_ply(path)
-            if exposure is not None:
-                self._write_json(str(path.with_name(EXPOSURE)), dict(exposure), training=True)
+            for name, learned in ((EXPOSURE, exposure), (POSES, poses)):
+                if learned is not None:
+                    self._write_json(str(path.with_name(name)), dict(learned), training=True)
             if optimizer_state is not None:
                 write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
@@ -304,6 +310,7 @@ class RunArchive:
         record: LevelRecord,
         fields: Mapping[int, GaussianField],
         exposure: Exposures | None,
+        poses: Poses | None,
         settings: Mapping[str, Any],
     ) -> None:
         """Replace fields and the finest level's record of a finished run that was trained further, all at once.
@@ -314,7 +321,7 @@ class RunArchive:
         Args:
             record: of level 0.
             fields: by level, each with as many Gaussians as before; others stay.
-            exposure: see `finish_level`.
+            exposure, poses: see `finish_level`.
             settings: that changed, with "iterations".
 
         Raises:
@@ -329,9 +336,10 @@ class RunArchive:
             path = self._extended_path(level, PLY, iterations)
             with one_line_errors(path, training=True):
                 field.save_ply(path)
-        if exposure is not None:
-            path = self._extended_path(record.level, EXPOSURE, iterations)
-            self._write_json(str(path), dict(exposure), training=True)
+        for name, learned in ((EXPOSURE, exposure), (POSES, poses)):
+            if learned is not None:
+                path = self._extended_path(record.level, name, iterations)
+                self._write_json(str(path), dict(learned), training=True)
         self._remove(METRICS, STABILITY, REPORT)
         self._write_json(MANIFEST, asdict(manifest), training=True)
         self._manifest = manifest
@@ -380,13 +388,26 @@ class RunArchive:
         Raises:
             RunFolderError: the file is damaged.
         """
-        path = self._extended_path(level, EXPOSURE)
+        found: Exposures | None = self._learned(level, EXPOSURE, Exposures)
+        return found
+
+    def poses(self, level: int) -> Poses | None:
+        """Read the corrections of the training photos' poses after a finished level; None without refinement.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        found: Poses | None = self._learned(level, POSES, Poses)
+        return found
+
+    def _learned(self, level: int, name: str, kind: Any) -> Any:
+        """Read what a level learned of the training photos; None if it has no such file."""
+        path = self._extended_path(level, name)
         if not _exists(path):
-            path = self.path(f"level_{level}", EXPOSURE)
+            path = self.path(f"level_{level}", name)
         if not _exists(path):
             return None
-        found: Exposures = read_json(path, Exposures, error=RunFolderError, advice="train again with --overwrite")
-        return found
+        return read_json(path, kind, error=RunFolderError, advice="train again with --overwrite")
 
     def append_history(self, entry: dict[str, Any]) -> None:
         """Append one entry to the history: JSON with finite numbers, with "level" and "iteration"."""
@@ -572,6 +593,7 @@ def _remove_results(folder: Path) -> None:
         (level / PLY).unlink(missing_ok=True)
         (level / OPTIMIZER).unlink(missing_ok=True)
         (level / EXPOSURE).unlink(missing_ok=True)
+        (level / POSES).unlink(missing_ok=True)
         for pattern in (TRAINED_ALONG.format("*"), EXTENDED.format("*", "*")):
             for waiting in level.glob(pattern):
                 waiting.unlink()

@@ -53,8 +53,8 @@ class ModelState(TypedDict):
     signed: bool
 
 
-class ExposureState(TypedDict):
-    """Result of `exposure.ViewExposures.state`."""
+class TransformsState(TypedDict):
+    """Result of `view_transforms.ViewTransforms.state`."""
 
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     transforms: Tensor
@@ -70,7 +70,8 @@ class BestState(TypedDict):
     iteration: PositiveInt
     model: ModelState
     joint: dict[int, ModelState] | None
-    exposure: ExposureState | None
+    exposure: TransformsState | None
+    poses: NotRequired[TransformsState | None]
 
 
 class StageState(TypedDict):
@@ -83,7 +84,8 @@ class StageState(TypedDict):
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
-    exposure: NotRequired[ExposureState | None]
+    exposure: NotRequired[TransformsState | None]
+    poses: NotRequired[TransformsState | None]
     best: NotRequired[BestState]
     random: Tensor
     random_gpu: NotRequired[Tensor]
@@ -143,26 +145,26 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
         )
 
 
-def check_exposure(state: ExposureState | None, views: int | None, path: Path) -> None:
-    """Check the state of colour transforms.
+def check_transforms(state: TransformsState | None, shape: torch.Size | None, name: str, path: Path) -> None:
+    """Check the state of what is learned of the training views.
 
     Args:
         state: from a checkpoint; None without transforms.
-        views: number of training views; None if the run has no transforms.
+        shape: of the transforms; None if the run has none.
+        name: "exposure" or "poses", for the message.
         path: of the checkpoint, for the message.
 
     Raises:
         RunFolderError: it is of another number of views, or damaged.
     """
-    if state is None and views is None:
+    if state is None and shape is None:
         return
-    shape = torch.Size([views or 0, 3, 4])
     tensors = [] if state is None else [state["transforms"], state["gradient"], *state["moments"].values()]
-    right = state is not None and views is not None and state["moments"].keys() in (set(), MOMENTS)
+    right = state is not None and shape is not None and state["moments"].keys() in (set(), MOMENTS)
     shapes = ((each, shape if each.ndim else torch.Size([])) for each in tensors if each is not None)
     if not (right and all(_is_finite(each, wanted, torch.float32) for each, wanted in shapes)):
         raise RunFolderError(
-            f"{path} is damaged: exposure is not the state of colour transforms for {views or 0} views; {ADVICE}"
+            f"{path} is damaged: {name} is not the state of transforms for {shape[0] if shape else 0} views; {ADVICE}"
         )
 
 

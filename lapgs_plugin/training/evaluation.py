@@ -100,7 +100,7 @@ class StageEvaluation:
             found = fmean(self._psnr(run, view)[fitted] for view in aside)
             if self.best is None or found > self.best["psnr"]:
                 state = run.state()
-                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure")}
+                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure", "poses")}
                 self.best = {"psnr": found, "iteration": iteration, **parts}
             if iteration == run.stage.iterations and self.best["iteration"] < run.stage.iterations:
                 self.context.monitor.say(
@@ -118,5 +118,4 @@ class StageEvaluation:
         run.coarser.joint = None
         if best["joint"] is not None:
             run.coarser.restore(best["joint"])
-        if run.exposures is not None:
-            run.exposures.restore(best["exposure"])
+        run.restore_transforms(best)

@@ -23,6 +23,7 @@ from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.poses import ViewPoses
 
 
 @dataclass
@@ -35,6 +36,7 @@ class JointFields:
         rasterizer: renders them.
         background: (3,) behind the base; residuals are rendered over zero.
         pyramid: Up between two levels.
+        poses: refined poses of the training views, which learn from these renders, too; None without refinement.
     """
 
     models: Mapping[int, TrainableField]
@@ -42,6 +44,7 @@ class JointFields:
     rasterizer: Rasterizer
     background: Tensor
     pyramid: Pyramid
+    poses: ViewPoses | None = None
     _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
     def predict(self, name: str) -> Tensor:
@@ -67,7 +70,8 @@ class JointFields:
             cameras = [self._camera(name, level) for name in names]
             background = self.background.new_zeros(3) if model.signed else self.background
             if len(cameras) == 1:
-                return render_image(self.rasterizer, model.field, cameras[0], background)
+                field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
+                return render_image(self.rasterizer, field, cameras[0], background)
             rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
             return rasterizer.render_batch(model.field, cameras, background=background, describes=False).image
 
@@ -77,7 +81,8 @@ class JointFields:
         """A view's camera, always the same object: a rasterizer may know it by that."""
         if (name, level) not in self._level_cameras:
             self._level_cameras[name, level] = level_camera(self.cameras[name], level)
-        return self._level_cameras[name, level]
+        camera = self._level_cameras[name, level]
+        return camera if self.poses is None else self.poses.camera(name, camera)
 
     def step(self, means_rate: float, sh_rest_factor: float = 1.0, scale: StepScale = ONE_VIEW) -> None:
         """Make one Adam step on every field, after backward passes through results of `predict`.

@@ -16,6 +16,7 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.training.losses import ViewLosses
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
+from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.views import LevelView
 
 
@@ -27,6 +28,7 @@ class FieldScoring:
         rasterizer: renders the field.
         views: the training views at the stage's level.
         losses: of the stage.
+        poses: refined poses of the views; None without refinement.
         background: (3,) behind the field.
         seed: of the run.
         breakdown: gets the time that this takes.
@@ -35,6 +37,7 @@ class FieldScoring:
     rasterizer: Rasterizer
     views: Sequence[LevelView]
     losses: ViewLosses
+    poses: ViewPoses | None
     background: Tensor
     seed: int
     breakdown: Breakdown
@@ -55,7 +58,7 @@ class FieldScoring:
 
         def asked(view: LevelView) -> ScoredView:
             with torch.no_grad():
-                image = render_image(self.rasterizer, field, view.camera, self.background, degree)
+                image = render_image(self.rasterizer, field, at_pose(view, self.poses).camera, self.background, degree)
                 below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
                 self.breakdown.mark("densification")
                 composed = self.losses.exposed([view.name], image if below is None else image + below)
@@ -72,7 +75,7 @@ class FieldScoring:
         return least_blended(blended_pixels((self._render(plain, view) for view in self.views), grey), share)
 
     def _render(self, plain: GaussianField, view: LevelView) -> Tensor:
-        return render_image(self.rasterizer, plain, view.camera, self.background, 0)
+        return render_image(self.rasterizer, plain, at_pose(view, self.poses).camera, self.background, 0)
 
 
 def _grey(field: GaussianField) -> tuple[GaussianField, Tensor]:

@@ -170,6 +170,12 @@ class TrainSettings(HierarchySettings):
         "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
         panel=SCHEDULE,
     )
+    refine_poses: bool = option(
+        False,
+        "Refine the pose of each training photo with the field, for poses that are not accurate. Views are then "
+        "rendered one by one, which takes longer on a GPU.",
+        panel=SCHEDULE,
+    )
     keep: str = option(
         LAST,
         "State that each level archives: last, or best by a few training views, which are then not trained on.",
@@ -297,7 +303,7 @@ class TrainSettings(HierarchySettings):
         """See `HierarchySettings.paper_settings`."""
         return {
             **super().paper_settings,
-            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF},
+            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF, "refine_poses": False},
         }
 
     def sh_degree_of(self, stage: Stage) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gsplat.strategy.ops import remove
@@ -29,10 +29,12 @@ from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.losses import ViewLosses
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage_progress import StageProgress
+from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, view_index
 
 FINITE_CHECK_EVERY = 100
@@ -76,6 +78,7 @@ class StageRun:
         densifier: density control with its statistics.
         coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
+        poses: corrections of the training views' poses; None without refinement.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
@@ -97,6 +100,7 @@ class StageRun:
     densifier: DensityControl
     coarser: CoarserLevels = field(default_factory=CoarserLevels)
     exposures: ViewExposures | None = None
+    poses: ViewPoses | None = None
     breakdown: Breakdown = field(default_factory=Breakdown)
     busy: GpuBusy = field(default_factory=GpuBusy)
     progress: StageProgress = field(default_factory=StageProgress)
@@ -110,7 +114,7 @@ class StageRun:
             self.stage, self.images, self.coarser, self.hooks, self.exposures, self.settings.ssim_weight
         )
         self._scoring = FieldScoring(
-            self.rasterizer, self.views, self._losses, self.background, self.settings.seed, self.breakdown
+            self.rasterizer, self.views, self._losses, self.poses, self.background, self.settings.seed, self.breakdown
         )
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
@@ -190,8 +194,12 @@ class StageRun:
 
     @cached_property
     def _batching(self) -> BatchRasterizer | None:
-        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow."""
-        return self.rasterizer if isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch else None
+        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow.
+
+        The gradient by a pose follows from the Gaussians' gradients of that view alone.
+        """
+        able = self.poses is None and isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+        return cast(BatchRasterizer, self.rasterizer) if able else None
 
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""
@@ -230,8 +238,8 @@ class StageRun:
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.coarser.joint is not None:
             self.coarser.joint.step(means_rate, rest, scale)
-        if self.exposures is not None:
-            self.exposures.after_step(last, len(iterations))
+        for transforms in self._transforms:
+            transforms.after_step(last, len(iterations))
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -270,8 +278,13 @@ class StageRun:
         for model in (self.model, *self.coarser.models):
             for param in model.params.values():
                 param.grad = None
-        if self.exposures is not None:
-            self.exposures.forget_gradients()
+        for transforms in self._transforms:
+            transforms.forget_gradients()
+
+    @property
+    def _transforms(self) -> list[ViewTransforms]:
+        """What is learned of the training views."""
+        return [transforms for transforms in (self.exposures, self.poses) if transforms is not None]
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
@@ -283,7 +296,8 @@ class StageRun:
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
-        rendered, result = self._render(gaussians, [view.camera for view in views], last)
+        shown = gaussians if self.poses is None else self.poses.watched(names[0], gaussians)
+        rendered, result = self._render(shown, [view.camera for view in views], last)
         self.breakdown.mark("loss")
         losses = losses_of(rendered)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
@@ -326,7 +340,8 @@ class StageRun:
         return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
 
     def _view(self, iteration: int) -> LevelView:
-        return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
+        index = view_index(iteration, len(self.views), self.settings.seed, self.stage.level)
+        return at_pose(self.views[index], self.poses)
 
     def _prefetch(self, iterations: Sequence[int]) -> None:
         """Copy the images of the next launch to the device while this one renders."""
@@ -380,6 +395,7 @@ class StageRun:
             "densifier": self.densifier.state,
             "joint": None if self.coarser.joint is None else self.coarser.joint.state(),
             "exposure": None if self.exposures is None else self.exposures.state(),
+            "poses": None if self.poses is None else self.poses.state(),
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -393,9 +409,14 @@ class StageRun:
         }
         if (joint := state.get("joint")) is not None:
             self.coarser.restore(joint)
-        if (exposure := state.get("exposure")) is not None:
-            assert self.exposures is not None, "the trainer looks for it"
-            self.exposures.restore(exposure)
+        self.restore_transforms(state)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)
+
+    def restore_transforms(self, state: Mapping[str, Any]) -> None:
+        """Take what is learned of the training views from a result of `state`."""
+        for transforms, name in ((self.exposures, "exposure"), (self.poses, "poses")):
+            if (found := state.get(name)) is not None:
+                assert transforms is not None, "the trainer looks for it"
+                transforms.restore(found)

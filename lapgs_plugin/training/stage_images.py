@@ -10,6 +10,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.run import refined_views
 from lapgs_plugin.runs.archive import CACHE
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
@@ -48,7 +49,9 @@ class StageImages:
             return
         try:
             with overhead.timed("cache"):
-                self.train_predictions = self._predictions(stage, context.scene.train, TRAIN)
+                self.train_predictions = self._predictions(
+                    stage, refined_views(context.archive, context.scene.train), TRAIN
+                )
             with overhead.timed("evaluation"):
                 self.test_predictions = self._predictions(stage, [*context.scene.test, *context.aside], TEST)
         except BaseException:

@@ -1,4 +1,4 @@
-"""Make what a stage starts with: its field, the finished fields to train jointly, the colour transforms of photos."""
+"""Make what a stage starts with: its field, the finished fields to train jointly, colours and poses of photos."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from lapgs_plugin.training.context import RunContext
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.settings import OFF
 
 
@@ -56,7 +57,7 @@ def _moments(context: RunContext, level: int, field: GaussianField) -> dict[str,
     return moments
 
 
-def joint_fields(context: RunContext, states: dict[int, dict[str, Any]] | None) -> JointFields:
+def joint_fields(context: RunContext, poses: ViewPoses | None, states: dict[int, dict[str, Any]] | None) -> JointFields:
     """Return the finished fields for joint training, from a checkpoint's `JointFields.state` or the archive."""
 
     def model(level: int) -> TrainableField:
@@ -69,7 +70,17 @@ def joint_fields(context: RunContext, states: dict[int, dict[str, Any]] | None) 
         rasterizer=context.rasterizer,
         background=context.background,
         pyramid=context.pyramid,
+        poses=poses,
     )
+
+
+def first_poses(context: RunContext, stage: Stage) -> ViewPoses | None:
+    """Return the corrections of poses that a stage starts with; None if the run does not refine poses."""
+    if not context.settings.refine_poses:
+        return None
+    levels, scene, done = context.archive.available_levels, context.scene, context.plan.iterations_before(stage.level)
+    start = (context.archive.poses(levels[-1]) if levels else None) or {}
+    return ViewPoses.create(scene.train, start, scene.extent, context.device, done, context.plan.iterations)
 
 
 def first_exposures(

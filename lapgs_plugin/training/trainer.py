@@ -22,7 +22,7 @@ from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdo
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.between_steps import BetweenSteps, CheckpointTimer
-from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_exposure
+from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
 from lapgs_plugin.training.evaluation import StageEvaluation
@@ -42,7 +42,7 @@ from lapgs_plugin.training.settings import BEST, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_images import StageImages
 from lapgs_plugin.training.stage_progress import StageProgress
-from lapgs_plugin.training.stage_start import first_exposures, first_model, joint_fields
+from lapgs_plugin.training.stage_start import first_exposures, first_model, first_poses, joint_fields
 from lapgs_plugin.training.views import level_views
 from lapgs_plugin.training.warm_up import warm_up
 
@@ -133,6 +133,10 @@ class Trainer:
                 few = few_views_line(len(context.scene.train), plan.iterations, bool(context.scene.test))
                 if few is not None and not resume:
                     self.monitor.say(few)
+                if self.settings.refine_poses and self.device.type == "cuda" and not resume:
+                    self.monitor.say(
+                        "--refine-poses: views are rendered one by one, which takes longer than several at once"
+                    )
                 for stage in plan:
                     if stage.level in self.archive.available_levels and context.record_to_extend(stage) is None:
                         continue
@@ -225,8 +229,9 @@ class Trainer:
 
     @property
     def _batches(self) -> bool:
-        """Whether the rasterizer renders several views together."""
-        return isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+        """Whether the rasterizer renders several views together; poses are refined with each view alone."""
+        able = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
+        return able and not self.settings.refine_poses
 
     def _stage_run(
         self,
@@ -240,12 +245,12 @@ class Trainer:
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         context, before = self._context, self._context.record_to_extend(stage)
-        breakdown = self._breakdown(before, checkpoint)
+        breakdown, poses = self._breakdown(before, checkpoint), first_poses(context, stage)
 
         def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
             memory.note(images.bytes_on_device)
             images.drop_predictions()  # from now on they are rendered
-            return joint_fields(context, states)
+            return joint_fields(context, poses, states)
 
         return StageRun(
             stage=replace(stage, iterations=schedule.end),
@@ -263,6 +268,7 @@ class Trainer:
                 images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
             ),
             exposures=first_exposures(context, stage, checkpoint, overhead),
+            poses=poses,
             breakdown=breakdown,
             progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
@@ -286,8 +292,9 @@ class Trainer:
         """Check a checkpoint against the stage, and continue from it."""
         path = self.archive.path(CHECKPOINT)
         check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
-        views = None if run.exposures is None else len(run.exposures.names)
-        check_exposure(checkpoint.get("exposure"), views, path)
+        for name, learned in (("exposure", run.exposures), ("poses", run.poses)):
+            shape = None if learned is None else learned.transforms.shape
+            check_transforms(checkpoint.get(name), shape, name, path)
         run.restore(checkpoint)
 
     def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:
@@ -313,10 +320,11 @@ class Trainer:
         joint = run.coarser.joint
         along = {} if joint is None else joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
+        poses = None if run.poses is None else run.poses.archived()
         if before is None:
             inherited = stage.level > 0 and self.settings.inherit_mode == "full"
             moments = run.model.optimizer_moments() if inherited else None
-            self.archive.finish_level(record, field, moments, along or None, exposure)
+            self.archive.finish_level(record, field, moments, along or None, exposure, poses)
         else:
             extended = {"iterations": self.settings.iterations, "extended": self.settings.extended}
-            self.archive.finish_extension(record, {**along, stage.level: field}, exposure, extended)
+            self.archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, extended)

@@ -131,10 +131,15 @@ def test_a_script_of_no_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with (fork / "gaussian_renderer" / "__init__.py").open("a", encoding="utf-8") as renderer:
+        renderer.write(
+            "\n\nfrom fast_backend import rasterize\n\ndef faster(pc):\n    return rasterize(means=pc.get_xyz)\n"
+        )
     lapgs("doctor", fork)
     text = capsys.readouterr().out
     for part in (str(fork), "--backbone generic", "scripts/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
         assert part in text
+    assert "its rasterizer takes shs, but fast_backend does not;" in text
     lapgs("doctor", CHECKOUTS / "taming")
     text = capsys.readouterr().out
     assert "Taming-3DGS (--backbone taming)" in text

@@ -14,6 +14,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -976,7 +977,10 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
     folder = os.environ.get("LAPGS_UPSTREAM")
     if not folder:
         pytest.skip("needs checkouts of the backbones: set LAPGS_UPSTREAM to a folder that holds them")
-    found = [target for checkout in sorted(Path(folder).iterdir()) for target in find_targets(checkout)]
+    found: list[Target] = []
+    for checkout in sorted(Path(folder).iterdir()):
+        with suppress(PatchError):  # the rasterizers of some forks have no recipe
+            found += find_targets(checkout)
     assert found
     for number, upstream in enumerate(found):
         for ending in (None, b"\r\n"):

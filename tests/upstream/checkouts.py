@@ -1,6 +1,7 @@
 """Run the real checkouts in processes of their own on the CPU stand-ins, at a tiny size.
 
-Paths of the checkouts are in LAPGS_FASTGS, LAPGS_TAMING and LAPGS_GRAPHDECO; tests of others are skipped.
+The folder in LAPGS_UPSTREAM holds checkouts called fastgs, taming, graphdeco, dashgaussian, mini_splatting and so on;
+LAPGS_FASTGS and the like name one elsewhere. Tests of checkouts that are not there are skipped.
 """
 
 from __future__ import annotations
@@ -15,6 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.runs.archive import RunArchive
 
 BARE = """
 import runpy, sys
@@ -90,11 +95,12 @@ class Done:
 
 
 def checkout(variable: str) -> Path:
-    """Return the folder in an environment variable; skip the test without it."""
-    named = os.environ.get(variable)
-    if not named:
-        pytest.skip(f"needs a checkout of the backbone: set {variable} to its folder")
-    return Path(named).resolve()
+    """Return the folder in an environment variable, or that of LAPGS_UPSTREAM; skip the test without it."""
+    name = variable.removeprefix("LAPGS_").lower()
+    folder = Path(os.environ.get(variable) or Path(os.environ.get("LAPGS_UPSTREAM", "nowhere"), name))
+    if not folder.is_dir():
+        pytest.skip(f"needs a checkout of the backbone: {variable}, or the folder {name} in LAPGS_UPSTREAM")
+    return folder.resolve()
 
 
 def knows_antialiasing(folder: Path) -> bool:
@@ -112,6 +118,14 @@ def run_lapgs(script: Path, options: list[str], arguments: list[str], folder: Pa
     calls = folder.with_name(f"{folder.name}-calls.json")
     progress = _python(COUNTING, calls, "--device", "cpu", *options, script, *arguments, "-m", folder)
     return Done(folder, progress, tuple((label, count) for label, count in json.loads(calls.read_text())))
+
+
+def assert_same_quality(archive: RunArchive) -> None:
+    """Compare the held-out PSNR of the checkout's own renders with that of the archived fields."""
+    (measured,) = [entry["psnr"] for entry in archive.history() if "psnr" in entry and entry["level"] == 0]
+    renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
+    pairs = ((renderer.render(view.camera).composed[0], view.image) for view in run_scene(archive).test)
+    assert mean_quality(pairs)["psnr"] == pytest.approx(measured, abs=0.05)
 
 
 def _python(code: str, *arguments: Any) -> str:

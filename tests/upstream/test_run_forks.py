@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.adapters.registry import adapter_class
-from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from tests.upstream.checkouts import checkout, run_lapgs
+from tests.upstream.checkouts import assert_same_quality, checkout, run_lapgs
 
 pytestmark = pytest.mark.upstream
 
@@ -87,7 +85,4 @@ def test_a_fork_trains(variable: str, kind: str, scene: Path, tmp_path: Path) ->
     for record in archive.manifest.records:
         assert record.num_gaussians == len(archive.field(record.level))
     if fork.same:
-        (measured,) = [entry["psnr"] for entry in archive.history() if "psnr" in entry and entry["level"] == 0]
-        renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
-        pairs = ((renderer.render(view.camera).composed[0], view.image) for view in run_scene(archive).test)
-        assert mean_quality(pairs)["psnr"] == pytest.approx(measured, abs=0.05)  # of the fork's own renders
+        assert_same_quality(archive)

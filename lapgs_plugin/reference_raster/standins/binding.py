@@ -34,6 +34,8 @@ class Rasterizer(nn.Module):
         return self.variant.outputs(settings, rasterize(settings, inputs, self.variant.options(settings)))
 
 
+# Each `forward` is written out, here and in `forks`, as CUDA bindings have it: its signature says which checkouts it
+# stands in for (`choice`), what it can do (`rasterizers.extensions`), and how positional arguments are called.
 class WholeSh(Rasterizer):
     """Take all SH coefficients in one argument."""
 

@@ -1,0 +1,99 @@
+"""Learn a few numbers for each training view beside the field."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+
+BETAS = (0.8, 0.99)
+"""Of Adam, which makes one step in each pass over the views, not one for each view."""
+
+
+@dataclass
+class ViewTransforms(ABC):
+    """Hold and optimize the transforms of all training views during a stage.
+
+    Gradients are added up over one pass through all views; then Adam steps, and `_recentre` sets the transforms' mean
+    back. The logarithm of the step size decays linearly over the run.
+
+    Attributes:
+        names: of the views.
+        transforms: (v, ...) parameter, on the training device.
+        done, total: iterations of the run before this stage, and of all stages, for the step size.
+    """
+
+    STARTS_AT: ClassVar[float] = 0.0
+    """Share of the run's iterations before the first step."""
+
+    names: Sequence[str]
+    transforms: torch.nn.Parameter  # (v, ...)
+    done: int
+    total: int
+    _index: dict[str, int] = field(init=False, repr=False)
+    _adam: torch.optim.Adam = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._index = {name: index for index, name in enumerate(self.names)}
+        self._adam = torch.optim.Adam([self.transforms], lr=self._rates[0], betas=BETAS)
+
+    @property
+    @abstractmethod
+    def _rates(self) -> tuple[float, float]:
+        """Adam's step size at the start and the end of a run."""
+
+    @abstractmethod
+    def _recentre(self) -> None:
+        """Remove in place what all transforms have in common, which the field can express."""
+
+    def after_step(self, iteration: int, views: int) -> None:
+        """Step after the views of an iteration if they end a pass through all views.
+
+        Args:
+            iteration: the last one, from 1 within the stage.
+            views: that the training step took.
+        """
+        if iteration % len(self.names) >= views:
+            return
+        progress = min(1.0, (self.done + iteration) / self.total)
+        if progress < self.STARTS_AT:
+            self.forget_gradients()
+            return
+        first, last = self._rates
+        self._adam.param_groups[0]["lr"] = first * (last / first) ** progress
+        self._step()
+
+    def _step(self) -> None:
+        self._adam.step()
+        self._adam.zero_grad()
+        with torch.no_grad():
+            self._recentre()
+
+    def forget_gradients(self) -> None:
+        """Drop gradients of the pass so far."""
+        self._adam.zero_grad()
+
+    def archived(self) -> Any:
+        """Return the transforms by view, as they are archived."""
+        return dict(zip(self.names, self.transforms.detach().cpu().tolist(), strict=True))
+
+    def state(self) -> dict[str, Any]:
+        """Return everything needed to continue to the same bits."""
+        return {
+            "transforms": self.transforms.detach(),
+            "gradient": self.transforms.grad,
+            "moments": dict(self._adam.state[self.transforms]),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a result of `state` of the same views."""
+        device = self.transforms.device
+        with torch.no_grad():
+            self.transforms.copy_(state["transforms"])
+        self.transforms.grad = None if state["gradient"] is None else state["gradient"].to(device, copy=True)
+        moments = {key: value if key == "step" else value.to(device) for key, value in state["moments"].items()}
+        if moments:
+            self._adam.state[self.transforms] = {key: value.clone() for key, value in moments.items()}
