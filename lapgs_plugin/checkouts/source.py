@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
+from lapgs_plugin.checkouts.script import parsed
 from lapgs_plugin.errors import UserInputError
 
 MODEL_ROLES = ("get_xyz", "training_setup")
@@ -154,15 +155,12 @@ def training_scripts(folder: Path) -> list[Path]:
 
 
 @lru_cache(maxsize=512)
-def _parse_file(path: Path, changed: float) -> ast.Module:
-    return ast.parse(path.read_bytes(), str(path))
+def _parsed_once(path: Path, changed: int) -> ast.Module:
+    return parsed(path)
 
 
 def _parse(path: Path) -> ast.Module:
-    try:
-        return _parse_file(path, path.stat().st_mtime)
-    except (SyntaxError, ValueError) as error:
-        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
+    return _parsed_once(path, path.stat().st_mtime_ns)
 
 
 def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
@@ -177,6 +175,11 @@ def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, P
                 if file is not None and imported not in seen:
                     seen.add(imported)
                     waiting.append((imported, file))
+
+
+def _place(path: Path, root: Path, line: int) -> str:
+    """Return a line of a file, which is in the checkout unless the script's folder is elsewhere."""
+    return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"
 
 
 def _parse_quietly(path: Path) -> ast.Module:
@@ -226,7 +229,7 @@ def _find_model(modules: Mapping[str, Path], root: Path) -> tuple[tuple[str, str
         methods, whole = _methods(node, {key: value[0] for key, value in classes.items()})
         if "training_setup" not in methods:
             continue
-        where = f"{path.relative_to(root) if path.is_relative_to(root) else path}:{node.lineno}"
+        where = _place(path, root, node.lineno)
         if whole and not methods.issuperset(MODEL_ROLES):
             near = f"{name} in {where} lacks {', '.join(set(MODEL_ROLES) - methods)}, and no other of its imports"
             continue
@@ -357,7 +360,7 @@ def _use(
         module=alias.module,
         names=tuple(names),
         holder=holder,
-        where=f"{path.relative_to(root) if path.is_relative_to(root) else path}:{alias.line}",
+        where=_place(path, root, alias.line),
         inside=local or any(each.name is None for each in own.values()),
         functions=(function.name,),
         settings=frozenset(word.arg for call in settings for word in call.keywords if word.arg is not None),
@@ -382,7 +385,7 @@ def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:
 
 def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
     """Yield imports of modules that are not in the checkout."""
-    for name, path in modules.items():
+    for path in modules.values():
         tree = _parse_quietly(path)
         needed = {id(node) for node in _always_executed(tree.body)}
         for node in ast.walk(tree):
@@ -392,10 +395,10 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
                 names = [node.module]
             else:
                 continue
-            where = f"{path.relative_to(root) if path.is_relative_to(root) else path}:{node.lineno}"
+            where = _place(path, root, node.lineno)
             for each in names:
                 if each not in modules and each.partition(".")[0] not in modules:
-                    yield External(each, where, name == "" or id(node) not in needed)
+                    yield External(each, where, id(node) not in needed)
 
 
 def _always_executed(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
