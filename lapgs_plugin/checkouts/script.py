@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, ModuleType
 
+from lapgs_plugin.checkouts.syntax import parsed
 from lapgs_plugin.errors import UserInputError
 
 
@@ -73,18 +74,6 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
         for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
             del sys.modules[name]
-
-
-def parsed(path: Path) -> ast.Module:
-    """Return the syntax tree of a script or module.
-
-    Raises:
-        UserInputError: it is not Python.
-    """
-    try:
-        return ast.parse(path.read_bytes(), str(path))
-    except (SyntaxError, ValueError) as error:
-        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
 
 
 def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:
