@@ -127,6 +127,11 @@ class BackboneInfo:
         return (*self.family_files, *self.own_files)
 
     @property
+    def script(self) -> str:
+        """Its training script: one of its own files, or `train.py`."""
+        return next((name for name in self.own_files if Path(name).name.startswith("train")), "train.py")
+
+    @property
     def extensions(self) -> Mapping[str, str]:
         """Compiled modules that its training script imports, each with its purpose."""
         return {self.rasterizer: "rasterizer", **FAMILY_EXTENSIONS}

@@ -95,6 +95,7 @@ def examine() -> dict[str, list[Finding]]:
 def current_folder(folder: Path, has_gpu: bool) -> Finding:
     """Return whether a folder is a checkout, and on which device `lapgs run` would train it."""
     from lapgs_plugin.adapters.registry import recognise
+    from lapgs_plugin.checkouts.source import training_scripts
     from lapgs_plugin.environment.findings import Finding
     from lapgs_plugin.errors import UserInputError
 
@@ -104,7 +105,9 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
         return Finding("Current folder", "problem", str(error))
     if adapter is not None:
         place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
-        detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run train.py ...` trains it on {place}"
+        names = [str(path.relative_to(folder)) for path in training_scripts(folder)]
+        script = adapter.info.script if adapter.info.script in names else names[0]
+        detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run {script} ...` trains it on {place}"
         return Finding("Current folder", "ok", detail)
     if all((folder / file).is_file() for file in GSPLAT_FILES):
         return Finding("Current folder", "ok", "a checkout of gsplat")

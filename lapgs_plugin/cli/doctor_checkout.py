@@ -51,6 +51,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
 
 def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     """Return the sources of the training script to describe, and the names of other training scripts."""
+    from lapgs_plugin.adapters.registry import adapter_class
     from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
 
     if path.is_file():
@@ -67,9 +68,10 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
         raise problems[0] if problems else UserInputError(missing)
     names = list(found)
     if len(names) > 1 and names[0] != "train.py":
+        usual = adapter_class(found[names[0]].root).info.script
         raise UserInputError(
             f"{path} has several training scripts: {', '.join(names)}; expected one of them, as in "
-            f"`lapgs doctor {path / names[0]}`"
+            f"`lapgs doctor {path / (usual if usual in names else names[0])}`"
         )
     return found[names[0]], names[1:]
 

@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from lapgs_plugin import environment
-from lapgs_plugin.cli.doctor import doctor, examine
+from lapgs_plugin.cli.doctor import current_folder, doctor, examine
 from lapgs_plugin.environment import findings, probes
 from lapgs_plugin.environment.probes import Probe
 from tests.contract.stub_runs import CHECKOUTS
@@ -93,3 +93,9 @@ def test_the_current_folder_is_a_checkout(monkeypatch: pytest.MonkeyPatch) -> No
         found = json.loads(CliRunner().invoke(app, ["--json"]).stdout)["Backbones"][-1]
         assert found["name"] == "Current folder"
         assert found["detail"].startswith(message)
+
+
+def test_the_script_of_the_current_folder_may_be_below_it() -> None:
+    assert (
+        "Mini-Splatting or a fork of it; `lapgs run ms/train.py ..." in current_folder(CHECKOUTS / "mini", False).detail
+    )

@@ -154,6 +154,10 @@ def test_doctor_says_which_training_scripts_there_are(fork: Path, capsys: pytest
         lapgs("doctor", fork)
     assert f"`lapgs doctor {fork / 'more/train.py'}`" in str(e.value)
     assert "\n" not in str(e.value)
+    own = Path(shutil.copytree(CHECKOUTS / "mini", fork.parent / "mini"))
+    shutil.copytree(own / "ms", own / "gs")
+    with pytest.raises(UserInputError, match=r"gs/train.py, ms/train.py; .* doctor .*/mini/ms/train.py`"):
+        lapgs("doctor", own)
     lapgs("doctor", fork / "scripts" / "train.py")
     assert "Other scripts" not in capsys.readouterr().out
     shutil.copy(fork / "more" / "train.py", fork)
