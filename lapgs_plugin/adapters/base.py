@@ -286,10 +286,16 @@ class BackboneAdapter(ABC):
         """Return where the CUDA module departs from the oracle by design; None if another backbone describes it."""
         return None
 
-    @staticmethod
-    def saved_logits(stored: Tensor) -> Tensor:
-        """Return the logits of opacities (n,), given the property "opacity" (n,) of a PLY that the backbone wrote."""
-        return stored
+    @classmethod
+    def saved_field(cls, path: Path) -> GaussianField:
+        """Return the field in a PLY that the backbone wrote, as its own render shows it.
+
+        Raises:
+            FieldError: as `GaussianField.load_ply`.
+        """
+        from lapgs_plugin.fields.gaussian_field import GaussianField
+
+        return GaussianField.load_ply(path)
 
     @property
     def train(self) -> ModuleType:
@@ -481,10 +487,8 @@ class BackboneAdapter(ABC):
         from lapgs_plugin.fields.gaussian_field import GaussianField
 
         with torch.no_grad():
-            if _activation(gaussians) is torch.sigmoid:
-                logits = gaussians._opacity
-            else:
-                logits = torch.logit(gaussians.get_opacity.clamp(1e-6, LARGEST_OPACITY))
+            plain = _activation(gaussians) is torch.sigmoid
+            logits = gaussians._opacity if plain else logits_of(gaussians.get_opacity)
             return GaussianField(
                 means=gaussians._xyz.detach().clone(),
                 quaternions=gaussians._rotation.detach().clone(),
@@ -519,6 +523,13 @@ class BackboneAdapter(ABC):
         """Return the optimizers that step Gaussians."""
         found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
         return [optimizer for optimizer in found if optimizer is not None]
+
+
+def logits_of(opacities: Tensor) -> Tensor:
+    """Return the logits of opacities, which may be 0, 1 or more."""
+    import torch
+
+    return torch.logit(opacities.clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
 
 
 def _options(opt: Any, *words: str) -> Iterator[str]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall, logits_of
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
 
 FILTER = "filter_3D"
-"""Attribute of its model: (n, 1) standard deviations."""
+"""Attribute of its model, (n, 1) standard deviations, and property of its PLY files."""
 
 
 class Adapter(generic.Adapter):
-    """Drive a Mip-Splatting checkout; its fields are archived with their filters applied."""
+    """Drive a Mip-Splatting checkout; its fields are archived and imported with their filters applied."""
 
     info = BackboneInfo(
         name="mip_splatting",
@@ -28,6 +29,22 @@ class Adapter(generic.Adapter):
         raster_defaults={"kernel_size": 0.1},
     )
 
+    @classmethod
+    def saved_field(cls, path: Path) -> GaussianField:
+        import torch
+        from plyfile import PlyData
+
+        field = super().saved_field(path)
+        vertices = PlyData.read(path)["vertex"]
+        if FILTER not in vertices.data.dtype.names:  # written by its create_fused_ply.py
+            return field
+        filters = torch.from_numpy(vertices[FILTER].astype("float32"))[:, None]  # (n, 1)
+        scales = torch.hypot(field.log_scales.exp(), filters).log()
+        dimmed = field.opacity_logits.sigmoid() * (field.log_scales - scales).sum(1).exp()
+        field = field.with_parameters({"log_scales": scales, "opacity_logits": logits_of(dimmed)})
+        field.require_finite()
+        return field
+
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
         import torch
 
@@ -39,7 +56,7 @@ class Adapter(generic.Adapter):
             return field.with_parameters(
                 {
                     "log_scales": torch.log(gaussians.get_scaling_with_3D_filter),
-                    "opacity_logits": torch.logit(opacities.clamp(1e-6, 1 - 1e-6)),
+                    "opacity_logits": logits_of(opacities),
                 }
             )
 

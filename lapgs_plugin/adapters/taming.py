@@ -6,16 +6,19 @@ import copy
 import logging
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import LARGEST_OPACITY, BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall, logits_of
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from lapgs_plugin.fields.gaussian_field import GaussianField
 
 logger = logging.getLogger(__name__)
 
@@ -46,14 +49,14 @@ class Adapter(generic.Adapter):
         unscaled=("ho_iteration",),
     )
 
-    @staticmethod
-    def saved_logits(stored: Tensor) -> Tensor:
+    @classmethod
+    def saved_field(cls, path: Path) -> GaussianField:
+        field = super().saved_field(path)
+        stored = field.opacity_logits
         if not bool((stored > LOW_LOGIT).all()):
-            return stored
-        import torch
-
+            return field
         # Half way through training it replaces the sigmoid by the absolute value, and saves the value before that.
-        return torch.logit(stored.abs().clamp(1 - LARGEST_OPACITY, LARGEST_OPACITY))
+        return field.with_parameters({"opacity_logits": logits_of(stored.abs())})
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from types import FunctionType, ModuleType
 from typing import Any
 
+from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.script import Script
-from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource, RasterizerUse
+from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource
 from lapgs_plugin.errors import UserInputError
 
 SCENE_ROLES = ("getTrainCameras", "getTestCameras")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, ModuleType
 
+from lapgs_plugin.checkouts.syntax import parsed
 from lapgs_plugin.errors import UserInputError
 
 
@@ -23,17 +24,11 @@ class Script:
     Attributes:
         path: absolute path of the script.
         module: the script's namespace, `__main__` while it is loaded.
-        tree: syntax tree of the whole script.
     """
 
     path: Path
     module: ModuleType
-    tree: ast.Module
     _main: CodeType
-
-    def function(self, name: str) -> ast.FunctionDef | None:
-        """Return the syntax tree of a function of the script."""
-        return next((node for node in self.tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
 
     def run_main(self) -> None:
         """Execute the main block. Its exceptions, including SystemExit and KeyboardInterrupt, are passed on."""
@@ -64,8 +59,7 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         UserInputError: it is not Python, or has no main block.
     """
     path = require_script(path)
-    tree = _parse(path)
-    definitions, main = _split(tree, path)
+    definitions, main = _split(parsed(path), path)
     module = ModuleType("__main__")
     module.__file__ = str(path)
     before = sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"]
@@ -74,19 +68,12 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     sys.modules["__main__"] = module
     try:
         exec(definitions, module.__dict__)
-        yield Script(path, module, tree, main)
+        yield Script(path, module, main)
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
         for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
             del sys.modules[name]
-
-
-def _parse(path: Path) -> ast.Module:
-    try:
-        return ast.parse(path.read_bytes(), str(path))
-    except (SyntaxError, ValueError) as error:
-        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
 
 
 def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:

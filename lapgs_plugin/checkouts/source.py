@@ -8,9 +8,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 
+from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
+from lapgs_plugin.checkouts.syntax import parsed, parsed_quietly, place
 from lapgs_plugin.errors import UserInputError
 
 MODEL_ROLES = ("get_xyz", "training_setup")
@@ -35,33 +36,6 @@ class External:
     name: str
     where: str
     optional: bool
-
-
-@dataclass(frozen=True)
-class RasterizerUse:
-    """Describe how one module of a checkout uses a rasterizer.
-
-    Attributes:
-        module: the rasterizer's module.
-        names: names that are taken from it, or looked up in it.
-        holder: module of the checkout that imports it.
-        where: file and line of the import.
-        inside: whether it is imported in a function or as a whole, so that its names are looked up at each call.
-        functions: functions of `holder` that use it.
-        settings: names of the settings that are passed.
-        inputs: names of the inputs that are passed.
-        outputs: number of outputs that are unpacked; 1 if they are not.
-    """
-
-    module: str
-    names: tuple[str, ...]
-    holder: str
-    where: str
-    inside: bool
-    functions: tuple[str, ...]
-    settings: frozenset[str]
-    inputs: frozenset[str]
-    outputs: int
 
 
 @dataclass(frozen=True)
@@ -105,7 +79,7 @@ class CheckoutSource:
 
     @classmethod
     def _read(cls, script: Path) -> CheckoutSource:
-        tree = _parse(script)
+        tree = parsed(script)
         near = ""
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
             modules = dict(_reachable(script, (script.parent, root)))
@@ -124,7 +98,7 @@ class CheckoutSource:
                 f"{script} has no function that its main block calls and that calls backward(), expected a function "
                 f"like training(dataset, opt, pipe, ...); {OTHERWISE}"
             )
-        uses = tuple(use for name, path in modules.items() for use in _uses(name, path, root, modules))
+        uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
         externals = tuple(_externals(modules, root))
         return cls(script, root, modules, externals, found, uses, training)
 
@@ -153,38 +127,18 @@ def training_scripts(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
 
 
-@lru_cache(maxsize=512)
-def _parse_file(path: Path, changed: float) -> ast.Module:
-    return ast.parse(path.read_bytes(), str(path))
-
-
-def _parse(path: Path) -> ast.Module:
-    try:
-        return _parse_file(path, path.stat().st_mtime)
-    except (SyntaxError, ValueError) as error:
-        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
-
-
 def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
     """Yield the checkout's modules that a script imports, the script itself first, with their files."""
     waiting, seen = [("__main__", script)], {"__main__"}
     while waiting:
         name, path = waiting.pop(0)
         yield name, path
-        for node in ast.walk(_parse_quietly(path)):
+        for node in ast.walk(parsed_quietly(path)):
             for imported in _imported(node, name, path):
                 file = _file_of(imported, folders)
                 if file is not None and imported not in seen:
                     seen.add(imported)
                     waiting.append((imported, file))
-
-
-def _parse_quietly(path: Path) -> ast.Module:
-    """Return the syntax tree of an imported module, empty if it is broken: importing it says so."""
-    try:
-        return _parse(path)
-    except UserInputError:
-        return ast.Module(body=[], type_ignores=[])
 
 
 def _imported(node: ast.AST, module: str, path: Path) -> Iterator[str]:
@@ -219,14 +173,14 @@ def _find_model(modules: Mapping[str, Path], root: Path) -> tuple[tuple[str, str
     classes = {
         node.name: (node, path)
         for path in modules.values()
-        for node in _parse_quietly(path).body
+        for node in parsed_quietly(path).body
         if isinstance(node, ast.ClassDef)
     }
     for name, (node, path) in classes.items():
         methods, whole = _methods(node, {key: value[0] for key, value in classes.items()})
         if "training_setup" not in methods:
             continue
-        where = f"{path.relative_to(root) if path.is_relative_to(root) else path}:{node.lineno}"
+        where = place(path, root, node.lineno)
         if whole and not methods.issuperset(MODEL_ROLES):
             near = f"{name} in {where} lacks {', '.join(set(MODEL_ROLES) - methods)}, and no other of its imports"
             continue
@@ -265,125 +219,10 @@ def _methods_called(node: ast.AST) -> set[str]:
     return {n.func.attr for n in ast.walk(node) if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)}
 
 
-@dataclass(frozen=True)
-class _Alias:
-    """A name that an import binds: `name` of `module`, or `module` itself."""
-
-    module: str
-    name: str | None
-    line: int
-
-
-def _aliases(nodes: Iterable[ast.AST]) -> dict[str, _Alias]:
-    """Return the names of rasterizers that import statements bind."""
-    found = {}
-    for node in nodes:
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            for alias in node.names:
-                if "raster" in alias.name.lower():
-                    found[alias.asname or alias.name] = _Alias(node.module, alias.name, node.lineno)
-        elif isinstance(node, ast.Import):
-            for alias in node.names:
-                if "raster" in alias.name.lower():
-                    found[alias.asname or alias.name.partition(".")[0]] = _Alias(alias.name, None, node.lineno)
-    return found
-
-
-def _outside_functions(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
-    """Yield statements that are executed when a module is imported."""
-    for node in body:
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            continue
-        yield node
-        for part in ("body", "orelse", "finalbody"):
-            yield from _outside_functions(getattr(node, part, []))
-        for handler in getattr(node, "handlers", []):
-            yield from _outside_functions(handler.body)
-
-
-def _uses(name: str, path: Path, root: Path, modules: Mapping[str, Path]) -> list[RasterizerUse]:
-    """Return how the functions of a module use rasterizers."""
-    tree = _parse_quietly(path)
-    top = _aliases(_outside_functions(tree.body))
-    found: dict[str, RasterizerUse] = {}
-    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
-        local = _aliases(ast.walk(function))
-        scope = {key: alias for key, alias in {**top, **local}.items() if alias.module not in modules}
-        used = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and node.id in scope}
-        for module in dict.fromkeys(scope[key].module for key in sorted(used)):
-            own = {key: scope[key] for key in used if scope[key].module == module}
-            use = _use(name, path, root, function, own, any(key in local for key in own))
-            found[module] = _merged(found[module], use) if module in found else use
-    return list(found.values())
-
-
-def _use(
-    holder: str, path: Path, root: Path, function: ast.FunctionDef, own: Mapping[str, _Alias], local: bool
-) -> RasterizerUse:
-    calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
-
-    def original(call: ast.expr) -> str:
-        """Return the rasterizer's name for the function of a call, empty for any other."""
-        if isinstance(call, ast.Name) and call.id in own:
-            return own[call.id].name or ""
-        whole = isinstance(call, ast.Attribute) and isinstance(call.value, ast.Name) and call.value.id in own
-        return call.attr if whole and isinstance(call, ast.Attribute) else ""
-
-    names = sorted({original(node) for node in ast.walk(function) if isinstance(node, ast.expr)} - {""})
-    settings = [call for call in calls if "setting" in original(call.func).lower()]
-    makers = [call for call in calls if original(call.func) and call not in settings]
-    made = {
-        target.id
-        for node in ast.walk(function)
-        if isinstance(node, ast.Assign) and node.value in makers
-        for target in node.targets
-        if isinstance(target, ast.Name)
-    }
-    renders = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id in made] or makers
-    inputs = {keyword.arg for call in renders for keyword in call.keywords}
-    if None in inputs:  # **inputs: their names are somewhere in the function
-        inputs |= {keyword.arg for call in calls for keyword in call.keywords}
-        constants = {node.value for node in ast.walk(function) if isinstance(node, ast.Constant)}
-        inputs |= {name for name in ("dc", "shs") if name in constants}
-    outputs = [
-        len(target.elts)
-        for node in ast.walk(function)
-        if isinstance(node, ast.Assign) and node.value in renders
-        for target in node.targets
-        if isinstance(target, ast.Tuple)
-    ]
-    alias = next(iter(own.values()))
-    return RasterizerUse(
-        module=alias.module,
-        names=tuple(names),
-        holder=holder,
-        where=f"{path.relative_to(root) if path.is_relative_to(root) else path}:{alias.line}",
-        inside=local or any(each.name is None for each in own.values()),
-        functions=(function.name,),
-        settings=frozenset(word.arg for call in settings for word in call.keywords if word.arg is not None),
-        inputs=frozenset(word for word in inputs if isinstance(word, str)),
-        outputs=max(outputs, default=1),
-    )
-
-
-def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:
-    return RasterizerUse(
-        module=one.module,
-        names=tuple(dict.fromkeys((*one.names, *other.names))),
-        holder=one.holder,
-        where=one.where,
-        inside=one.inside or other.inside,
-        functions=(*one.functions, *other.functions),
-        settings=one.settings | other.settings,
-        inputs=one.inputs | other.inputs,
-        outputs=max(one.outputs, other.outputs),
-    )
-
-
 def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
     """Yield imports of modules that are not in the checkout."""
-    for name, path in modules.items():
-        tree = _parse_quietly(path)
+    for path in modules.values():
+        tree = parsed_quietly(path)
         needed = {id(node) for node in _always_executed(tree.body)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
@@ -392,10 +231,10 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
                 names = [node.module]
             else:
                 continue
-            where = f"{path.relative_to(root) if path.is_relative_to(root) else path}:{node.lineno}"
+            where = place(path, root, node.lineno)
             for each in names:
                 if each not in modules and each.partition(".")[0] not in modules:
-                    yield External(each, where, name == "" or id(node) not in needed)
+                    yield External(each, where, id(node) not in needed)
 
 
 def _always_executed(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
-    from lapgs_plugin.checkouts.source import CheckoutSource, RasterizerUse
+    from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
+    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.environment.findings import Finding
 
 COLORS = {"shs", "colors_precomp"}

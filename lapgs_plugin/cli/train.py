@@ -20,6 +20,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option_values
 from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def _resume(
                 f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
                 "start again with --overwrite"
             )
-        settings = TrainSettings.from_manifest(manifest, str(archive.path(MANIFEST)))
+        settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
         if manifest.complete:
             settings = _extended(archive, settings, int(wanted["iterations"]) if "iterations" in given else None)
             given = given - {"iterations"}

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
@@ -39,6 +39,12 @@ class RunContext:
     watcher: Watcher
     test_every: int | None
     gpu_busy: bool
+
+    def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
+        """Return the place of a stage in the run."""
+        options, start = self.options, plan.iterations_before(stage.level)
+        factors = options.color_factor, options.threshold_factor(stage)
+        return StageWindow(stage, start, plan.iterations, plan.levels, *factors)
 
     def render(
         self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor

@@ -20,6 +20,7 @@ import tempfile
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.single_call import SingleCall
+from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import CACHE, RunArchive
 from lapgs_plugin.runs.manifest import Manifest
@@ -120,6 +122,7 @@ class HierarchyDriver:
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
         self._adapter.refuse(call, self._options.levels, self._options.kind)
+        require_pruning(call, self._options.prune)
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite)
@@ -159,14 +162,10 @@ class HierarchyDriver:
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
-        start = 0
         finished: list[FinishedStage] = []
         before: StageResult | None = None
         for stage in plan:
-            options = self._options
-            window = StageWindow(
-                stage, start, plan.iterations, plan.levels, options.color_factor, options.threshold_factor(stage)
-            )
+            window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
             active = self._active = ActiveStage(self._context, run, window, call, tuple(finished), before)
             try:
@@ -182,30 +181,24 @@ class HierarchyDriver:
                 self._active = None
                 active.close()
             finished.append(active.as_finished)
-            start += stage.iterations
 
     def _stage_call(self, run: TrainingRun, window: StageWindow) -> TrainingCall:
         """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""
         level = window.stage.level
         call = self._adapter.stage_call(run.call, window, str(run.archive.path(f"level_{level}")))
-        schedule = self._schedule(run.call)
-        if schedule is None:
-            return call
-        changed = schedule.for_stage(_variables(run.call), call.values, window, self._adapter.info.unscaled)
+        changed = self._schedule.for_stage(_variables(run.call), call.values, window, self._adapter.info.unscaled)
         if changed.notes:
             logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
         return replace(call, values=changed.arguments(call.values), function=changed.function(call.function))
 
     def _log_schedule(self, call: TrainingCall) -> None:
-        schedule = self._schedule(call)
-        if schedule is not None:
-            lines = schedule.describe(_variables(call))
-            logger.info("%s acts by iteration: %s", self._adapter.script.path.name, "; ".join(lines) or "nowhere")
+        lines = self._schedule.describe(_variables(call))
+        logger.info("%s acts by iteration: %s", self._adapter.script.path.name, "; ".join(lines) or "nowhere")
 
-    def _schedule(self, call: TrainingCall) -> Schedule | None:
-        """Return the schedule of the script's training function."""
-        tree = self._adapter.script.function(inspect.unwrap(call.function).__name__)
-        return None if tree is None else Schedule(tree)
+    @cached_property
+    def _schedule(self) -> Schedule:
+        """Schedule of the script's training function."""
+        return Schedule(self._adapter.profile.source.training)
 
     @property
     def _signs_nothing(self) -> bool:

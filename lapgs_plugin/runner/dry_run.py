@@ -150,9 +150,7 @@ class DryRun:
     @property
     def _window(self) -> StageWindow | None:
         """The residual's stage; None for levels that keep the checkout's own schedule."""
-        start = self._plan.iterations_before(self._stage.level)
-        window = StageWindow(self._stage, start, self._plan.iterations, self._plan.levels, 1.0, 1.0)
-        return window if self._stage.signed else None
+        return self._context.window(self._plan, self._stage) if self._stage.signed else None
 
     def _scratch_call(self, folder: Path) -> TrainingCall:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""

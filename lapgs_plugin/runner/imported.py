@@ -353,6 +353,4 @@ def _manifest(run: ForeignRun, backbone: BackboneInfo, scene: Path | None, setti
 
 
 def _field(level: ForeignLevel, levels: int, backbone: type[BackboneAdapter]) -> GaussianField:
-    field = GaussianField.load_ply(level.ply)
-    logits = backbone.saved_logits(field.opacity_logits)  # (n,)
-    return replace(field, opacity_logits=logits, signed=level.level != levels - 1)
+    return replace(backbone.saved_field(level.ply), signed=level.level != levels - 1)

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import CHECKPOINTS, StageWindow
+from lapgs_plugin.adapters.base import CHECKPOINTS
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
@@ -77,11 +77,9 @@ class SingleCall:
     def __init__(
         self, context: RunContext, run: TrainingRun, plan: StagePlan, activate: Callable[[ActiveStage | None], None]
     ) -> None:
-        self._context, self._run, self._activate, self._total = context, run, activate, plan.iterations
-        self._levels = plan.levels
+        self._context, self._run, self._plan, self._activate = context, run, plan, activate
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
-        self._start = sum(stage.iterations for stage in self._done)  # iterations before the running stage
         self._opt = run.call.opt
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
         dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
@@ -132,11 +130,7 @@ class SingleCall:
 
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
-        stage, options = self._left.pop(0), self._context.options
-        window = StageWindow(
-            stage, self._start, self._total, self._levels, options.color_factor, options.threshold_factor(stage)
-        )
-        self._start += stage.iterations
+        window = self._context.window(self._plan, self._left.pop(0))
         return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
 
     def _begin(self, stage: NestedStage) -> None:
@@ -196,13 +190,13 @@ class SingleCall:
         Raises:
             LapgsError: no iteration was seen, or the call ended in a coarser level.
         """
-        trained = stage.window.start + stage.record.iteration
+        trained, total = stage.window.start + stage.record.iteration, self._plan.iterations
         name = self._call.function.__name__
         if stage.stage.level > 0 or stage.record.iteration == 0:
             raise LapgsError(
-                f"{name}() ended after {trained} of {self._total} iterations, in level {stage.stage.level}; expected "
+                f"{name}() ended after {trained} of {total} iterations, in level {stage.stage.level}; expected "
                 f"one call of {CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run "
                 "--off`, or with as many --iterations as it runs"
             )
-        if trained != self._total:
-            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, trained, self._total)
+        if trained != total:
+            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, trained, total)

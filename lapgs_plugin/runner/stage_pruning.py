@@ -8,16 +8,34 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import TrainingCall
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 
+DENSIFICATION = ("densify_from_iter", "densify_until_iter")
+"""Options of the family for the iterations between which its scripts densify."""
+
 
 def pruning_iteration(call: TrainingCall) -> int | None:
     """Return the first iteration of a stage after densification; None if densification does not end in the stage."""
-    opt = call.opt
-    return opt.densify_until_iter if opt.densify_from_iter < opt.densify_until_iter < opt.iterations else None
+    first, until = (getattr(call.opt, name, 0) for name in DENSIFICATION)
+    return until if first < until < call.opt.iterations else None
+
+
+def require_pruning(call: TrainingCall, share: float) -> None:
+    """Check that densification ends within a run that is to be pruned then.
+
+    Raises:
+        UserInputError: it does not, so that --prune would change nothing.
+    """
+    if share and pruning_iteration(call) is None:
+        given = ", ".join(f"--{name} {getattr(call.opt, name, 'missing')}" for name in (*DENSIFICATION, "iterations"))
+        raise UserInputError(
+            f"--prune {share}: prunes when densification ends, which it does not in this run ({given}); expected an "
+            "end between its start and the last iteration: leave --prune out, or change these options of the script"
+        )
 
 
 def prune_least_visible(views: StageViews, gaussians: Any, share: float, path: ColorPath) -> None:

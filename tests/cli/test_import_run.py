@@ -12,6 +12,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 import typer
+from numpy.lib.recfunctions import append_fields
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from lapgs_plugin.cli.evaluate import evaluate
@@ -104,6 +106,32 @@ def test_a_hierarchy_of_the_release_is_rendered_as_its_script_does(foreign: Fore
     expected = release_up(coarse.clamp(0, 1), (41, 57)) + fine.clamp(-1, 1)
     written = read_image(run / "renders" / "test" / "photos" / "00_composed.exr")
     np.testing.assert_allclose(written, expected, atol=1e-5)  # worst seen 8e-7
+
+
+def test_filters_of_mip_splatting_are_applied(foreign: Foreign, tmp_path: Path) -> None:
+    """As its render does: filters widen Gaussians, and dim them so that what they cover stays."""
+    field = foreign.field("", 700, blob_field(90, seed=1))
+    (path,) = foreign.folder.glob("point_cloud/*/point_cloud.ply")
+    filters = np.linspace(0.0, 0.2, 90, dtype=np.float32)
+    data = PlyData.read(path)["vertex"].data
+    PlyData([PlyElement.describe(append_fields(data, "filter_3D", filters, usemask=False), "vertex")]).write(path)
+    lapgs("import-run", foreign.folder, "-o", tmp_path / "run", "--backbone", "mip_splatting")
+    found = RunArchive.open(tmp_path / "run").field(0)
+    before = field.log_scales.double().exp().square()
+    after = before + torch.from_numpy(filters).double().square()[:, None]
+    torch.testing.assert_close(found.log_scales.double(), after.sqrt().log(), atol=1e-5, rtol=0)
+    opacities = field.opacity_logits.double().sigmoid() * (before.prod(1) / after.prod(1)).sqrt()
+    torch.testing.assert_close(found.opacity_logits.double().sigmoid(), opacities, atol=1e-5, rtol=0)
+    assert opacities[-1] < 0.9 * field.opacity_logits[-1].sigmoid()
+
+
+def test_opacities_that_taming_3dgs_saves_as_they_are(foreign: Foreign, tmp_path: Path) -> None:
+    """After half of its training they are absolute values, which may be above 1, and no logits."""
+    stored = torch.linspace(-0.1, 1.2, 90)
+    foreign.field("", 700, replace(blob_field(90, seed=1), opacity_logits=stored))
+    lapgs("import-run", foreign.folder, "-o", tmp_path / "run", "--backbone", "taming")
+    found = RunArchive.open(tmp_path / "run").field(0).opacity_logits.sigmoid()
+    torch.testing.assert_close(found, stored.abs().clamp(max=1), atol=1e-5, rtol=0)
 
 
 def test_figures_of_the_release_count_from_its_first_stage(foreign: Foreign, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from lapgs_plugin.options import option, options_of
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.sample import make_sample_scene
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 
 PLUGIN = '''
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ def test_a_strategy_of_another_package_trains_with_its_options(installed: Path, 
     density = json.loads((run / "manifest.json").read_text())["settings"]["densification"]
     assert (density["strategy"], density["options"]) == ("copying", {"copies": 7})
     with pytest.raises(RunFolderError, match="--strategy copying: expected default, mcmc, multiview; install the pack"):
-        TrainSettings.from_manifest(manifest)
+        settings_from_manifest(manifest)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
@@ -16,7 +17,7 @@ from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runner import stage_pruning
 from lapgs_plugin.runner.active_stage import ActiveStage
-from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, run_hierarchy, run_residuals
+from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
 
 SHARE = 0.05
 
@@ -72,6 +73,18 @@ def test_what_is_least_seen_goes(
     for level, first in expected_at.items():
         assert counts[level, first - 1] == len(fields[level][0])
         assert counts[level, first] == len(fields[level][1])
+
+
+def test_pruning_needs_an_end_of_densification(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, folder, "--densify_until_iter", 90) as adapter,
+        pytest.raises(UserInputError, match=r"--prune 0.05: .*--densify_until_iter 90, --iterations 90\)") as caught,
+    ):
+        drive(adapter, prune=SHARE)
+    assert "\n" not in str(caught.value)
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -23,6 +23,7 @@ from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
@@ -73,7 +74,7 @@ def finished(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pyt
 
 def extend(path: Path, scene: Scene, asked: int | None = AFTER, monitor: Monitor | None = None) -> None:
     with RunArchive.open(path, resume=True) as archive:
-        settings = _extended(archive, TrainSettings.from_manifest(archive.manifest), asked)
+        settings = _extended(archive, settings_from_manifest(archive.manifest), asked)
         Trainer(scene, settings, archive, CpuRasterizer(), monitor=monitor or Monitor()).run(resume=True)
 
 
@@ -99,7 +100,7 @@ def test_a_finished_run_is_extended(finished: Path, scene: Scene, tmp_path: Path
     RunArchive.open(path).write_metrics({"psnr": 1.0})
     extend(path, scene)
     new = RunArchive.open(path)
-    settings = TrainSettings.from_manifest(new.manifest)
+    settings = settings_from_manifest(new.manifest)
     assert (settings.iterations, settings.extended) == (AFTER, AFTER - BEFORE)
     (*coarser, before), (*same, after) = old.manifest.records, new.manifest.records
     assert coarser == same

@@ -27,6 +27,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
@@ -119,7 +120,7 @@ def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     scene: Scene, tmp_path: Path, whole: RunArchive, level: int, iteration: int
 ) -> None:
-    settings = TrainSettings.from_manifest(whole.manifest)
+    settings = settings_from_manifest(whole.manifest)
     with make_archive(tmp_path / "parts", settings) as archive:
         trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(level, iteration))
         with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
@@ -145,7 +146,7 @@ def test_an_older_run_with_residuals_still_resets_opacities_in_them(scene: Scene
     flat |= flat.pop("options") | {"cap_max": 1_000_000, "base_cap_max": None, "error_pixels": 0.1}
     (run / "manifest.json").write_text(json.dumps(manifest))
     with RunArchive.open(run, resume=True) as archive:
-        older = TrainSettings.from_manifest(archive.manifest)
+        older = settings_from_manifest(archive.manifest)
         Trainer(scene, older, archive, CpuRasterizer()).run(resume=True)
         assert plys(archive) == plys(whole)
     without = train(tmp_path / "without", scene, replace(settings, residual_resets=False))
@@ -401,7 +402,7 @@ def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, ob
     assert all(math.isfinite(loss) for loss in losses.values())
     assert archive.manifest.complete
     assert not archive.path("cache").exists()
-    assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
+    assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
 
 
 def test_the_least_visible_gaussians_are_removed_when_densification_ends(scene: Scene, tmp_path: Path) -> None:

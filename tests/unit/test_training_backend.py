@@ -31,6 +31,7 @@ from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.planning import check_storage
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Default, Mcmc
@@ -106,15 +107,15 @@ def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene
     settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
     reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
     manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
-    assert TrainSettings.from_manifest(manifest).for_manifest() == settings.for_manifest()
+    assert settings_from_manifest(manifest).for_manifest() == settings.for_manifest()
     since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy", "base_sh_degree")
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
-    found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
+    found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
     density = replace(SETTINGS.densification, options=Default(grow_grad2d=2e-4))  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
-    found = TrainSettings.from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
+    found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
     assert (found.hierarchy, found.views_per_step, found.sh_rate_factor) == ("laplacian", "1", 1.0)
 
 
@@ -249,7 +250,7 @@ def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -
     assert [archive.field(level).sh_degree for level in (1, 0)] == [1, 2]
     assert all(bool((archive.field(level).sh[:, 1:] != 0).any()) for level in (1, 0))
     assert archive.history()[-1]["psnr"] > archive.history()[0].get("psnr", 0)
-    assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
+    assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
 
 
 def test_fused_steps_have_the_bits_of_the_optimizers_own() -> None:

@@ -33,6 +33,7 @@ from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import Default
@@ -329,7 +330,7 @@ def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(sc
             with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
                 trainer.run()
         with RunArchive.open(folder, resume=True) as archive:
-            assert TrainSettings.from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
+            assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
             Trainer(scene, settings, archive, CpuRasterizer(), test_every=1).run(resume=True)
             assert plys(archive) == plys(whole)
             assert [entry["loss"] for entry in archive.history()] == [entry["loss"] for entry in whole.history()]

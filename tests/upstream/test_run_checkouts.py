@@ -68,8 +68,9 @@ def test_two_levels(variable: str, hierarchy: str, scene: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_three_levels(variable: str, scene: Path, tmp_path: Path) -> None:
-    options = ("--hierarchy", "laplacian", "--levels", "3", "--prune", "0.01", "--breakdown")
-    done = run(variable, scene, tmp_path / "run", *options)
+    options = ["--hierarchy", "laplacian", "--levels", "3", "--prune", "0.01", "--breakdown"]
+    words = [*arguments_of(variable, scene), "--densify_until_iter", "120"]
+    done = run_lapgs(checkout(variable) / "train.py", options, words, tmp_path / "run")
     archive = RunArchive.open(done.folder)
     assert archive.available_levels == (2, 1, 0)
     assert archive.manifest.complete

@@ -1,0 +1,39 @@
+"""Parse scripts and modules of checkouts, and name places in them."""
+
+from __future__ import annotations
+
+import ast
+from functools import lru_cache
+from pathlib import Path
+
+from lapgs_plugin.errors import UserInputError
+
+
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a script or module, not to be changed: it is kept until the file changes.
+
+    Raises:
+        UserInputError: it is not Python.
+    """
+    try:
+        return _parsed_version(path, path.stat().st_mtime_ns)
+    except (SyntaxError, ValueError) as error:
+        raise UserInputError(f"{path} is not a Python script ({error}); expected a checkout's train.py") from error
+
+
+@lru_cache(maxsize=512)
+def _parsed_version(path: Path, changed: int) -> ast.Module:
+    return ast.parse(path.read_bytes(), str(path))
+
+
+def parsed_quietly(path: Path) -> ast.Module:
+    """Return the syntax tree of an imported module, empty if it is broken: importing it says so."""
+    try:
+        return parsed(path)
+    except UserInputError:
+        return ast.Module(body=[], type_ignores=[])
+
+
+def place(path: Path, root: Path, line: int) -> str:
+    """Return a line of a file as `file:line`, relative to the checkout's root if the file is below it."""
+    return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"
