@@ -92,50 +92,54 @@ def _outside_functions(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
 def _use(
     holder: str, path: Path, root: Path, function: ast.FunctionDef, own: Mapping[str, _Alias], local: bool
 ) -> RasterizerUse:
+    """Return how a function uses the rasterizer whose names are `own` there; `local` if it imports some itself."""
     calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
-
-    def original(call: ast.expr) -> str:
-        """Return the rasterizer's name for the function of a call, empty for any other."""
-        if isinstance(call, ast.Name) and call.id in own:
-            return own[call.id].name or ""
-        whole = isinstance(call, ast.Attribute) and isinstance(call.value, ast.Name) and call.value.id in own
-        return call.attr if whole and isinstance(call, ast.Attribute) else ""
-
-    names = sorted({original(node) for node in ast.walk(function) if isinstance(node, ast.expr)} - {""})
-    settings = [call for call in calls if "setting" in original(call.func).lower()]
-    makers = [call for call in calls if original(call.func) and call not in settings]
-    made = {
-        target.id
-        for node in ast.walk(function)
-        if isinstance(node, ast.Assign) and node.value in makers
-        for target in node.targets
-        if isinstance(target, ast.Name)
-    }
+    names = {_original(node, own) for node in ast.walk(function) if isinstance(node, ast.expr)} - {""}
+    settings = [call for call in calls if "setting" in _original(call.func, own).lower()]
+    makers = [call for call in calls if _original(call.func, own) and call not in settings]
+    made = {target.id for target in _targets(function, makers) if isinstance(target, ast.Name)}
     renders = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id in made] or makers
-    inputs = {keyword.arg for call in renders for keyword in call.keywords}
-    if None in inputs:  # **inputs: their names are somewhere in the function
-        inputs |= {keyword.arg for call in calls for keyword in call.keywords}
-        constants = {node.value for node in ast.walk(function) if isinstance(node, ast.Constant)}
-        inputs |= {name for name in ("dc", "shs") if name in constants}
-    outputs = [
-        len(target.elts)
-        for node in ast.walk(function)
-        if isinstance(node, ast.Assign) and node.value in renders
-        for target in node.targets
-        if isinstance(target, ast.Tuple)
-    ]
+    outputs = [len(target.elts) for target in _targets(function, renders) if isinstance(target, ast.Tuple)]
     alias = next(iter(own.values()))
     return RasterizerUse(
         module=alias.module,
-        names=tuple(names),
+        names=tuple(sorted(names)),
         holder=holder,
         where=place(path, root, alias.line),
         inside=local or any(each.name is None for each in own.values()),
         functions=(function.name,),
         settings=frozenset(word.arg for call in settings for word in call.keywords if word.arg is not None),
-        inputs=frozenset(word for word in inputs if isinstance(word, str)),
+        inputs=_inputs(function, renders),
         outputs=max(outputs, default=1),
     )
+
+
+def _original(expression: ast.expr, own: Mapping[str, _Alias]) -> str:
+    """Return the rasterizer's name for an expression such as `Rasterizer` or `module.Rasterizer`; empty for others."""
+    if isinstance(expression, ast.Name) and expression.id in own:
+        return own[expression.id].name or ""
+    if isinstance(expression, ast.Attribute) and isinstance(expression.value, ast.Name) and expression.value.id in own:
+        return expression.attr
+    return ""
+
+
+def _targets(function: ast.FunctionDef, calls: list[ast.Call]) -> Iterator[ast.expr]:
+    """Yield what the results of these calls are assigned to."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and node.value in calls:
+            yield from node.targets
+
+
+def _inputs(function: ast.FunctionDef, renders: list[ast.Call]) -> frozenset[str]:
+    """Return the names of the inputs of calls that render, which may be passed as `**inputs`."""
+    found = {word.arg for call in renders for word in call.keywords}
+    if None in found:
+        calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+        collecting = [call for call in calls if ast.unparse(call.func).rpartition(".")[2] in ("dict", "update")]
+        found |= {word.arg for call in collecting for word in call.keywords}
+        constants = {node.value for node in ast.walk(function) if isinstance(node, ast.Constant)}
+        found |= {name for name in ("dc", "shs", "colors_precomp") if name in constants}
+    return frozenset(word for word in found if word is not None)
 
 
 def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:

@@ -139,7 +139,7 @@ def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[s
     text = capsys.readouterr().out
     for part in (str(fork), "--backbone generic", "scripts/train.py:", "training(dataset, opt, pipe", OTHER, "open3d"):
         assert part in text
-    assert "its rasterizer takes shs, but fast_backend does not;" in text
+    assert "its rasterizer takes colors_precomp and shs, but fast_backend does not;" in text
     lapgs("doctor", CHECKOUTS / "taming")
     text = capsys.readouterr().out
     assert "Taming-3DGS (--backbone taming)" in text
