@@ -12,7 +12,6 @@ from torch import Tensor
 
 from lapgs_plugin.environment import versions
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr, ssim
 from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
@@ -25,6 +24,7 @@ from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import METRICS, RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest
+from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.training_figures import training_figures
 from lapgs_plugin.scenes.scene import View
 

@@ -17,6 +17,7 @@ from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.trajectory import orbit, read_trajectory, spline, walking_order
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import SceneReference
+from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.masks import ALPHA, NONE
 from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene
 from lapgs_plugin.scenes.source import is_folder
@@ -68,7 +69,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         background=reference.background,
     )
     require_same_scene(archive, scene.path, scene.smallest_size)
-    return replace(scene, train=refined_views(archive, scene.train))
+    return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
@@ -82,25 +83,25 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     cameras = [*train.values(), *test.values()]
     smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
     require_same_scene(archive, path, smallest)
-    return refined(archive, train), test
+    return refined(archive, train), refined(archive, test)
 
 
 def refined(archive: RunArchive, cameras: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Return training cameras by view name, at the poses to which the run refined them, if it did.
+    """Return cameras by view name at the poses to which the run refined them, if it did.
+
+    Held-out views are moved as their neighbours are if these predict each other, see `runs.neighbours`.
 
     Raises:
         RunFolderError: the file of its corrections is damaged.
     """
     levels = archive.available_levels
-    corrections = (archive.poses(levels[-1]) if levels else None) or {}
-    return {
-        name: corrected(camera, corrections[name]) if name in corrections else camera
-        for name, camera in cameras.items()
-    }
+    learned = (archive.poses(levels[-1]) if levels else None) or {}
+    moved = {**predicted_poses(learned, cameras.keys() - learned.keys()), **learned}
+    return {name: corrected(camera, moved[name]) if name in moved else camera for name, camera in cameras.items()}
 
 
 def refined_views(archive: RunArchive, views: Sequence[View]) -> tuple[View, ...]:
-    """Return training views with `refined` cameras."""
+    """Return views with `refined` cameras."""
     cameras = refined(archive, {view.name: view.camera for view in views})
     return tuple(replace(view, camera=cameras[view.name]) for view in views)
 

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import add_prediction, to_full_size
+from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.context import RunContext
@@ -65,9 +65,9 @@ class StageEvaluation:
             exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
         """
         level, device, cache = run.stage.level, self.context.device, self.images.test_predictions
-        image = self.context.rasterizer(
-            run.model.field, level_camera(view.camera, level), background=run.background
-        ).image
+        camera = level_camera(view.camera, level)
+        camera = camera if run.poses is None else run.poses.camera(view.name, camera)
+        image = self.context.rasterizer(run.model.field, camera, background=run.background).image
         cached = None if cache is None else cache.get
         predict = cached if run.coarser.joint is None else run.coarser.joint.predict
         image = add_prediction(image, None if predict is None else predict(view.name))

@@ -1,7 +1,8 @@
 """Refine the poses of the training views: `--refine-poses`.
 
 Each view has a correction of its camera, see `fields.pose`, which learns with the field. What all corrections have in
-common, a similarity transform of the scene, is removed, so that held-out views stay aligned with the field.
+common, a similarity transform of the scene, is removed, so that held-out views stay aligned with the field. Where
+corrections change slowly from view to view, held-out views are moved as their neighbours are.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.pose import corrected, turned_gradient, with_pose_gradient
 from lapgs_plugin.runs.archive import Poses
+from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView
@@ -62,16 +64,15 @@ class ViewPoses(ViewTransforms):
         return cls([*cameras], torch.nn.Parameter(rows.to(device)), done, total, cameras, extent)
 
     def camera(self, name: str, camera: Camera) -> Camera:
-        """Return a view's camera, of any size, at the refined pose; held-out views keep theirs.
+        """Return a view's camera, of any size, at the refined pose; for held-out views see `runs.neighbours`.
 
         It is the same object until the next step: a rasterizer may know it by that.
         """
-        if name not in self._index:
-            return camera
         self._known = self._known or self.archived()
         key = name, camera.width, camera.height
         if key not in self._moved:
-            self._moved[key] = corrected(camera, self._known[name])
+            known = self._known if name in self._index else predicted_poses(self._known, [name])
+            self._moved[key] = corrected(camera, known[name]) if name in known else camera
         return self._moved[key]
 
     def watched(self, name: str, gaussians: GaussianField) -> GaussianField:

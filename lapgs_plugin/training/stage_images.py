@@ -52,8 +52,9 @@ class StageImages:
                 self.train_predictions = self._predictions(
                     stage, refined_views(context.archive, context.scene.train), TRAIN
                 )
+            measured = [*context.scene.test, *context.aside]
             with overhead.timed("evaluation"):
-                self.test_predictions = self._predictions(stage, [*context.scene.test, *context.aside], TEST)
+                self.test_predictions = self._predictions(stage, refined_views(context.archive, measured), TEST)
         except BaseException:
             self.close()
             raise

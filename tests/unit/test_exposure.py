@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
-from lapgs_plugin.evaluation.exposure import predicted_exposures
 from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.evaluation.lpips import LpipsRequest
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
@@ -24,6 +23,7 @@ from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities

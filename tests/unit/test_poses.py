@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import refined, run_cameras, run_scene
 from lapgs_plugin.runs.archive import Poses, RunArchive
+from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import poses
 from lapgs_plugin.training.checkpoint import TransformsState, check_transforms
@@ -168,11 +170,10 @@ def test_refinement_finds_true_poses_and_sharpens_held_out_views(
 
 
 def test_archived_corrections_move_training_cameras_and_no_others(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path)
-    run = write_run(tmp_path / "run", folder)
+    run = write_run(tmp_path / "run", write_scene(tmp_path))
     train_before, test_before = run_cameras(RunArchive.open(run))
-    name = next(iter(train_before))
-    moved = {name: [0.0, 0.0, 0.0, 0.5, -0.25, 1.0], next(iter(test_before)): [0.1] * 6}
+    name = sorted(train_before)[1]
+    moved = {each: [0.0] * 6 for each in train_before} | {name: [0.0, 0.0, 0.0, 0.5, -0.25, 1.0]}
     (run / "level_0" / "poses.json").write_text(json.dumps(moved))
     archive = RunArchive.open(run)
     train_after, test_after = run_cameras(archive)
@@ -181,10 +182,27 @@ def test_archived_corrections_move_training_cameras_and_no_others(tmp_path: Path
     loaded = run_scene(archive)
     for views, cameras in ((loaded.train, train_after), (loaded.test, test_after)):
         assert all((view.camera.world_to_camera == cameras[view.name].world_to_camera).all() for view in views)
-    others = {**train_before, **test_before}
-    del others[name]
-    for other, camera in others.items():
-        assert ({**train_after, **test_after}[other].world_to_camera == camera.world_to_camera).all()
+    before, after = {**train_before, **test_before}, {**train_after, **test_after}
+    for other in before.keys() - {name}:
+        torch.testing.assert_close(after[other].world_to_camera, before[other].world_to_camera, atol=1e-6, rtol=0)
+
+
+def test_held_out_views_move_with_their_neighbours_where_corrections_change_slowly() -> None:
+    waves = [[math.sin(i / 4), math.cos(i / 5), 0.2, 30 * math.cos(i / 4), 0.0, -9.0] for i in range(20)]
+    slow = {f"{2 * index:03d}.png": [0.01 * each for each in row] for index, row in enumerate(waves)}
+    found = predicted_poses(slow, ["013.png", "004.png"])
+    assert found["013.png"] == pytest.approx(np.mean([slow["012.png"], slow["014.png"]], axis=0), rel=1e-9)
+    assert found["004.png"] == pytest.approx(slow["004.png"], rel=1e-9)
+    jumping = {name: [(-1.0) ** index * each for each in row] for index, (name, row) in enumerate(slow.items())}
+    assert predicted_poses(jumping, ["013.png"]) == {}
+    assert predicted_poses({}, ["013.png"]) == {}
+    scene = ring_scene(train=6, test=2)
+    poses = {view.name: [0.0, 0.0, 0.0, 0.3, 0.1, 0.01 * index] for index, view in enumerate(scene.train)}
+    views = ViewPoses.create(scene.train, poses, scene.extent, torch.device("cpu"), 0, 100)
+    camera = scene.test[1].camera
+    shift = views.camera(scene.test[1].name, camera).position - camera.position
+    torch.testing.assert_close(shift[:2], torch.tensor([0.3, 0.1]), atol=5e-6, rtol=0)
+    assert views.camera(scene.test[1].name, camera) is views.camera(scene.test[1].name, camera)
 
 
 def test_damaged_corrections_are_refused(tmp_path: Path) -> None:

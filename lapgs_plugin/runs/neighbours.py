@@ -1,0 +1,79 @@
+"""Predict what a run would have learned of held-out views from what it learned of the training views beside them.
+
+In a video, or a walk around an object, exposure and errors of poses change slowly from view to view. Whether they do
+is found out among the training views: each is predicted by its two neighbours in the order of names, and by nothing.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.runs.archive import Exposures, Poses
+
+LARGEST_ERROR = 0.5
+"""Largest squared error of prediction among training views, as a share of that of the neutral value, for neighbours to
+be used."""
+
+
+def predicted_exposures(learned: Exposures, views: Iterable[str]) -> dict[str, Tensor]:
+    """Predict the colour transforms of views.
+
+    Args:
+        learned: colour transforms of the training photos by name.
+        views: names of views; a training photo has its own transform.
+
+    Returns:
+        (3, 4) transforms by view; empty where neighbours predict no better than the identity.
+    """
+    names = sorted(learned)
+    return _predicted(names, torch.tensor([learned[name] for name in names]), torch.eye(3, 4), views)
+
+
+def predicted_poses(learned: Poses, views: Iterable[str]) -> Poses:
+    """Predict the corrections of the poses of views.
+
+    Args:
+        learned: corrections of the training photos' poses by name.
+        views: names of views; a training photo has its own correction.
+
+    Returns:
+        Corrections by view; empty where neighbours predict no better than no correction.
+    """
+    if not learned:
+        return {}
+    names = sorted(learned)
+    rows = torch.tensor([learned[name] for name in names], dtype=torch.float64)  # (v, 6)
+    sizes = rows.view(-1, 2, 3).square().mean((0, 2)).sqrt().clamp_min(1e-12).repeat_interleave(3)  # radians, lengths
+    found = _predicted(names, rows / sizes, torch.zeros(6), views)
+    return {name: (row * sizes).tolist() for name, row in found.items()}
+
+
+def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterable[str]) -> dict[str, Tensor]:
+    """Return values by view: its own, or the mean of its neighbours'.
+
+    Args:
+        names: of the training views, sorted.
+        values: (v, ...) theirs.
+        neutral: value of a view that needs none.
+        views: names of views.
+
+    Returns:
+        Empty if there are views that are not among the names, and neighbours tell nothing about those.
+    """
+    wanted = list(views)
+    if unknown := [name for name in wanted if name not in names]:
+        if len(names) < 3:
+            return {}
+        middle = values[1:-1]
+        by_neighbours = (middle - (values[:-2] + values[2:]) / 2).square().sum()
+        if by_neighbours > LARGEST_ERROR * (middle - neutral).square().sum():
+            return {}
+    found = {name: values[names.index(name)] for name in wanted if name in names}
+    for name in unknown:
+        place = bisect(names, name)
+        found[name] = values[max(place - 1, 0) : place + 1].mean(dim=0)
+    return found
