@@ -15,7 +15,7 @@ import logging
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.script import Script
+from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import Hierarchy
 
 if TYPE_CHECKING:
     import torch
@@ -67,16 +68,6 @@ GROUPS = {
     "rotation": "_rotation",
 }
 """The same attributes by the names of their parameter groups in the family's optimizers."""
-
-ROLES = {
-    "dataset": ("source_path",),
-    "opt": ("iterations", "densify_until_iter", "position_lr_init"),
-    "pipe": ("convert_SHs_python", "compute_cov3D_python", "debug"),
-}
-"""Arguments of `training` by role, each with attributes of which it has one; the first such argument has the role."""
-
-CHECKPOINTS = ("checkpoint", "start_checkpoint")
-"""Parameters of `training` for a checkpoint to start from."""
 
 FLAT_AXES = 2
 """Number of scales of flat Gaussians."""
@@ -143,104 +134,6 @@ class BackboneInfo:
     def is_fork_of(self, other: BackboneInfo) -> bool:
         """Return whether a checkout that both recognise is this one's."""
         return other.name in self.fork_of or set(other.files) < set(self.files)
-
-
-@dataclass(frozen=True)
-class TrainingCall:
-    """Hold a call of the script's `training` with its arguments by parameter name.
-
-    Attributes:
-        function: the script's `training`.
-        values: its arguments.
-        roles: parameter of each role of `ROLES` that some argument has.
-    """
-
-    function: Callable[..., Any]
-    values: Mapping[str, Any]
-    roles: Mapping[str, str]
-
-    @classmethod
-    def bind(cls, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> TrainingCall:
-        """Return the call `function(*args, **kwargs)`, defaults included.
-
-        Raises:
-            UserInputError: no argument says which scene, or for how many iterations.
-        """
-        bound = inspect.signature(function).bind(*args, **kwargs)
-        bound.apply_defaults()
-        values = dict(bound.arguments)
-        found = {
-            role: next((name for name, value in values.items() if any(hasattr(value, a) for a in attributes)), None)
-            for role, attributes in ROLES.items()
-        }
-        for role in ("dataset", "opt"):
-            if found[role] is None:
-                raise UserInputError(
-                    f"{function.__name__}({', '.join(values)}) of the script got no argument with "
-                    f"{ROLES[role][0]}, expected one as {role} has in 3DGS; `lapgs run --off` runs the script as it is"
-                )
-        return cls(function, values, {role: name for role, name in found.items() if name is not None})
-
-    @property
-    def dataset(self) -> Any:
-        return self.values[self.roles["dataset"]]
-
-    @property
-    def opt(self) -> Any:
-        return self.values[self.roles["opt"]]
-
-    @property
-    def pipe(self) -> Any:
-        """Options of the pipeline, without attributes if the script has none."""
-        return self.values[self.roles["pipe"]] if "pipe" in self.roles else SimpleNamespace()
-
-    @property
-    def checkpoint(self) -> Any:
-        """Checkpoint to start from, if the script takes one."""
-        return next((self.values[name] for name in CHECKPOINTS if name in self.values), None)
-
-    @property
-    def white_background(self) -> bool:
-        return bool(getattr(self.dataset, "white_background", False))
-
-    def changed(self, **values: Any) -> TrainingCall:
-        """Return the call with other values of some arguments, by role or parameter; absent ones are left out."""
-        named = {self.roles.get(name, name): value for name, value in values.items()}
-        known = {name: value for name, value in named.items() if name in self.values}
-        return replace(self, values={**self.values, **known})
-
-    def run(self) -> None:
-        """Make the call."""
-        self.function(**self.values)
-
-
-@dataclass(frozen=True)
-class StageWindow:
-    """Place a stage in the whole run.
-
-    Attributes:
-        stage: the stage.
-        start: number of iterations before it.
-        total: number of iterations of the whole run, as the user asked for.
-        levels: number of levels of the whole run.
-        residual_color_rate: factor on the SH learning rates of residual stages.
-        threshold_factor: factor on densification thresholds in this stage.
-    """
-
-    stage: Stage
-    start: int
-    total: int
-    levels: int
-    residual_color_rate: float
-    threshold_factor: float
-
-    def scaled(self, iterations: int) -> int:
-        """Return a number of iterations of the whole run's schedule as the same share of this stage."""
-        return round(iterations * self.stage.iterations / self.total)
-
-    def local(self, iterations: Iterable[int]) -> list[int]:
-        """Return the iterations of the whole run that fall into this stage, counted from its beginning."""
-        return [i - self.start for i in iterations if self.start < i <= self.start + self.stage.iterations]
 
 
 class BackboneAdapter(ABC):

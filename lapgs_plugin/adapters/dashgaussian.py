@@ -11,8 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 SCHEDULER = "utils.schedule_utils"
 """Module of its scheduler, which only `train_dash.py` imports."""

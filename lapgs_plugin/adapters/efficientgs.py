@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 SIMPLIFICATIONS = ("simp_iteration1", "simp_iteration2")
 """Arguments of its script: the iterations after which it simplifies."""

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, TrainingCall, logits_of
+from lapgs_plugin.adapters.base import BackboneInfo, logits_of
+from lapgs_plugin.checkouts.training_call import TrainingCall
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField

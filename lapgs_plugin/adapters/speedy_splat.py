@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, StageWindow
+from lapgs_plugin.adapters.base import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.training_call import StageWindow
 
 
 class Adapter(generic.Adapter):

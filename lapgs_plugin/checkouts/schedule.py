@@ -15,7 +15,9 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any, Protocol, cast
+from typing import Any, cast
+
+from lapgs_plugin.checkouts.training_call import StageWindow
 
 RARE = 10
 """An iteration after 1/RARE of a run is late, and an event whose period is at least that is rare. Earlier iterations
@@ -41,17 +43,6 @@ FLIPPED = {ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE}
 FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
 
 Place = tuple[int, int, int | None, int | None]
-
-
-class Window(Protocol):
-    """Place a stage in a run: `adapters.base.StageWindow`."""
-
-    @property
-    def total(self) -> int:
-        """Iterations of the whole run."""
-
-    def scaled(self, iterations: int, /) -> int:
-        """Return iterations of the whole run as the same share of the stage."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +184,7 @@ class Schedule:
         return [event.describe(known) for event in self.events if event.matters and not event.never(known)]
 
     def for_stage(
-        self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: Window, keep: Collection[str] = ()
+        self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: StageWindow, keep: Collection[str] = ()
     ) -> StageSchedule:
         """Return what changes in a stage of its own length.
 

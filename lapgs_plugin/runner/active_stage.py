@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun

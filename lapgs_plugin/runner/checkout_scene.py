@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 
 

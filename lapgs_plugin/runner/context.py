@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.level_views import SceneImages
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath

@@ -26,10 +26,11 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import BackboneAdapter, StageWindow, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath

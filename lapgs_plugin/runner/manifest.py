@@ -7,7 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS

@@ -19,8 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import BackboneAdapter, TrainingCall
+from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement, of_class
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors

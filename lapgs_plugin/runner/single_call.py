@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import CHECKPOINTS
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
+from lapgs_plugin.checkouts.training_call import CHECKPOINTS
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage

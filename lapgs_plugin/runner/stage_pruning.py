@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import TrainingCall
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.rasterizers.signed_color import ColorPath

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.adapters.base import StageWindow
+from lapgs_plugin.checkouts.training_call import StageWindow
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import RunContext, StageResult
 from lapgs_plugin.runs.archive import RunArchive

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import TrainingCall
 from lapgs_plugin.checkouts.level_views import PrefetchingViews
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.checkouts.schedule import Schedule
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import PRESETS
 from lapgs_plugin.hierarchy.plan import StagePlan

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import typer
 
-from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage

@@ -13,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.adapters.base import StageWindow, TrainingCall
 from lapgs_plugin.adapters.registry import recognise
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.run import run_renderer, run_scene

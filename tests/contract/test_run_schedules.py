@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.adapters.base import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from tests.contract.stub_runs import CHECKOUTS, KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_residuals
