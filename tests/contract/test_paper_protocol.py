@@ -94,9 +94,7 @@ def test_every_stage_resets_prunes_late_and_starts_as_in_the_release(scene: Path
     assert (paper.residual_resets, paper.joint_share, paper.prune) == (True, 0.0, 0.0)
     assert (paper.inherit_mode, paper.inherit_ratio) == ("xyz", 1.0)  # --inherit_state only_xyz --inherit_ratio 1.0
     with loaded(STUBS["fastgs"], scene, tmp_path) as adapter:
-        tree = adapter.script.function("training")
-        assert tree is not None
-        schedule, call = Schedule(tree), published_call("fastgs", adapter)
+        schedule, call = Schedule(adapter.profile.source.training), published_call("fastgs", adapter)
     for stage, due in zip(
         StagePlan.create((1600, 1066), TOTAL, 2, paper.shares, paper.kind), LATE_PRUNING, strict=True
     ):
