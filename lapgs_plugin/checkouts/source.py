@@ -6,6 +6,7 @@ Nothing is executed, so a checkout can be described before its packages are inst
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,9 @@ from lapgs_plugin.errors import UserInputError
 
 MODEL_ROLES = ("get_xyz", "training_setup")
 """Methods by which the class of the Gaussians is recognised."""
+
+SCALES = re.compile(r"\w*scal.*\.repeat\(1, ([0-9])\).*", re.DOTALL)
+"""Statement by which models of the family give a point one scale along each of its axes."""
 
 FOLDERS_UP = 3
 """How far above a script the root of its checkout is searched."""
@@ -105,6 +109,17 @@ class CheckoutSource:
     def place(self, node: ast.AST) -> str:
         """Return the file and line of a node of the script."""
         return f"{self.script.relative_to(self.root)}:{getattr(node, 'lineno', 0)}"
+
+    @property
+    def scale_axes(self) -> tuple[int, str] | None:
+        """Number of scales that the model gives each point, and the place where; None if its sources do not say."""
+        for path in self.modules.values():
+            classes = (node for node in parsed_quietly(path).body if isinstance(node, ast.ClassDef))
+            models = (node for node in classes if node.name == self.model[0])
+            for node in (each for model in models for each in ast.walk(model) if isinstance(each, ast.Assign)):
+                if found := SCALES.fullmatch(ast.unparse(node)):
+                    return int(found[1]), place(path, self.root, node.lineno)
+        return None
 
     @property
     def rasterizer_modules(self) -> tuple[str, ...]:

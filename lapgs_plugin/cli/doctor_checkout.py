@@ -131,6 +131,9 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
         taken[use.module] |= use.inputs & COLORS
     more = "the dry run of `lapgs run` says more"
     nested = Finding("nested", "ok", f"one call of the checkout's own training; {more}")
+    axes = source.scale_axes
+    if axes is not None and axes[0] != 3:
+        return [nested, Finding("laplacian", "absent", f"residuals need three scale axes; {axes[1]} makes {axes[0]}")]
     blind = [module for module, inputs in taken.items() if not inputs]
     if len(blind) < len(taken):
         takes = " and ".join(sorted(set[str]().union(*taken.values())))

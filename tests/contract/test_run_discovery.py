@@ -147,6 +147,22 @@ def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[s
     assert "iteration == args.ho_iteration (modify_functions)" in text, "what the loop does by iteration"
 
 
+def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As 2DGS has."""
+    lapgs("doctor", fork)
+    assert "scale axes" not in capsys.readouterr().out
+    model = fork / "scene" / "gaussian_model.py"
+    lines = model.read_text(encoding="utf-8").splitlines()
+    lines += [
+        "",
+        "    def create_from_pcd(self, pcd, *others):",
+        "        scales = self.distances(pcd)[..., None].repeat(1, 2)",
+    ]
+    model.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lapgs("doctor", fork)
+    assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
+
+
 def test_doctor_says_which_training_scripts_there_are(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As Mini-Splatting has `gs/train.py` and `ms/train.py`, DashGaussian `train.py` and `train_dash.py`."""
     shutil.copytree(fork / "scripts", fork / "more")
