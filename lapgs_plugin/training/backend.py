@@ -60,7 +60,6 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
     made = make_rasterizer(name)
     asked = {
-        f"--strategy {settings.densification.strategy}": settings.densification.options.needs_gsplat,
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,

@@ -1,12 +1,11 @@
-"""Density control by gsplat's strategies: the 3DGS heuristics, and MCMC."""
+"""What density control does, and 3DGS's heuristics by gsplat."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import torch
-from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
@@ -16,13 +15,10 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.strategies import Default, Mcmc
+from lapgs_plugin.training.strategies import Gradients
 
 if TYPE_CHECKING:
     from lapgs_plugin.training.multiview import ViewScores
-
-MCMC_SCALE, MCMC_OPACITY = 0.1, 0.5
-"""Factor on the sizes, and opacity, of a base field that starts from points: as MCMC's authors start it."""
 
 
 class DensityControl:
@@ -96,7 +92,7 @@ class Densifier(DensityControl):
         extent: scene extent in world units, which decides between cloning and splitting.
     """
 
-    def __init__(self, schedule: StageSchedule, options: Default, extent: float) -> None:
+    def __init__(self, schedule: StageSchedule, options: Gradients, extent: float) -> None:
         super().__init__(options.opacity_weight, options.scale_weight)
         self._schedule = schedule
         self._strategy = DefaultStrategy(
@@ -167,48 +163,3 @@ class Densifier(DensityControl):
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:
         reset_opa(model.params, model.optimizers, self.state, value=highest)
-
-
-class McmcDensifier(DensityControl):
-    """Edit the field with gsplat's `MCMCStrategy` (Kheradmand et al. 2024), which runs on a GPU only.
-
-    Gaussians that have become transparent are moved to opaque ones, 5 % are added at a time up to `cap_max`, and
-    positions get noise in every iteration. Opacities are never reset.
-
-    Args:
-        schedule: when the stage adds and moves.
-        options: the limit.
-    """
-
-    def __init__(self, schedule: StageSchedule, options: Mcmc) -> None:
-        super().__init__(options.opacity_weight, options.scale_weight)
-        self._schedule = schedule
-        self._strategy = MCMCStrategy(
-            cap_max=options.cap_max,
-            refine_start_iter=schedule.densify_start,
-            refine_stop_iter=schedule.densify_until,
-            refine_every=schedule.densify_every,
-        )
-        self.state = self._strategy.initialize_state()
-
-    def after_step(
-        self,
-        model: TrainableField,
-        iteration: int,
-        result: RenderResult | None,
-        camera: Camera,
-        scores: ViewScores | None = None,
-    ) -> bool:
-        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
-        self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, {}, lr=rate)
-        return iteration < self._schedule.densify_until and self._schedule.refines(iteration)
-
-
-def mcmc_start(field: GaussianField) -> GaussianField:
-    """Return a field from points with the sizes and opacities that MCMC's authors start with."""
-    return field.with_parameters(
-        {
-            "log_scales": field.log_scales + math.log(MCMC_SCALE),
-            "opacity_logits": torch.full_like(field.opacity_logits, math.log(MCMC_OPACITY / (1 - MCMC_OPACITY))),
-        }
-    )

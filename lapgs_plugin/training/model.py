@@ -164,6 +164,34 @@ class TrainableField:
         assert gradient is not None, "no backward pass since the last step"
         return gradient != 0
 
+    @torch.no_grad()
+    def overwrite(self, rows: Tensor, source: Tensor) -> None:
+        """Make Gaussians `rows` (k,) copies of Gaussians `source` (k,). They keep their moments."""
+        for param in self.params.values():
+            param[rows] = param[source]
+
+    @torch.no_grad()
+    def append(self, source: Tensor) -> None:
+        """Add copies of Gaussians `source` (k,), without moments."""
+        for name, optimizer in self.optimizers.items():
+            param = self.params[name]
+            grown = torch.nn.Parameter(torch.cat([param, param[source]]))
+            state = optimizer.state.pop(param, {})
+            optimizer.state[grown] = {
+                key: value if key == "step" else torch.cat([value, value.new_zeros(len(source), *value.shape[1:])])
+                for key, value in state.items()
+            }
+            optimizer.param_groups[0]["params"] = [grown]
+            self.params[name] = grown
+
+    @torch.no_grad()
+    def forget_moments(self, rows: Tensor) -> None:
+        """Set Adam's moments of Gaussians `rows` (k,) to zero."""
+        for name, optimizer in self.optimizers.items():
+            for key, value in optimizer.state.get(self.params[name], {}).items():
+                if key != "step":
+                    value[rows] = 0
+
     def optimizer_moments(self) -> dict[str, dict[str, Tensor]]:
         """Return Adam's state of every parameter by its name: step and both moments."""
         return {name: dict(opt.state[self.params[name]]) for name, opt in self.optimizers.items()}

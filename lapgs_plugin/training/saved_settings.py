@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.training.settings import IN_MANIFEST, LAST, OFF, TrainSettings
-from lapgs_plugin.training.strategies import DEFAULT, STRATEGIES
+from lapgs_plugin.training.strategies import GRADIENTS, STRATEGIES
 from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked
 
 if sys.version_info >= (3, 12):
@@ -87,7 +87,9 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
         values["split"] = ",".join(values["split"])
     elif values["split"] is None and "cache" in given and values["levels"] == 2:
         values["split"] = "1/2,1/2"  # the default then, of residuals too
-    strategy = STRATEGIES[str(density.get("strategy", DEFAULT))]
+    if density.get("strategy", "default") == "default":  # its name once
+        density["strategy"] = GRADIENTS
+    strategy = STRATEGIES[density["strategy"]]
     options = density.pop("options", None)
     if options is None:  # older runs list those of all strategies beside the rest
         every = {each.name for name in ("multiview", "mcmc") for each in fields(STRATEGIES[name])}

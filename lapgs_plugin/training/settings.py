@@ -13,7 +13,17 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.options import check_bounds, option, option_name, options_of
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
-from lapgs_plugin.training.strategies import DEFAULT, PANEL, STRATEGIES, Strategy, require_positive
+from lapgs_plugin.training.strategies import (
+    GRADIENTS,
+    LONG_RUN,
+    MCMC,
+    PANEL,
+    STRATEGIES,
+    Auto,
+    StagePart,
+    Strategy,
+    require_positive,
+)
 from lapgs_plugin.untrusted import STRICT
 
 SH_RATE_VIEWS, MOST_SH_RATE = 32, 8.0
@@ -80,8 +90,8 @@ class Densification:
     )
     until: int | None = option(
         None,
-        "Last densification, of the whole run; stages scale it. Default: 15000 of 30000, and 25000 with --strategy "
-        "mcmc.",
+        "Last densification, of the whole run; stages scale it. Default: 25000 of 30000 with --strategy mcmc, else "
+        "15000.",
         panel=PANEL,
         names=("--densify-until",),
         least=0,
@@ -96,14 +106,15 @@ class Densification:
     reset_every: int | None = option(
         None,
         "Iterations between two resets of all opacities, in every stage; 0 never resets. Default: 3000 of 30000, in "
-        "the coarsest level alone.",
+        "the coarsest level alone; never with --strategy mcmc.",
         panel=PANEL,
         names=("--opacity-reset-every",),
     )
     strategy: str = option(
-        DEFAULT,
-        "default (3DGS's heuristics), mcmc (Kheradmand et al. 2024), multiview (only where several views have large "
-        "errors), or one that another package brings.",
+        AUTO,
+        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (its heuristics), multiview (those, "
+        "only where several views have large errors), or one that another package brings. auto: mcmc from "
+        f"{LONG_RUN} iterations on, else 3dgs.",
         panel=PANEL,
     )
     options: Strategy = options_of(STRATEGIES, "strategy")  # noqa: RUF009  # a field, made by `dataclasses.field`
@@ -193,6 +204,7 @@ class TrainSettings(HierarchySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_bounds(self)
+        self._choose_strategy()
         self.learning_rates.check()
         self.densification.check()
         if not 0 <= self.sh_degree <= 3:
@@ -211,6 +223,22 @@ class TrainSettings(HierarchySettings):
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+
+    def _choose_strategy(self) -> None:
+        """Replace the strategy auto by the one that it means here.
+
+        Raises:
+            UserInputError: another one than 3DGS's with the paper's settings.
+        """
+        density, paper = self.densification, self.protocol == "paper"
+        if isinstance(density.options, Auto):
+            name = density.options.choose(self.scheduled, paper or bool(self._idle(STRATEGIES[MCMC])))
+            chosen = replace(density, strategy=name, options=density.options.options_for(name))
+            object.__setattr__(self, "densification", chosen)  # the dataclass is frozen
+        elif paper and density.strategy != GRADIENTS:
+            raise UserInputError(
+                f"--strategy {density.strategy} with --protocol paper: the paper has {GRADIENTS}; leave one out"
+            )
 
     def _check_base(self) -> None:
         """Refuse settings of a base if there is none, or if the next level inherits all of its coefficients."""
@@ -248,14 +276,20 @@ class TrainSettings(HierarchySettings):
     def _check_unused(self) -> None:
         """Refuse settings that have no effect with the strategy."""
         density = self.densification
-        idle = [
+        if idle := self._idle(density.options):
+            raise UserInputError(
+                f"{', '.join(idle)} with --strategy {density.strategy}: no effect there; leave it out, or add "
+                f"--strategy {GRADIENTS}"
+            )
+
+    def _idle(self, strategy: Strategy) -> list[str]:
+        """Return the options that were given and have no effect with a strategy."""
+        return [
             option_name(each)
-            for owner in (self, density)
+            for owner in (self, self.densification)
             for each in fields(owner)
-            if each.name in density.options.unused and getattr(owner, each.name) not in (each.default, 0)
+            if each.name in strategy.unused and getattr(owner, each.name) not in (each.default, 0)
         ]
-        if idle:
-            raise UserInputError(f"{', '.join(idle)} with --strategy {density.strategy}: no effect there; leave it out")
 
     @property
     def scheduled(self) -> int:
@@ -286,9 +320,10 @@ class TrainSettings(HierarchySettings):
         """Settings of the rasterizer that change images, for the manifest."""
         return {ANTIALIASING: True} if self.antialiased else {}
 
-    def strategy_of(self, stage: Stage) -> Strategy:
-        """Return the strategy of density control with the options of a stage."""
-        return self.densification.options.of_stage(self.threshold_factor(stage), self._is_base(stage))
+    def strategy_of(self, stage: Stage, pixels: int) -> Strategy:
+        """Return the strategy of density control with the options of a stage and the pixels of its training images."""
+        part = StagePart(self.threshold_factor(stage), pixels, base=self._is_base(stage), finest=stage.level == 0)
+        return self.densification.options.of_stage(part)
 
     def sh_rate_factor_of(self, stage: Stage, training_views: int) -> float:
         """Return the factor on the rate of SH above degree 0 that a stage starts with."""

@@ -7,7 +7,7 @@ Each strategy here says what differs between strategies in the rest of training;
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
@@ -28,6 +28,29 @@ GROW_THRESHOLD = 2e-4
 ABSGRAD_THRESHOLD = 8e-4
 """Default threshold on absolute gradients, which do not cancel and are larger: gsplat's recommendation."""
 
+PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
+"""Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
+LONG_RUN = 7_000
+"""Iterations from which MCMC is better than 3DGS's heuristics: it starts from tiny Gaussians, and short runs end before
+they have grown."""
+
+
+@dataclass(frozen=True)
+class StagePart:
+    """Describe the part of a run that one stage is.
+
+    Attributes:
+        threshold_factor: on densification thresholds.
+        pixels: of all training images of its level together.
+        base: whether it is the coarsest of several levels.
+        finest: whether it trains at full size.
+    """
+
+    threshold_factor: float = 1.0
+    pixels: int = 1
+    base: bool = False
+    finest: bool = True
+
 
 @dataclass(frozen=True)
 class Strategy:
@@ -38,13 +61,11 @@ class Strategy:
 
     Attributes:
         densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
-        needs_gsplat: whether only gsplat on a GPU can train with it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
     densify_until: ClassVar[int] = 15_000
-    needs_gsplat: ClassVar[bool] = False
     unused: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -56,13 +77,8 @@ class Strategy:
         """Raise a UserInputError about an option that is out of range."""
         check_bounds(self)
 
-    def of_stage(self, threshold_factor: float, base: bool) -> Self:
-        """Return the options of one stage.
-
-        Args:
-            threshold_factor: on densification thresholds in this stage.
-            base: whether it is the coarsest of several levels.
-        """
+    def of_stage(self, part: StagePart) -> Self:
+        """Return the options of one stage."""
         return self
 
     def start(self, field: GaussianField) -> GaussianField:
@@ -88,14 +104,14 @@ class Regularized(Strategy):
     opacity_regularization: float | None = option(
         None,
         "Weight of the mean opacity in the loss; it makes Gaussians that are not needed transparent, and fewer. "
-        "Default: 0, and 0.01 with --strategy mcmc.",
+        "Default: 0.01 with --strategy mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )
     scale_regularization: float | None = option(
         None,
-        "Weight of the mean standard deviation of Gaussians in the loss, in world units. Default: 0, and 0.01 with "
-        "--strategy mcmc.",
+        "Weight of the mean standard deviation of Gaussians in the loss, in world units. Default: 0.01 with --strategy "
+        "mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )
@@ -112,7 +128,7 @@ class Regularized(Strategy):
 
 
 @dataclass(frozen=True)
-class Default(Regularized):
+class Gradients(Regularized):
     """Clone and split by screen-space gradients, prune by opacity and size: 3DGS's heuristics, by gsplat."""
 
     grow_grad2d: float | None = option(
@@ -133,9 +149,9 @@ class Default(Regularized):
         if self.grow_grad2d is not None:
             require_positive("--densify-threshold", self.grow_grad2d, "gradient")
 
-    def of_stage(self, threshold_factor: float, base: bool) -> Self:
+    def of_stage(self, part: StagePart) -> Self:
         whole = self.grow_grad2d or (ABSGRAD_THRESHOLD if self.absgrad else GROW_THRESHOLD)
-        return replace(self, grow_grad2d=whole * threshold_factor)
+        return replace(self, grow_grad2d=whole * part.threshold_factor)
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
         from lapgs_plugin.training.densification import Densifier
@@ -144,7 +160,7 @@ class Default(Regularized):
 
 
 @dataclass(frozen=True)
-class Multiview(Default):
+class Multiview(Gradients):
     """Clone and split only where several views have large errors: the idea of FastGS (Ren et al. 2025)."""
 
     split_absgrad2d: float = option(
@@ -178,9 +194,9 @@ class Multiview(Default):
         if self.absgrad:
             raise UserInputError("--absgrad with --strategy multiview: it splits by absolute gradients anyway")
 
-    def of_stage(self, threshold_factor: float, base: bool) -> Self:
-        split = self.split_absgrad2d * threshold_factor
-        return replace(super().of_stage(threshold_factor, base), split_absgrad2d=split)
+    def of_stage(self, part: StagePart) -> Self:
+        split = self.split_absgrad2d * part.threshold_factor
+        return replace(super().of_stage(part), split_absgrad2d=split)
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
         from lapgs_plugin.training.multiview import MultiviewDensifier
@@ -190,30 +206,68 @@ class Multiview(Default):
 
 @dataclass(frozen=True)
 class Mcmc(Regularized):
-    """Move transparent Gaussians to opaque ones and add some up to a limit (Kheradmand et al. 2024), by gsplat."""
+    """Move transparent Gaussians to opaque ones and add some up to a limit (Kheradmand et al. 2024)."""
 
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
-    needs_gsplat: ClassVar[bool] = True
     unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
 
-    cap_max: int = option(1_000_000, "Most Gaussians of a level, for --strategy mcmc.", panel=PANEL, least=1)
+    cap_max: int | None = option(
+        None,
+        f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
+        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}.",
+        panel=PANEL,
+        least=1,
+    )
     base_cap_max: int | None = option(
-        None, "Most Gaussians of the coarsest level, for --strategy mcmc. Default: --cap-max.", panel=PANEL, least=1
+        None, "Most Gaussians of the coarsest level, for --strategy mcmc. Default: as all levels.", panel=PANEL, least=1
     )
 
-    def of_stage(self, threshold_factor: float, base: bool) -> Self:
-        return replace(self, cap_max=self.base_cap_max) if base and self.base_cap_max is not None else self
+    def of_stage(self, part: StagePart) -> Self:
+        own = self.base_cap_max if part.base and self.base_cap_max is not None else self.cap_max
+        most = MOST_GAUSSIANS if part.finest else MOST_GAUSSIANS // 2
+        return replace(self, cap_max=own or max(1, min(most, part.pixels // PIXELS_A_GAUSSIAN)))
 
     def start(self, field: GaussianField) -> GaussianField:
-        from lapgs_plugin.training.densification import mcmc_start
+        from lapgs_plugin.training.mcmc import mcmc_start
 
         return mcmc_start(field)
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
-        from lapgs_plugin.training.densification import McmcDensifier
+        from lapgs_plugin.training.mcmc import McmcDensifier
 
         return McmcDensifier(schedule, self)
+
+
+@dataclass(frozen=True)
+class Auto(Mcmc, Gradients):
+    """Choose between MCMC and 3DGS's heuristics by the length of a run, and by options that only one of them has."""
+
+    def choose(self, iterations: int, heuristics: bool) -> str:
+        """Return the name of the strategy to train with.
+
+        Args:
+            iterations: of the run.
+            heuristics: whether its settings need those of 3DGS.
+
+        Raises:
+            UserInputError: options of both were given.
+        """
+        limits = [name for name in ("cap_max", "base_cap_max") if getattr(self, name) is not None]
+        thresholds = [name for name in ("grow_grad2d", "absgrad") if getattr(self, name) not in (None, False)]
+        if limits and (thresholds or heuristics):
+            raise UserInputError(
+                f"--{limits[0].replace('_', '-')} is an option of --strategy {MCMC}, which does not take "
+                f"{'--densify-threshold or --absgrad' if thresholds else 'other settings given'}; leave one out"
+            )
+        if thresholds or heuristics:
+            return GRADIENTS
+        return MCMC if limits or iterations >= LONG_RUN else GRADIENTS
+
+    def options_for(self, name: str) -> Strategy:
+        """Return those options that a strategy has."""
+        kind = type(STRATEGIES[name])
+        return kind(**{each.name: getattr(self, each.name) for each in fields(kind)})
 
 
 def require_positive(name: str, value: float, kind: str) -> None:
@@ -222,11 +276,11 @@ def require_positive(name: str, value: float, kind: str) -> None:
         raise UserInputError(f"{name} {value}: expected a positive {kind}")
 
 
-DEFAULT = "default"
+AUTO, MCMC, GRADIENTS = "auto", "mcmc", "3dgs"
 STRATEGIES: Registry[Strategy] = Registry(
     "--strategy",
     "lapgs_plugin.strategies",
     Strategy,
-    {DEFAULT: Default(), "mcmc": Mcmc(), "multiview": Multiview()},
+    {AUTO: Auto(), MCMC: Mcmc(), GRADIENTS: Gradients(), "multiview": Multiview()},
 )
 """Strategies by name. Other packages add instances of `Strategy` as entry points of this group."""

@@ -245,6 +245,8 @@ class Trainer:
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         context, before = self._context, self._context.record_to_extend(stage)
+        views = level_views(context.scene.train, stage.level)
+        pixels = sum(view.camera.width * view.camera.height for view in views)
         breakdown, poses = self._breakdown(before, checkpoint), first_poses(context, stage)
 
         def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
@@ -256,14 +258,14 @@ class Trainer:
             stage=replace(stage, iterations=schedule.end),
             schedule=schedule,
             settings=self.settings,
-            views=level_views(context.scene.train, stage.level),
+            views=views,
             images=images.targets,
             background=torch.zeros(3, device=self.device) if stage.signed else context.background,
             extent=context.scene.extent,
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=self.settings.strategy_of(stage).density_control(schedule, context.scene.extent),
+            densifier=self.settings.strategy_of(stage, pixels).density_control(schedule, context.scene.extent),
             coarser=CoarserLevels(
                 images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
             ),

@@ -85,14 +85,16 @@ def test_a_strategy_of_another_package_trains_with_its_options(installed: Path, 
     words = ("train", scene, "-o", run, "--iterations", "40", "--levels", "1", "--densify-every", "10")
     refused = lapgs(installed, *words, "--copies", "7")
     assert refused.returncode == 2
-    assert "--copies 7 with --strategy default: an option of --strategy copying; leave it out" in refused.stderr
+    assert "--copies 7 with --strategy auto: an option of --strategy copying; leave it out" in refused.stderr
     done = lapgs(installed, *words, "--strategy", "copying", "--copies", "7")
     assert done.returncode == 0, done.stderr
     manifest = RunArchive.open(run).manifest
     assert manifest.record(0).num_gaussians == 100 + 3 * 7, "100 to start with; 7 more after 10, 20 and 30 iterations"
     density = json.loads((run / "manifest.json").read_text())["settings"]["densification"]
     assert (density["strategy"], density["options"]) == ("copying", {"copies": 7})
-    with pytest.raises(RunFolderError, match="--strategy copying: expected default, mcmc, multiview; install the pack"):
+    with pytest.raises(
+        RunFolderError, match="--strategy copying: expected auto, mcmc, 3dgs, multiview; install the pack"
+    ):
         settings_from_manifest(manifest)
 
 

@@ -16,7 +16,7 @@ from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.strategies import Default, Mcmc, Multiview, Regularized
+from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview, Regularized, StagePart
 from tests.training_scene import blob_field, ring_camera
 
 EXTENT = 2.0
@@ -43,7 +43,7 @@ def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)
     fields = [TrainableField.create(blob_field(200), settings.learning_rates, EXTENT) for _ in range(2)]
-    ours = Densifier(schedule, Default(grow_grad2d=2e-4, absgrad=absgrad), EXTENT)
+    ours = Densifier(schedule, Gradients(grow_grad2d=2e-4, absgrad=absgrad), EXTENT)
     theirs = DefaultStrategy(
         refine_start_iter=2, refine_stop_iter=60, refine_every=10, reset_every=1000, absgrad=absgrad
     )
@@ -70,8 +70,8 @@ def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
 @pytest.mark.parametrize(
     ("options", "opacity", "scale"),
     [
-        (Default(), 0.0, 0.0),
-        (Default(opacity_regularization=0.02), 0.02, 0.0),
+        (Gradients(), 0.0, 0.0),
+        (Gradients(opacity_regularization=0.02), 0.02, 0.0),
         (Multiview(scale_regularization=0.5), 0.0, 0.5),
         (Mcmc(), 0.01, 0.01),
         (Mcmc(opacity_regularization=0.0), 0.0, 0.01),
@@ -82,7 +82,7 @@ def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, o
     field.opacity_logits.requires_grad_()
     settings = TrainSettings(iterations=100)
     (stage,) = StagePlan.create((64, 48), 100, 1)
-    control = options.of_stage(1.0, base=False).density_control(StageSchedule.create(settings, stage), EXTENT)
+    control = options.of_stage(StagePart()).density_control(StageSchedule.create(settings, stage), EXTENT)
     term = control.regularization(field)
     if opacity == scale == 0.0:
         assert term is None

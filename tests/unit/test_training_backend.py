@@ -10,8 +10,6 @@ from typing import Any
 import gsplat
 import pytest
 import torch
-from gsplat.cuda import _torch_impl
-from gsplat.strategy import ops
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
@@ -28,13 +26,12 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-from lapgs_plugin.training.densification import mcmc_start
 from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
 from lapgs_plugin.training.planning import check_storage
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.strategies import Default, Mcmc
+from lapgs_plugin.training.strategies import Gradients, Mcmc
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import blob_field, ring_scene
 
@@ -112,7 +109,7 @@ def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
     older["densification"] = {"start": 3, "until": 45, "every": 5, "reset_every": 12, "grow_grad2d": 2e-4}
     found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": older}))
-    density = replace(SETTINGS.densification, options=Default(grow_grad2d=2e-4))  # as it was written then
+    density = replace(SETTINGS.densification, options=Gradients(grow_grad2d=2e-4))  # as it was written then
     assert found.for_manifest() == replace(SETTINGS, densification=density).for_manifest()
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
     found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
@@ -162,7 +159,9 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
     """They do not cancel, so more Gaussians are above the same threshold."""
     counts = []
     for absgrad in (False, True):
-        density = replace(SETTINGS.densification, reset_every=1000, options=Default(grow_grad2d=2e-4, absgrad=absgrad))
+        density = replace(
+            SETTINGS.densification, reset_every=1000, options=Gradients(grow_grad2d=2e-4, absgrad=absgrad)
+        )
         archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
         counts.append(archive.manifest.records[0].num_gaussians)
     assert counts[1] > counts[0]
@@ -329,44 +328,3 @@ def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
         else:
             torch.testing.assert_close(target, expected, rtol=0, atol=2.5e-4)
     stored.close()
-
-
-# ------------------------------------------------------------------------------------------------------------- MCMC
-
-
-def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    """Compute equation 9 of Kheradmand et al. 2024 term by term, as gsplat's CUDA kernel does."""
-    new_opacities = 1 - (1 - opacities) ** (1 / ratios)
-    denominators = torch.zeros_like(opacities)
-    for row, count in enumerate(ratios.tolist()):
-        for i in range(1, count + 1):
-            for k in range(i):
-                sign = (-1) ** k / math.sqrt(k + 1)
-                denominators[row] += math.comb(i - 1, k) * sign * new_opacities[row] ** (k + 1)
-    return new_opacities, scales * (opacities / denominators)[:, None]
-
-
-@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
-def test_mcmc_moves_adds_and_stays_under_its_limit(
-    hierarchy: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ops, "compute_relocation", relocated)
-
-    def covariances(quats: Tensor, scales: Tensor, **options: Any) -> tuple[Tensor, None]:
-        return _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], None
-
-    monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
-    density = Densification(start=3, until=55, every=5, strategy="mcmc", options=Mcmc(cap_max=120, base_cap_max=110))
-    settings = replace(SETTINGS, hierarchy=hierarchy, densification=density)
-    archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
-    assert [record.num_gaussians for record in archive.manifest.records] == [110, 120]
-    assert [record.signed for record in archive.manifest.records] == [False, hierarchy == "laplacian"]
-    first, last = (archive.history()[i]["loss"] for i in (0, -1))
-    assert last < first
-
-
-def test_mcmc_starts_small_and_half_opaque() -> None:
-    field = blob_field(5)
-    started = mcmc_start(field)
-    torch.testing.assert_close(started.log_scales.exp(), 0.1 * field.log_scales.exp())
-    torch.testing.assert_close(started.opacity_logits.sigmoid(), torch.full((5,), 0.5))

@@ -16,15 +16,23 @@ from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
-from lapgs_plugin.training.strategies import Default, Mcmc, Multiview
+from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview
 from lapgs_plugin.training.views import view_index
+
+
+def heuristics(**values: Any) -> TrainSettings:
+    """Return settings whose strategy, if none is given, is that of 3DGS."""
+    density = values.pop("densification", Densification())
+    if density.strategy == "auto":
+        density = replace(density, strategy="3dgs", options=None)
+    return TrainSettings(**values, densification=density)
 
 
 def schedules(**values: Any) -> list[StageSchedule]:
     """Return the schedules of a base and its residuals."""
     if values.get("levels", 2) == 2:
         values.setdefault("split", "1/2,1/2")
-    settings = TrainSettings(hierarchy="laplacian", **values)
+    settings = heuristics(hierarchy="laplacian", **values)
     plan = StagePlan.create((1600, 1066), settings.iterations, settings.levels, settings.shares, settings.kind)
     return [StageSchedule.create(settings, stage) for stage in plan]
 
@@ -122,7 +130,7 @@ def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
 
 
 @pytest.mark.parametrize("views", [2, 3, 8, 250])
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize("strategy", ["3dgs", "mcmc"])
 def test_steps_for_several_views_end_where_something_is_due(views: int, strategy: str) -> None:
     density = Densification(until=3333, every=70, reset_every=None if strategy == "mcmc" else 1100, strategy=strategy)
     settings = TrainSettings(iterations=6000, densification=density, gather=5)
@@ -134,7 +142,7 @@ def test_steps_for_several_views_end_where_something_is_due(views: int, strategy
     assert max(early) == views, "at 250 after densification alone"
     assert len(early) < 1.5 * 4500 / views or views > 70
     due = {*range(70, 3333, 70), 3332, 3333, 4500, 6000}
-    due |= {1100, 2200, 3300} if strategy == "default" else set()
+    due |= {1100, 2200, 3300} if strategy == "3dgs" else set()
     assert due <= set(stepping)
     assert all(length == 5 for end, length in zip(stepping, lengths, strict=True) if end > 4500)
     # A resumed run takes the steps that an uninterrupted one takes: they are a function of where one ended.
@@ -242,12 +250,14 @@ def test_thresholds_and_limits_of_stages() -> None:
     density = Densification(strategy="multiview")
     settings = TrainSettings(levels=3, hierarchy="laplacian", residual_threshold=1.5, densification=density)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
-    found: Any = [settings.strategy_of(stage) for stage in plan]
+    found: Any = [settings.strategy_of(stage, 10**9) for stage in plan]
     assert [one.grow_grad2d for one in found] == pytest.approx([2e-4, 3e-4, 3e-4])
     assert [one.split_absgrad2d for one in found] == pytest.approx([8e-4, 12e-4, 12e-4])
     mcmc = Densification(strategy="mcmc", options=Mcmc(cap_max=9, base_cap_max=5))
     capped = replace(settings, residual_threshold=1.0, densification=mcmc)
-    assert [capped.strategy_of(stage) for stage in plan] == [Mcmc(cap_max=cap, base_cap_max=5) for cap in (5, 9, 9)]
+    assert [capped.strategy_of(stage, 10**9) for stage in plan] == [
+        Mcmc(cap_max=cap, base_cap_max=5) for cap in (5, 9, 9)
+    ]
 
 
 def test_epochs_levels_and_seeds_differ_in_order() -> None:
@@ -276,7 +286,7 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             {"coarse_threshold": 2.0, "densification": Densification(reset_every=9, strategy="mcmc")},
             "--coarse-threshold, --opacity-reset-every with --strategy mcmc",
         ),
-        ({"densification": Densification(options=Mcmc(cap_max=7))}, "--strategy default with options of Mcmc"),
+        ({"densification": Densification(options=Mcmc(cap_max=7))}, "--strategy auto with options of Mcmc"),
         (
             {"densification": Densification(strategy="mcmc", options=Mcmc(cap_max=0))},
             "--cap-max 0: expected at least 1",
@@ -296,7 +306,7 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"hierarchy": "laplacian", "residual_threshold": 0.0}, "--residual-threshold 0"),
         ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
         (
-            {"densification": Densification(options=Default(grow_grad2d=-1.0))},
+            {"densification": Densification(strategy="3dgs", options=Gradients(grow_grad2d=-1.0))},
             "--densify-threshold -1.0: expected a positive gradient",
         ),
         ({"densification": Densification(base_share=1.5)}, "--base-densify-share 1.5: expected a share"),
@@ -321,13 +331,13 @@ def test_bad_settings_say_what_is_expected(values: dict[str, Any], message: str)
 
 def test_a_nested_field_keeps_its_sh_degree() -> None:
     stage = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)[0]
-    schedule = StageSchedule.create(TrainSettings(hierarchy="nested"), stage, before=1500)
+    schedule = StageSchedule.create(heuristics(hierarchy="nested"), stage, before=1500)
     assert [schedule.active_sh_degree(i) for i in (1, 499, 500, 1499, 1500)] == [1, 1, 2, 2, 3]
 
 
 @pytest.mark.parametrize(("given", "resets"), [(None, []), (4000, [4000, 8000, 12_000])])
 def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | None, resets: list[int]) -> None:
-    settings = TrainSettings(hierarchy="nested", densification=Densification(reset_every=given))
+    settings = heuristics(hierarchy="nested", densification=Densification(reset_every=given))
     base, finer = StagePlan.create((1600, 1066), 30_000, hierarchy=Hierarchy.NESTED)
     schedule = StageSchedule.create(settings, finer, before=base.iterations)
     assert [i for i in range(1, finer.iterations + 1) if i % schedule.reset_every == 0] == resets
@@ -337,7 +347,7 @@ def test_a_nested_field_keeps_its_opacities_unless_told_otherwise(given: int | N
 @pytest.mark.parametrize(("iterations", "until"), [(30_000, 5000), (20_000, 4000), (7000, 1750)])
 def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, until: int) -> None:
     base, finer = StagePlan.create((1600, 1066), iterations, hierarchy=Hierarchy.NESTED)
-    settings = TrainSettings(iterations=iterations, hierarchy="nested")
+    settings = heuristics(iterations=iterations, hierarchy="nested")
     assert StageSchedule.create(settings, base).densify_until == iterations // 4
     assert StageSchedule.create(settings, finer, before=base.iterations).densify_until == until
 
@@ -352,7 +362,7 @@ def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, u
     ],
 )
 def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
-    settings = TrainSettings(levels=3, hierarchy=hierarchy, coarse_threshold=given)
+    settings = heuristics(levels=3, hierarchy=hierarchy, coarse_threshold=given)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
-    found = [settings.strategy_of(stage).grow_grad2d for stage in plan]
+    found = [settings.strategy_of(stage, 10**9).grow_grad2d for stage in plan]
     assert found == pytest.approx([2e-4 * factor for factor in factors])

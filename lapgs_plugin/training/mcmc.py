@@ -1,0 +1,162 @@
+"""Density control as a Markov chain (Kheradmand et al. 2024): move Gaussians that have become transparent, add some up
+to a limit, and shake positions.
+
+In plain PyTorch, so that a CPU trains with it as well; gsplat has the same steps for CUDA alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.strategies import Mcmc
+
+if TYPE_CHECKING:
+    from lapgs_plugin.training.multiview import ViewScores
+
+START_SCALE, START_OPACITY = 0.1, 0.5
+"""Factor on the sizes, and opacity, of a field that starts from points."""
+DEAD_OPACITY = 0.005
+"""Gaussians with at most this opacity are moved."""
+MOST_COPIES = 51
+"""Gaussians that one Gaussian becomes at once, at most."""
+NOISE = 5e5
+"""Noise of positions, in units of their step size and of the Gaussian's covariance."""
+GROWTH, GROWTH_OF_STAGE, MOST_GROWTH = 1.05, 350.0, 1.5
+"""Factor on the number of Gaussians each time that some are added: MCMC's, or more in short stages, so that they grow
+as much as the stages of a run of 30,000 iterations."""
+SHARPNESS, FAINT = 100.0, 0.005
+"""Noise falls with the opacity as the sigmoid SHARPNESS (FAINT - opacity)."""
+SOLID = 0.1
+"""Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
+
+
+def mcmc_start(field: GaussianField) -> GaussianField:
+    """Return a field from points with the sizes and opacities that MCMC's authors start with."""
+    return field.with_parameters(
+        {
+            "log_scales": field.log_scales + math.log(START_SCALE),
+            "opacity_logits": torch.full_like(field.opacity_logits, math.log(START_OPACITY / (1 - START_OPACITY))),
+        }
+    )
+
+
+class McmcDensifier(DensityControl):
+    """Move and add Gaussians between iterations. Opacities are never reset.
+
+    Args:
+        schedule: when the stage adds and moves.
+        options: of the stage, with its limit.
+    """
+
+    def __init__(self, schedule: StageSchedule, options: Mcmc) -> None:
+        super().__init__(options.opacity_weight, options.scale_weight)
+        assert options.cap_max is not None, "`Mcmc.of_stage` sets it"
+        self._schedule, self._most = schedule, options.cap_max
+        times = (schedule.densify_until - schedule.densify_start) // schedule.densify_every
+        self._growth = min(max(GROWTH, GROWTH_OF_STAGE ** (1.0 / max(times, 1))), MOST_GROWTH)
+
+    @torch.no_grad()
+    def after_step(
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None = None,
+    ) -> bool:
+        refines = iteration < self._schedule.densify_until and self._schedule.refines(iteration)
+        if refines:
+            self._move_dead(model)
+            self._add(model)
+        rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
+        shake(model, NOISE * rate)
+        return refines
+
+    def _move_dead(self, model: TrainableField) -> None:
+        opacities = torch.sigmoid(model.params["opacities"])
+        dead = opacities <= DEAD_OPACITY
+        places = dead.nonzero()[:, 0]
+        if 0 < len(places) < len(dead):
+            chosen = _sample(torch.where(dead, 0.0, opacities), len(places))
+            model.forget_moments(_share(model, chosen))
+            # What is moved keeps its moments: it was visible a moment ago, and its first steps would be long without.
+            model.overwrite(places, chosen)
+
+    def _add(self, model: TrainableField) -> None:
+        count = min(self._most, int(self._growth * len(model))) - len(model)
+        if count > 0:
+            chosen = _sample(torch.sigmoid(model.params["opacities"]), count)
+            _share(model, chosen)
+            model.append(chosen)
+
+
+def _sample(weights: Tensor, count: int) -> Tensor:
+    """Draw `count` rows with replacement, each in proportion to its weight (n,) from 0."""
+    sums = weights.double().cumsum(0)  # `torch.multinomial` takes 2^24 weights at most
+    drawn = torch.rand(count, dtype=sums.dtype, device=sums.device) * sums[-1]
+    return torch.searchsorted(sums, drawn, right=True).clamp_max(len(weights) - 1)
+
+
+def _share(model: TrainableField, chosen: Tensor) -> Tensor:
+    """Give Gaussians the opacity and the size with which they and their copies, one for each time that `chosen` (k,)
+    names them, look as they did. Return their rows."""
+    opacities, log_scales = model.params["opacities"], model.params["scales"]
+    copies = torch.bincount(chosen)
+    rows = copies.nonzero()[:, 0]
+    each, factors = copies_of(torch.sigmoid(opacities[rows]), (copies[rows] + 1).clamp_max(MOST_COPIES))
+    opacities[rows] = torch.logit(each.clamp(DEAD_OPACITY, 1.0 - torch.finfo(each.dtype).eps))
+    log_scales[rows] += torch.log(factors)[:, None]
+    return rows
+
+
+def copies_of(opacities: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what equal Gaussians at one place need to look like a single one: equation 9 of Kheradmand et al. 2024.
+
+    Its double sum is simplified by the sum of binomial coefficients C(i - 1, k) over i, which is C(N, k + 1).
+
+    Args:
+        opacities: (n,) of the single Gaussians, between 0 and 1.
+        counts: (n,) integers from 1 to `MOST_COPIES`, N for each.
+
+    Returns:
+        (n,) opacities of each of the N Gaussians, and (n,) factors on their standard deviations.
+    """
+    single = opacities.double()  # the sum has alternating signs
+    each = 1.0 - (1.0 - single) ** (1.0 / counts.double())
+    order = torch.arange(1, MOST_COPIES + 1, device=opacities.device)
+    table = [[math.comb(n, m) * (-1) ** (m - 1) / math.sqrt(m) for m in order.tolist()] for n in range(MOST_COPIES + 1)]
+    coefficients = torch.tensor(table, dtype=single.dtype, device=opacities.device)
+    factors = single / (coefficients[counts] * each[:, None] ** order).sum(1)
+    return each.to(opacities.dtype), factors.to(opacities.dtype)
+
+
+@torch.no_grad()
+def shake(model: TrainableField, amount: float) -> None:
+    """Add noise to the positions of faint Gaussians, of the shape of each Gaussian.
+
+    Args:
+        model: edited in place.
+        amount: factor on the covariance, times which a standard normal vector is added to a transparent Gaussian.
+    """
+    means, opacities = model.params["means"], torch.sigmoid(model.params["opacities"])
+    quats, log_scales = model.params["quats"], model.params["scales"]
+    rows: Tensor | slice = slice(None)
+    if means.device.type == "cpu":  # a GPU would wait for the number of rows
+        rows = (opacities < SOLID).nonzero()[:, 0]
+    share = torch.sigmoid(SHARPNESS * (FAINT - opacities[rows]))
+    noise = torch.randn_like(means[rows]) * (amount * share)[:, None]
+    rotations = normalized_quat_to_rotmat(torch.nn.functional.normalize(quats[rows], dim=-1))
+    axes = rotations * torch.exp(log_scales[rows])[:, None, :]  # (n, 3, 3), one axis a column
+    along = (axes * noise[:, :, None]).sum(1)  # (n, 3) faster than products of small matrices
+    means[rows] += (axes * along[:, None, :]).sum(2)

@@ -1,0 +1,242 @@
+"""MCMC's density control: what moves, what is added, and what keeps its look."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gsplat.strategy import MCMCStrategy, ops
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from torch import Tensor
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import StagePlan
+from lapgs_plugin.hierarchy.settings import Hierarchy
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.reference_raster.oracle import world_covariances
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.training import mcmc
+from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, mcmc_start, shake
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.schedule import StageSchedule
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_scene import blob_field, ring_scene
+
+
+def model_of(field: GaussianField) -> TrainableField:
+    return TrainableField.create(field, LearningRates(), 1.0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(opacity=st.floats(0.005, 0.999), count=st.integers(1, MOST_COPIES))
+def test_copies_have_the_opacity_and_the_integral_of_the_one_they_replace(opacity: float, count: int) -> None:
+    each, factor = (
+        float(value) for value in copies_of(torch.tensor([opacity], dtype=torch.float64), torch.tensor([count]))
+    )
+    assert 1 - (1 - each) ** count == pytest.approx(opacity, rel=1e-12)
+    # Along a line through the centre: the alpha of all copies together against that of the single Gaussian.
+    together = quad(lambda x: 1 - (1 - each * math.exp(-x * x / (2 * factor**2))) ** count, -12, 12, limit=200)[0]
+    assert together == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-6)
+
+
+def test_noise_has_the_shape_of_faint_gaussians_and_spares_the_others() -> None:
+    torch.manual_seed(0)
+    one = blob_field(1)
+    logits = torch.cat([torch.full((4000,), -20.0), torch.full((1000,), 1.0)])
+    field = GaussianField(
+        *(value.expand(5000, *value.shape[1:]).clone() for value in (one.means, one.quaternions, one.log_scales)),
+        logits,
+        one.sh.expand(5000, *one.sh.shape[1:]).clone(),
+    )
+    model = model_of(field)
+    shake(model, 3.0)
+    moved = (model.params["means"].detach() - field.means).numpy().astype(np.float64)
+    assert not moved[4000:].any()
+    covariance = world_covariances(one.quaternions, one.log_scales)[0].double().numpy()
+    whiten = np.linalg.inv(3.0 / (1 + math.exp(-0.5)) * covariance)  # of the displacement of a transparent Gaussian
+    np.testing.assert_allclose(np.cov((moved[:4000] @ whiten).T), np.eye(3), atol=0.12)  # worst seen 0.04
+
+
+def schedule_of(iterations: int) -> StageSchedule:
+    (stage,) = StagePlan.create((64, 48), iterations, 1)
+    chosen = TrainSettings(iterations=iterations, densification=Densification(start=1, every=10, strategy=MCMC))
+    return StageSchedule.create(chosen, stage)
+
+
+def trained_once(count: int) -> TrainableField:
+    model = model_of(blob_field(count))
+    sum(value.square().sum() for value in model.params.values()).backward()  # type: ignore[union-attr]
+    model.step(1e-3)
+    return model
+
+
+def test_the_transparent_move_to_the_opaque_and_keep_their_moments() -> None:
+    torch.manual_seed(0)
+    model = trained_once(30)
+    with torch.no_grad():
+        model.params["opacities"][:10] = -9.0
+        model.params["opacities"][10:] = 2.0
+        model.params["opacities"][29] = -30.0  # never chosen among the living: it moves, too
+    before = {name: value.detach().clone() for name, value in model.params.items()}
+    kept = model.optimizer_moments()["means"]["exp_avg_sq"][:10].clone()
+    (stage,) = StagePlan.create((64, 48), 100, 1)
+    schedule = StageSchedule.create(
+        TrainSettings(iterations=100, densification=Densification(start=1, every=10)), stage
+    )
+    control = McmcDensifier(schedule, replace(Mcmc(), cap_max=30))
+    model.optimizers["means"].param_groups[0]["lr"] = 0.0  # no noise
+    assert control.after_step(model, 20, None, ring_scene().train[0].camera)
+    assert len(model) == 30
+    gone = [*range(10), 29]
+    means = model.params["means"].detach()
+    assert all((means[row] == before["means"][10:29]).all(-1).any() for row in gone)
+    assert (torch.sigmoid(model.params["opacities"]) > 0.005).all()
+    assert torch.equal(model.optimizer_moments()["means"]["exp_avg_sq"][:10], kept)
+    changed = (model.params["opacities"] != before["opacities"]).nonzero()[:, 0]
+    sources = [int(row) for row in changed if row not in gone]
+    assert sources
+    assert not model.optimizer_moments()["means"]["exp_avg_sq"][sources].any()
+
+
+def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute equation 9 of Kheradmand et al. 2024 term by term, as gsplat's CUDA kernel does."""
+    new_opacities = 1 - (1 - opacities) ** (1 / ratios)
+    denominators = torch.zeros_like(opacities)
+    for row, count in enumerate(ratios.tolist()):
+        for i in range(1, count + 1):
+            for k in range(i):
+                sign = (-1) ** k / math.sqrt(k + 1)
+                denominators[row] += math.comb(i - 1, k) * sign * new_opacities[row] ** (k + 1)
+    return new_opacities, scales * (opacities / denominators)[:, None]
+
+
+def test_refinement_edits_parameters_and_moments_as_gsplat_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = [torch.tensor([12, 20, 20, 25, 12, 13, 29, 29, 29, 18]), torch.tensor([2, 15, 15])]
+    models = [trained_once(30) for _ in range(2)]
+    for model in models:
+        with torch.no_grad():
+            model.params["opacities"][:10] = -9.0
+            model.params["opacities"][10:] = torch.linspace(-1, 3, 20)
+    ours = iter(drawn)
+    monkeypatch.setattr(mcmc, "_sample", lambda weights, count: next(ours))
+    control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=33))
+    monkeypatch.setattr(mcmc, "shake", lambda *arguments: None)
+    assert control.after_step(models[0], 20, None, ring_scene().train[0].camera)
+
+    theirs = iter([drawn[0] - 10, drawn[1]])  # gsplat counts the living alone where it moves the dead
+    monkeypatch.setattr(ops, "_multinomial_sample", lambda weights, count, replacement: next(theirs))
+    monkeypatch.setattr(ops, "compute_relocation", relocated)
+    strategy = MCMCStrategy(cap_max=33)
+    binoms = strategy.initialize_state()["binoms"]
+    params, optimizers = models[1].params, models[1].optimizers
+    strategy._relocate_gs(params, optimizers, binoms)
+    ops.sample_add(params, optimizers, {}, 3, binoms)
+    assert len(models[0]) == len(models[1]) == 33
+    for name, value in params.items():
+        torch.testing.assert_close(models[0].params[name], value, rtol=2e-5, atol=2e-5)
+        for key, moment in models[1].optimizer_moments()[name].items():
+            torch.testing.assert_close(models[0].optimizer_moments()[name][key], moment, msg=f"{name} {key}")
+
+
+def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
+    torch.manual_seed(0)
+    model = trained_once(200)
+    camera = ring_scene().train[0].camera
+    image = CpuRasterizer()(model.field.detach(), camera, background=torch.zeros(3)).image
+    (stage,) = StagePlan.create((64, 48), 30_000, 1)
+    schedule = StageSchedule.create(TrainSettings(), stage)
+    control = McmcDensifier(schedule, replace(Mcmc(), cap_max=215))
+    model.optimizers["means"].param_groups[0]["lr"] = 0.0
+    counts = []
+    for iteration in (600, 650, 700, 800):
+        control.after_step(model, iteration, None, camera)
+        counts.append(len(model))
+    assert counts == [210, 210, 215, 215], "5 % each 100 iterations"
+    again = CpuRasterizer()(model.field.detach(), camera, background=torch.zeros(3)).image
+    assert (again - image).abs().mean() < 0.004  # worst seen 0.0013
+
+
+def test_a_short_run_grows_in_larger_steps() -> None:
+    (stage,) = StagePlan.create((64, 48), 700, 1)
+    schedule = StageSchedule.create(TrainSettings(iterations=700, densification=Densification(strategy=MCMC)), stage)
+    model = trained_once(100)
+    McmcDensifier(schedule, replace(Mcmc(), cap_max=1000)).after_step(model, 100, None, ring_scene().train[0].camera)
+    assert len(model) == 150
+
+
+def test_limits_follow_the_pixels_of_a_level() -> None:
+    plan = StagePlan.create((800, 533), 30_000, 2, hierarchy=Hierarchy.LAPLACIAN)
+
+    def limits(pixels: tuple[int, int], **options: int) -> list[int | None]:
+        chosen = TrainSettings(densification=Densification(strategy=MCMC, options=Mcmc(**options)))
+        stages = zip(plan, pixels, strict=True)
+        found = (chosen.strategy_of(stage, count) for stage, count in stages)
+        return [each.cap_max for each in found if isinstance(each, Mcmc)]
+
+    assert limits((10**9, 10**9)) == [500_000, 1_000_000]
+    assert limits((32_000, 160_000)) == [2_000, 10_000]
+    assert limits((10**9, 10**9), cap_max=70) == [70, 70]
+    assert limits((10**9, 10**9), base_cap_max=70) == [70, 1_000_000]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"iterations": LONG_RUN}, MCMC),
+        ({"iterations": LONG_RUN - 1}, GRADIENTS),
+        ({"iterations": 100, "densification": Densification(options=Auto(cap_max=9))}, MCMC),
+        ({"densification": Densification(options=Auto(absgrad=True))}, GRADIENTS),
+        ({"densification": Densification(reset_every=500)}, GRADIENTS),
+        ({"prune": 0.01}, GRADIENTS),
+        ({"protocol": "paper"}, GRADIENTS),
+    ],
+)
+def test_auto_follows_the_length_of_a_run_and_what_was_given(options: dict[str, object], expected: str) -> None:
+    chosen = TrainSettings(**options).densification  # type: ignore[arg-type]  # some of its fields
+    assert chosen.strategy == expected
+    assert type(chosen.options) is {MCMC: Mcmc, GRADIENTS: Gradients}[expected]
+    given = options.get("densification", Densification())
+    assert isinstance(given, Densification)
+    for name in vars(chosen.options):
+        assert getattr(chosen.options, name) == getattr(given.options, name), name
+
+
+def test_options_of_both_are_refused() -> None:
+    with pytest.raises(UserInputError, match="--cap-max is an option of --strategy mcmc, which does not take"):
+        TrainSettings(densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
+    with pytest.raises(UserInputError, match="--strategy mcmc with --protocol paper: the paper has 3dgs"):
+        TrainSettings(protocol="paper", densification=Densification(strategy=MCMC))
+
+
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
+def test_runs_stay_under_their_limits_and_learn(hierarchy: str, tmp_path: Path) -> None:
+    density = Densification(start=3, until=55, every=5, strategy=MCMC, options=Mcmc(cap_max=120, base_cap_max=110))
+    chosen = TrainSettings(
+        iterations=60, hierarchy=hierarchy, sh_degree=1, sh_every=10, split="1/2,1/2", densification=density
+    )
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    with RunArchive.create(
+        tmp_path / "run", Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
+    ) as run:
+        Trainer(ring_scene(), chosen, run, CpuRasterizer()).run()
+    assert [record.num_gaussians for record in run.manifest.records] == [110, 120]
+    assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
+    first, last = (run.history()[i]["loss"] for i in (0, -1))
+    assert last < first
+
+
+def test_a_base_starts_small_and_half_opaque() -> None:
+    field = blob_field(5)
+    started = mcmc_start(field)
+    torch.testing.assert_close(started.log_scales.exp(), 0.1 * field.log_scales.exp())
+    torch.testing.assert_close(started.opacity_logits.sigmoid(), torch.full((5,), 0.5))
