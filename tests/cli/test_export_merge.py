@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.training import stage_start
+from lapgs_plugin.training import merge, stage_start
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -50,6 +51,23 @@ def test_the_merged_field_keeps_most_of_the_image(tmp_path: Path) -> None:
     started = _kept(run, first_field({level: archive.field(level) for level in (1, 0)}))
     assert float(kept) > started + 2  # seen 3.1
     assert float(photo) == pytest.approx(float(before), abs=0.5)  # seen 0.02
+
+
+def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its opacities and sizes are right already, and nothing is to shake the positions."""
+    found = []
+
+    def trainer(**given: Any) -> None:
+        found.append(given["settings"].densification.options)
+        raise UserInputError("far enough")
+
+    monkeypatch.setattr(merge, "Trainer", trainer)
+    archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
+    for iterations in (3_000, 30_000):
+        with pytest.raises(UserInputError, match="far enough"):
+            merge.merge_levels(archive, iterations=iterations)
+    assert found[0] == found[1]
+    assert (found[0].opacity_weight, found[0].scale_weight) == (0.0, 0.0)
 
 
 def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:
