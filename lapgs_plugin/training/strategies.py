@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_bounds, option
+from lapgs_plugin.options import check_values, option
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -75,7 +75,7 @@ class Strategy:
 
     def check(self) -> None:
         """Raise a UserInputError about an option that is out of range."""
-        check_bounds(self)
+        check_values(self)
 
     def of_stage(self, part: StagePart) -> Self:
         """Return the options of one stage."""
