@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_bounds, option, option_name
+from lapgs_plugin.options import check_values, option, option_name
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -76,7 +76,7 @@ class Strategy:
 
     def check(self) -> None:
         """Raise a UserInputError about an option that is out of range."""
-        check_bounds(self)
+        check_values(self)
 
     def of_stage(self, part: StagePart) -> Self:
         """Return the options of one stage."""
