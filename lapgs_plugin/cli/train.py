@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MAY_CHANGE = ("images_on", "prediction_precision")
 """Settings that may change when a run is continued."""
+CHOSEN_ONCE = ("rasterizer", "strategy")
+"""Options whose value "auto" stands for the choice that the run was started with when it is continued."""
 
 
 @takes_settings
@@ -103,7 +105,7 @@ def train(
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
     console = make_console(stderr=True)
     if resume:
-        given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
+        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(control.rasterizer), overwrite)
@@ -111,7 +113,8 @@ def train(
     with archive:
         _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
         if resume and settings.extended:
-            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended)
+            strategy = settings.densification.strategy
+            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
     keep_preview(out.absolute())
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     console.print(
@@ -171,6 +174,11 @@ def _resume(
             given = given - {"iterations"}
         started_with = _wanted(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+            if name not in started_with:  # another strategy's
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
+                    f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
+                )
             if wanted[name] != started_with[name]:
                 raise UserInputError(
                     f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "

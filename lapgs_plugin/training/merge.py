@@ -28,6 +28,7 @@ from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import GRADIENTS
 from lapgs_plugin.training.trainer import Trainer
 
 ITERATIONS = 3000
@@ -138,7 +139,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSetti
         exposure=OFF,  # what the run learned of its photos' exposure is part of its images
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
-        densification=Densification(until=0, reset_every=0),
+        densification=Densification(until=0, reset_every=0, strategy=GRADIENTS),  # the field stays as it is
         antialiased=bool(manifest.settings.get("antialiased", False)),
     )
 

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.training import stage_start
+from lapgs_plugin.training import merge, stage_start
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -64,6 +65,23 @@ def test_a_run_that_compensates_exposure_is_compared_with_photos_after_a_colour_
     renderer, photos = run_renderer(archive), run_scene(archive).test
     fitted = [color_fitted_psnr(renderer.images([view.camera], 0)[0].cpu(), view.image) for view in photos]
     assert float(before) == pytest.approx(fmean(fitted), abs=0.01)
+
+
+def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its opacities and sizes are right already, and nothing is to shake the positions."""
+    found = []
+
+    def trainer(**given: Any) -> None:
+        found.append(given["settings"].densification.options)
+        raise UserInputError("far enough")
+
+    monkeypatch.setattr(merge, "Trainer", trainer)
+    archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
+    for iterations in (3_000, 30_000):
+        with pytest.raises(UserInputError, match="far enough"):
+            merge.merge_levels(archive, iterations=iterations)
+    assert found[0] == found[1]
+    assert (found[0].opacity_weight, found[0].scale_weight) == (0.0, 0.0)
 
 
 def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:

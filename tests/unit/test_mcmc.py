@@ -174,6 +174,11 @@ def test_a_short_run_grows_in_larger_steps() -> None:
     assert len(model) == 150
 
 
+def test_nothing_is_due_for_resets_that_never_come() -> None:
+    schedule = schedule_of(9000)  # 3DGS's heuristics reset every 900 iterations
+    assert schedule.sampled(5) == {1800, 3600, 5400, 7200, 9000}
+
+
 def test_limits_follow_the_pixels_of_a_level() -> None:
     plan = StagePlan.create((800, 533), 30_000, 2, hierarchy=Hierarchy.LAPLACIAN)
 
@@ -212,8 +217,13 @@ def test_auto_follows_the_length_of_a_run_and_what_was_given(options: dict[str, 
 
 
 def test_options_of_both_are_refused() -> None:
-    with pytest.raises(UserInputError, match="--cap-max is an option of --strategy mcmc, which does not take"):
-        TrainSettings(densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
+    message = "--cap-max is an option of --strategy mcmc, which does not take --densify-threshold, --prune; leave"
+    with pytest.raises(UserInputError, match=message):
+        TrainSettings(prune=0.01, densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
+    with pytest.raises(UserInputError, match=r"--base-cap-max is an option .* does not take --protocol paper"):
+        TrainSettings(protocol="paper", densification=Densification(options=Auto(base_cap_max=9)))
+    with pytest.raises(UserInputError, match=r"--densify-threshold 0\.0: expected a positive gradient"):
+        TrainSettings(densification=Densification(options=Auto(grow_grad2d=0.0)))
     with pytest.raises(UserInputError, match="--strategy mcmc with --protocol paper: the paper has 3dgs"):
         TrainSettings(protocol="paper", densification=Densification(strategy=MCMC))
 
