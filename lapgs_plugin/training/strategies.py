@@ -211,7 +211,9 @@ class Mcmc(Regularized):
 
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
-    unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
+    unused: ClassVar[tuple[str, ...]] = (
+        *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
+    )
 
     cap_max: int | None = option(
         None,

@@ -26,6 +26,7 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training import mcmc
 from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, mcmc_start, shake
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
@@ -203,6 +204,7 @@ def test_limits_follow_the_pixels_of_a_level() -> None:
         ({"densification": Densification(options=Auto(absgrad=True))}, GRADIENTS),
         ({"densification": Densification(reset_every=500)}, GRADIENTS),
         ({"prune": 0.01}, GRADIENTS),
+        ({"residual_resets": True}, GRADIENTS),
         ({"protocol": "paper"}, GRADIENTS),
     ],
 )
@@ -226,6 +228,17 @@ def test_options_of_both_are_refused() -> None:
         TrainSettings(densification=Densification(options=Auto(grow_grad2d=0.0)))
     with pytest.raises(UserInputError, match="--strategy mcmc with --protocol paper: the paper has 3dgs"):
         TrainSettings(protocol="paper", densification=Densification(strategy=MCMC))
+
+
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
+def test_manifests_of_any_version_are_read(hierarchy: str) -> None:
+    density = Densification(strategy=MCMC, options=Mcmc(cap_max=9))
+    chosen = TrainSettings(hierarchy=hierarchy, densification=density)
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
+    assert settings_from_manifest(manifest).for_manifest() == chosen.for_manifest()
+    older = {name: value for name, value in manifest.settings.items() if name != "residual_resets"}
+    assert settings_from_manifest(replace(manifest, settings=older)).for_manifest() == chosen.for_manifest()
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
