@@ -64,17 +64,19 @@ def train(
 
     Examples:
 
-        lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
+        lapgs train data/garden -o runs/garden --eval
 
-        lapgs train data/garden -o runs/plain --levels 1       (baseline: one field)
+        lapgs train data/garden -o runs/small --resolution 1/4 --iterations 3000
 
-        lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
+        lapgs train data/garden -o runs/plain --levels 1    (a single field)
 
-        lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+        lapgs train data/garden -o runs/nested --hierarchy nested    (one PLY)
 
-        lapgs train data/garden -o runs/garden --resume --iterations 40000       (extends a finished run)
+        lapgs train data/garden -o runs/garden --resume    (after Ctrl-C)
 
-        lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
+        lapgs train data/garden -o runs/garden --resume --iterations 40000
+
+        lapgs train --config runs/garden/run.toml -o runs/again --seed 1
     """
     from rich.markup import escape
 
