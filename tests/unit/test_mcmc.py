@@ -258,6 +258,22 @@ def test_runs_stay_under_their_limits_and_learn(hierarchy: str, tmp_path: Path) 
     assert last < first
 
 
+def test_a_sparse_step_leaves_out_what_no_view_shows_although_the_loss_has_all_opacities() -> None:
+    scene = ring_scene()
+    first = blob_field(40)
+    means = torch.cat([first.means[:30], first.means[30:] + 1000.0])
+    model = model_of(first.with_parameters({"means": means}))
+    result = CpuRasterizer()(model.field, scene.train[0].camera, background=torch.zeros(3))
+    loss = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=40)).regularization(model.field)
+    assert loss is not None
+    (result.image.square().mean() + loss).backward()  # type: ignore[no-untyped-call]  # torch's
+    assert (model.params["opacities"].grad != 0).all()
+    touched = model._touched
+    assert touched[:30].any()
+    assert not (touched & (result.radii.reshape(40, -1).amax(-1) == 0)).any()
+    assert not touched[30:].any()
+
+
 def test_a_base_starts_small_and_half_opaque() -> None:
     field = blob_field(5)
     started = mcmc_start(field)
