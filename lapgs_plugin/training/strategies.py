@@ -218,7 +218,8 @@ class Mcmc(Regularized):
     cap_max: int | None = option(
         None,
         f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
-        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}.",
+        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A "
+        "level that starts with more keeps them.",
         panel=PANEL,
         least=1,
     )
