@@ -27,6 +27,8 @@ class Option:
         panel: title of its group in `--help`.
         names: of the option, the current one first, then old ones; empty for a name made from the field's.
         least, most: bounds of a number.
+        choices: accepted texts; empty for any.
+        metavar: name of its value in `--help`; empty for its type.
     """
 
     help: str
@@ -34,6 +36,8 @@ class Option:
     names: tuple[str, ...] = ()
     least: float | None = None
     most: float | None = None
+    choices: tuple[str, ...] = ()
+    metavar: str = ""
 
 
 def option(
@@ -44,9 +48,11 @@ def option(
     names: tuple[str, ...] = (),
     least: float | None = None,
     most: float | None = None,
+    choices: tuple[str, ...] = (),
+    metavar: str = "",
 ) -> Any:
     """Declare a dataclass field that is an option of every command that takes the dataclass."""
-    return field(default=default, metadata={KEY: Option(help, panel, names, least, most)})
+    return field(default=default, metadata={KEY: Option(help, panel, names, least, most, choices, metavar)})
 
 
 def options_of(registry: Registry[Any], by: str) -> Any:
@@ -81,17 +87,22 @@ def option_values(settings: Any) -> Mapping[str, Any]:
     return values
 
 
-def check_bounds(settings: Any) -> None:
-    """Check the numbers of a settings object against their declared bounds.
+def check_values(settings: Any) -> None:
+    """Check the values of a settings object against their declared bounds and choices.
 
     Raises:
-        UserInputError: a number is out of bounds.
+        UserInputError: a number is out of bounds, or a text is not among the choices.
     """
     for each in fields(settings):
         declared, value = each.metadata.get(KEY), getattr(settings, each.name)
-        if declared is None or value is None or isinstance(value, str):
+        if declared is None or value is None:
             continue
         name = option_name(each)
+        if declared.choices and value not in declared.choices:
+            *others, last = declared.choices
+            raise UserInputError(f"{name} {value}: expected {', '.join(others)} or {last}")
+        if isinstance(value, str):
+            continue
         if declared.least is not None and not value >= declared.least:
             raise UserInputError(f"{name} {value}: expected at least {declared.least:g}")
         if declared.most is not None and not value <= declared.most:

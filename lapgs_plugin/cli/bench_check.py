@@ -21,9 +21,10 @@ from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.experiments.commands import LAPGS
-from lapgs_plugin.experiments.expansion import SceneSpec, Selection
+from lapgs_plugin.experiments.expansion import SceneSpec
 from lapgs_plugin.experiments.mistakes import Mistakes, keys_of
 from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution

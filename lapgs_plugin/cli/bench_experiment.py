@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.experiments.settings import PlaceSettings, ResultSettings, Selection, WorkerSettings
 from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
+    from lapgs_plugin.experiments.commands import Locations
     from lapgs_plugin.experiments.expansion import PlannedRun
-    from lapgs_plugin.experiments.launchers import Launcher, WorkOrder
+    from lapgs_plugin.experiments.launchers import WorkOrder
+    from lapgs_plugin.experiments.mistakes import Mistakes
     from lapgs_plugin.experiments.runner import Folder
     from lapgs_plugin.experiments.schema import Experiment
-    from lapgs_plugin.experiments.store import Job, Outcome, ResultStore
-
-SELECTION = "Selection"
-PLACES = "Folders"
-ENGINE = "Execution"
+    from lapgs_plugin.experiments.store import Job, Outcome
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
@@ -40,81 +38,15 @@ class RunsFailedError(LapgsError):
     exit_code = 1
 
 
+@takes_settings
 def bench_experiment(
     experiment: Annotated[
         Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
     ],
-    scene: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this scene. Repeatable.")
-    ] = None,
-    backbone: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this backbone. Repeatable.")
-    ] = None,
-    variant: Annotated[
-        list[str] | None, typer.Option(rich_help_panel=SELECTION, help="Run only this variant. Repeatable.")
-    ] = None,
-    seeds: Annotated[
-        str | None, typer.Option(rich_help_panel=SELECTION, help="Seeds instead of those in the file, such as 0,1,2.")
-    ] = None,
-    iterations: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            rich_help_panel=SELECTION,
-            help="Iterations instead of the file's; variants are scaled alike.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", rich_help_panel=PLACES, help="Folder for runs and results. Default: runs/bench/NAME."
-        ),
-    ] = None,
-    path: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=FOLDER",
-            rich_help_panel=PLACES,
-            help="Folder of a data set, scene or checkout that the file names. Repeatable. LAPGS_<NAME> in the "
-            "environment does the same.",
-        ),
-    ] = None,
-    launcher: Annotated[
-        str, typer.Option(rich_help_panel=ENGINE, help="Where runs are executed: local, slurm (with submitit) or ray.")
-    ] = "local",
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=1024, rich_help_panel=ENGINE, help="Runs at a time. Default: one per GPU, or one without GPUs."
-        ),
-    ] = None,
-    gpus: Annotated[
-        str | None,
-        typer.Option(rich_help_panel=ENGINE, help="GPUs to use, as in CUDA_VISIBLE_DEVICES: 0,1. Default: all."),
-    ] = None,
-    launcher_option: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            rich_help_panel=ENGINE,
-            help="Option of the launcher. Slurm: those of submitit (slurm_partition=gpu, timeout_min=600). Ray: "
-            "address, num_gpus, num_cpus. Repeatable.",
-        ),
-    ] = None,
-    evaluate: Annotated[
-        bool,
-        typer.Option(
-            "--eval/--no-eval",
-            help="Measure every run with `lapgs eval`, or use the metrics that training recorded at its end.",
-        ),
-    ] = True,
-    lpips_weights: Annotated[
-        list[Path] | None, typer.Option(help="Weights of an LPIPS network for `lapgs eval`. Repeatable.")
-    ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands of all runs.")] = False,
-    tables_only: Annotated[
-        bool, typer.Option("--tables-only", help="Only write the tables from existing results.")
-    ] = False,
+    selection: Selection,
+    places: PlaceSettings,
+    engine: WorkerSettings,
+    results: ResultSettings,
 ) -> None:
     """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
 
@@ -125,54 +57,61 @@ def bench_experiment(
 
         lapgs bench benchmarks/smoke.toml
 
-        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360 --path fastgs=~/FastGS --scene bonsai
+        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360
     """
-
-    from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.aggregate import check_table
     from lapgs_plugin.experiments.commands import Locations
-    from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
-    from lapgs_plugin.experiments.launchers import check_order, launch
+    from lapgs_plugin.experiments.expansion import plan_runs
     from lapgs_plugin.experiments.mistakes import Mistakes
-    from lapgs_plugin.experiments.runner import Folder, execute, make_samples, prepare
+    from lapgs_plugin.experiments.runner import Folder
     from lapgs_plugin.experiments.schema import load_experiment
-    from lapgs_plugin.experiments.store import ResultStore
 
-    console = make_console(stderr=True)
     mistakes = Mistakes(experiment)
     loaded = load_experiment(experiment, _option_names())
     with mistakes.at("table"):
         check_table(loaded)
-    selection = Selection(scene, backbone, variant, _seeds(seeds), iterations)
-    planned, scenes = plan_runs(loaded, selection), scenes_of(loaded, selection)
-    folder = Folder(Path("runs", "bench", loaded.name) if out is None else out)
-    if tables_only:
+    planned = plan_runs(loaded, selection)
+    folder = Folder(Path("runs", "bench", loaded.name) if places.out is None else places.out)
+    if results.tables_only:
         mistakes.refuse()
     else:
-        order = _order(workers, gpus, _pairs(launcher_option, "--launcher-option"), folder)
-        if not dry_run:
-            check_order(launcher, order)
-            _require_place(folder.path)
-        if evaluate:
-            _require_measuring(lpips_weights or ())
-        places = Locations(
-            {name: _folder(name, value) for name, value in _pairs(path, "--path").items()}, experiment.parent
-        )
-        weights = [word for file in lpips_weights or () for word in ("--lpips-weights", str(file.absolute()))]
-        measuring = weights if evaluate else None
-        jobs, found = prepare(planned, scenes, places, folder, measuring, loaded, selection, mistakes)
-        here = launcher == "local" and not dry_run
-        check_runs(loaded, selection, planned, jobs, found, mistakes, here=here)
-        mistakes.refuse()
-        if dry_run:
-            _print_commands(jobs)
-            return
-        make_samples(scenes, folder)
-        store = ResultStore.create(folder.store)
-        store.plan(jobs)
-        order = replace(order, run_ids=[job.run_id for job in jobs])
-        _follow(execute, store, jobs, lambda: launch(launcher, order), console)
-    _write(loaded, planned, ResultStore(folder.store), folder, console)
+        locations = Locations(places.folders, experiment.parent)
+        _run(loaded, selection, planned, folder, locations, engine, results, mistakes)
+    if results.tables_only or not results.dry_run:
+        _write(loaded, planned, folder)
+
+
+def _run(
+    experiment: Experiment,
+    selection: Selection,
+    planned: Sequence[PlannedRun],
+    folder: Folder,
+    locations: Locations,
+    engine: WorkerSettings,
+    results: ResultSettings,
+    mistakes: Mistakes,
+) -> None:
+    """Check all runs, then execute them, or print their commands with --dry-run."""
+    from lapgs_plugin.cli.bench_check import check_runs
+    from lapgs_plugin.experiments.expansion import scenes_of
+    from lapgs_plugin.experiments.launchers import check_order
+    from lapgs_plugin.experiments.runner import make_samples, prepare
+
+    order = _order(engine, folder)
+    if not results.dry_run:
+        check_order(engine.launcher, order)
+        _require_place(folder.path)
+    scenes = scenes_of(experiment, selection)
+    measuring = _measuring(results)
+    jobs, found = prepare(planned, scenes, locations, folder, measuring, experiment, selection, mistakes)
+    here = engine.launcher == "local" and not results.dry_run
+    check_runs(experiment, selection, planned, jobs, found, mistakes, here=here)
+    mistakes.refuse()
+    if results.dry_run:
+        _print_commands(jobs)
+        return
+    make_samples(scenes, folder)
+    _follow(jobs, folder, engine.launcher, order)
 
 
 def _option_names() -> dict[str, set[str]]:
@@ -185,35 +124,6 @@ def _option_names() -> dict[str, set[str]]:
         name: {p for p in function.__annotations__ if p not in ("return", "context")} - SET_BY_EXPERIMENTS
         for name, function in functions.items()
     }
-
-
-def _seeds(text: str | None) -> list[int] | None:
-    if text is None:
-        return None
-    try:
-        numbers = [int(part) for part in text.split(",")]
-    except ValueError as error:
-        raise UserInputError(f"--seeds {text}: expected whole numbers separated by commas, such as 0,1,2") from error
-    if len(set(numbers)) < len(numbers):
-        raise UserInputError(f"--seeds {text}: expected different numbers")
-    return numbers
-
-
-def _pairs(texts: Sequence[str] | None, option: str) -> dict[str, str]:
-    found = {}
-    for text in texts or ():
-        name, separator, value = text.partition("=")
-        if not (separator and name and value):
-            raise UserInputError(f"{option} {text}: expected NAME=VALUE")
-        found[name] = value
-    return found
-
-
-def _folder(name: str, text: str) -> Path:
-    try:
-        return Path(text).expanduser()
-    except RuntimeError as error:
-        raise UserInputError(f"--path {name}={text}: no such user; expected a folder") from error
 
 
 def _require_place(folder: Path) -> None:
@@ -234,23 +144,29 @@ def _require_place(folder: Path) -> None:
         raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
-def _require_measuring(weights: Sequence[Path]) -> None:
-    """Check that `lapgs eval` can run: the packages that read scenes are installed and the weights exist.
+def _measuring(results: ResultSettings) -> list[str] | None:
+    """Return the options of `lapgs eval`, None without it.
 
     Raises:
-        UserInputError: a package or a file of weights is missing.
+        UserInputError: a package that reads scenes or a file of weights is missing.
     """
     from importlib.util import find_spec
 
+    from lapgs_plugin.cli.bench_check import READS_SCENES
+
+    if not results.evaluate:
+        return None
+    weights = results.lpips_weights or []
     for file in weights:
         if not os.path.isfile(file):  # noqa: PTH113  # Path.is_file raises where a name is too long
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
-    missing = [name for name in ("OpenImageIO", "pycolmap") if find_spec(name) is None]
+    missing = [name for name in READS_SCENES if find_spec(name) is None]
     if missing:
         raise UserInputError(
             f"{' and '.join(missing)} cannot be imported, and `lapgs eval` needs them to read scenes; install them, or "
             "use the metrics that training records with --no-eval"
         )
+    return [word for file in weights for word in ("--lpips-weights", str(file.absolute()))]
 
 
 def _print_commands(jobs: Sequence[Job]) -> None:
@@ -262,37 +178,36 @@ def _print_commands(jobs: Sequence[Job]) -> None:
             print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
-def _order(workers: int | None, gpus: str | None, options: dict[str, str], folder: Folder) -> WorkOrder:
+def _order(engine: WorkerSettings, folder: Folder) -> WorkOrder:
     """Return the settings of the workers; the runs are filled in later."""
     from lapgs_plugin.experiments.launchers import WorkOrder
 
     return WorkOrder(
         store=folder.store.absolute(),
         run_ids=(),
-        workers=workers,
-        gpus=None if gpus is None else gpus.split(","),
+        workers=engine.workers,
+        gpus=None if engine.gpus is None else engine.gpus.split(","),
         logs=folder.logs("workers").absolute(),
-        options={name: int(value) if value.isdecimal() else value for name, value in options.items()},
+        options=engine.launcher_options,
     )
 
 
-def _follow(
-    execute: Callable[..., list[Outcome]],
-    store: ResultStore,
-    jobs: Sequence[Job],
-    start: Callable[[], Launcher],
-    console: Console,
-) -> None:
+def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder) -> None:
     """Run the jobs with a progress bar and a line for each finished run."""
     from rich.markup import escape
 
-    from lapgs_plugin.experiments.store import DONE, FAILED
+    from lapgs_plugin.experiments.launchers import launch
+    from lapgs_plugin.experiments.runner import execute
+    from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
     from lapgs_plugin.progress import item_progress
 
+    store = ResultStore.create(folder.store)
+    store.plan(jobs)
     run_ids = [job.run_id for job in jobs]
+    order = replace(order, run_ids=run_ids)
     finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
     if finished:
-        console.print(f"{finished} of {len(run_ids)} runs are done already")
+        make_console(stderr=True).print(f"{finished} of {len(run_ids)} runs are done already")
     with item_progress("runs") as progress:
         task = progress.add_task("Running", total=len(run_ids), completed=finished)
 
@@ -305,7 +220,7 @@ def _follow(
             progress.console.print(text, soft_wrap=True, highlight=False)
 
         try:
-            execute(store, run_ids, start, say)
+            execute(store, run_ids, lambda: launch(launcher, order), say)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 
@@ -315,9 +230,7 @@ def _summary(record: dict[str, Any]) -> str:
     return ", ".join(pattern.format(record[name]) for name, pattern in patterns.items() if name in record)
 
 
-def _write(
-    experiment: Experiment, planned: Sequence[PlannedRun], store: ResultStore, folder: Folder, messages: Console
-) -> None:
+def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Folder) -> None:
     """Write the results, print their table, and report the runs that failed.
 
     Raises:
@@ -326,16 +239,44 @@ def _write(
     import shlex
 
     from rich.markdown import Markdown
-    from rich.markup import escape
 
-    from lapgs_plugin import __version__
     from lapgs_plugin.experiments import exports
-    from lapgs_plugin.experiments.aggregate import baseline_of, make_table
-    from lapgs_plugin.experiments.store import FAILED
+    from lapgs_plugin.experiments.aggregate import make_table
+    from lapgs_plugin.experiments.store import FAILED, ResultStore
     from lapgs_plugin.experiments.tables import latex, markdown
 
+    store = ResultStore(folder.store)
     outcomes = {o.run_id: o for o in store.outcomes({run.spec.run_id for run in planned})}
     records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}
+    try:
+        table = make_table(experiment, planned, records)
+    except RunFolderError as error:
+        raise RunFolderError(f"{folder.store}: {error}") from None
+    text = markdown(table)
+    exports.write_text(folder.path / exports.MARKDOWN, text)
+    exports.write_text(folder.path / exports.LATEX, latex(table))
+    _write_rows(experiment, planned, records, folder.path)
+    console = make_console()
+    console.print(Markdown(text)) if console.is_terminal else print(text)
+    _name_versions(records)
+    print(f"{folder.path} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    print(f"next: lapgs report {shlex.quote(str(folder.path))} writes a page with curves and images")
+    if failed := [o for o in outcomes.values() if o.state == FAILED]:
+        raise RunsFailedError(
+            f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "
+            f"{folder.path / 'logs'}"
+        )
+
+
+def _write_rows(
+    experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, dict[str, Any]], folder: Path
+) -> None:
+    """Write the figures of each run, as CSV and, where pyarrow is installed, as Parquet."""
+    from rich.markup import escape
+
+    from lapgs_plugin.experiments import exports
+    from lapgs_plugin.experiments.aggregate import baseline_of
+
     names: dict[str, list[str]] = {}
     for run in planned:
         names.setdefault(run.spec.backbone, []).append(run.variant)
@@ -350,29 +291,19 @@ def _write(
         for run in planned
         if run.spec.run_id in records
     ]
+    exports.write_csv(folder / exports.CSV, rows)
     try:
-        table = make_table(experiment, planned, records)
-    except RunFolderError as error:
-        raise RunFolderError(f"{folder.store}: {error}") from None
-    text = markdown(table)
-    exports.write_csv(folder.path / exports.CSV, rows)
-    exports.write_text(folder.path / exports.MARKDOWN, text)
-    exports.write_text(folder.path / exports.LATEX, latex(table))
-    try:
-        exports.write_parquet(folder.path / exports.PARQUET, rows)
+        exports.write_parquet(folder / exports.PARQUET, rows)
     except MissingExtraError as error:
-        messages.print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
-    console = make_console()
-    console.print(Markdown(text)) if console.is_terminal else print(text)
+        make_console(stderr=True).print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
+
+
+def _name_versions(records: Mapping[str, dict[str, Any]]) -> None:
+    """Say on stderr if results were made by other versions of this package."""
+    from lapgs_plugin import __version__
+
     others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
     if others:
-        messages.print(
+        make_console(stderr=True).print(
             f"[yellow]some results were made by lapgs_plugin {', '.join(others)}; this is {__version__}[/yellow]"
-        )
-    print(f"{folder.path} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
-    print(f"next: lapgs report {shlex.quote(str(folder.path))} writes a page with curves and images")
-    if failed := [o for o in outcomes.values() if o.state == FAILED]:
-        raise RunsFailedError(
-            f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "
-            f"{folder.path / 'logs'}"
         )

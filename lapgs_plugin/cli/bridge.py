@@ -67,7 +67,12 @@ def _parameter(each: Field[Any], hint: Any, declared: Option, default: Any) -> i
     name = parameter_name(each.name, declared)
     names = declared.names or ((f"--{name.replace('_', '-')}",) if hint is bool else ())
     asked = typer.Option(
-        *names, help=declared.help, rich_help_panel=declared.panel or None, min=declared.least, max=declared.most
+        *names,
+        help=declared.help,
+        rich_help_panel=declared.panel or None,
+        min=declared.least,
+        max=declared.most,
+        metavar=declared.metavar or None,
     )
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, asked])
 

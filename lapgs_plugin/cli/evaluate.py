@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import printable
+from lapgs_plugin.options import check_values, option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,42 +23,52 @@ SHOWN_VIEWS = 12
 """Views listed on the terminal; metrics.json and the report list all."""
 
 
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """Choose what is measured: images of the views, or flicker along a camera path.
+
+    Raises:
+        UserInputError: a value is out of range, or an option has no effect with the others.
+    """
+
+    lpips: str | None = option(
+        None,
+        "LPIPS variants to measure, separated by commas: vgg, alex, squeeze, vgg_3dgs (VGG as 3DGS codebases compute "
+        "it), or none. Default: those that --lpips-weights names, else vgg and vgg_3dgs.",
+        metavar="VARIANTS",
+    )
+    lpips_weights: list[Path] | None = option(
+        None,
+        "Weights of an LPIPS network in torchvision's layout, .pth or .safetensors. Repeatable. Default: those in "
+        "torchvision's cache. Nothing is downloaded.",
+    )
+    trajectory: str | None = option(
+        None,
+        "Measure flicker along a camera path instead of the views: orbit, spline or a JSON file of cameras, as for "
+        "`lapgs render`.",
+    )
+    baseline: Path | None = option(None, "With --trajectory: a run of one field to compare with.")
+    frames: int | None = option(
+        None, f"Frames of the path. Default: {FLICKER_FRAMES}, or the cameras of the JSON file.", least=2
+    )
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        if self.trajectory is None:
+            refuse({"--baseline": self.baseline, "--frames": self.frames}, "needs --trajectory")
+        else:
+            photo_options = {"--lpips": self.lpips, "--lpips-weights": self.lpips_weights}
+            refuse(photo_options, "does not go with --trajectory, which has no photos")
+
+
 @takes_settings
 def evaluate(
     run: Annotated[
         Path,
         typer.Argument(metavar="RUN", help="Complete run folder of `lapgs train`, `lapgs run` or `lapgs import-run`."),
     ],
+    settings: EvaluateSettings,
     options: RenderOptions,
-    lpips: Annotated[
-        str | None,
-        typer.Option(
-            metavar="VARIANTS",
-            help="LPIPS variants to measure, separated by commas: vgg, alex, squeeze, vgg_3dgs (VGG as 3DGS codebases "
-            "compute it), or none. Default: those that --lpips-weights names, else vgg and vgg_3dgs.",
-        ),
-    ] = None,
-    lpips_weights: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Weights of an LPIPS network in torchvision's layout, .pth or .safetensors. Repeatable. Default: "
-            "those in torchvision's cache. Nothing is downloaded."
-        ),
-    ] = None,
-    trajectory: Annotated[
-        str | None,
-        typer.Option(
-            help="Measure flicker along a camera path instead of the views: orbit, spline or a JSON file of cameras, "
-            "as for `lapgs render`."
-        ),
-    ] = None,
-    baseline: Annotated[
-        Path | None, typer.Option(help="With --trajectory: a run of one field to compare with.")
-    ] = None,
-    frames: Annotated[
-        int | None,
-        typer.Option(min=2, help=f"Frames of the path. Default: {FLICKER_FRAMES}, or the cameras of the JSON file."),
-    ] = None,
 ) -> None:
     """Measure PSNR, SSIM and LPIPS of RUN on its held-out views, and write RUN/metrics.json.
 
@@ -69,18 +81,14 @@ def evaluate(
     With --trajectory the command measures flicker instead: how much each frame differs from the one before after
     warping it by the rendered depth, where both show the same surface. It writes RUN/stability.json.
     """
-    if trajectory is not None:
-        refuse(
-            {"--lpips": lpips, "--lpips-weights": lpips_weights}, "does not go with --trajectory, which has no photos"
-        )
-        _stability(run, baseline, trajectory, frames, options)
+    if settings.trajectory is not None:
+        _stability(run, settings.trajectory, settings, options)
         return
-    refuse({"--baseline": baseline, "--frames": frames}, "needs --trajectory")
     from lapgs_plugin.evaluation.figures import evaluate_run
     from lapgs_plugin.evaluation.lpips import LpipsRequest
     from lapgs_plugin.runs.archive import METRICS, RunArchive
 
-    wanted = LpipsRequest.parse(lpips, lpips_weights or ())
+    wanted = LpipsRequest.parse(settings.lpips, settings.lpips_weights or ())
     archive = RunArchive.open(run)
     show_log()
     metrics = evaluate_run(archive, options.scene, device=options.device, rasterizer=options.rasterizer, lpips=wanted)
@@ -88,7 +96,7 @@ def evaluate(
     print(f"{archive.path(METRICS)} holds these figures")
 
 
-def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | None, options: RenderOptions) -> None:
+def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: RenderOptions) -> None:
     """Measure flicker along a path and print it."""
     from rich import box
     from rich.table import Table
@@ -97,9 +105,10 @@ def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | 
     from lapgs_plugin.rendering.run import path_cameras
     from lapgs_plugin.runs.archive import STABILITY, RunArchive
 
-    archive, other = RunArchive.open(run), None if baseline is None else RunArchive.open(baseline)
+    archive = RunArchive.open(run)
+    other = None if settings.baseline is None else RunArchive.open(settings.baseline)
     show_log()
-    cameras = path_cameras(archive, trajectory, frames, FLICKER_FRAMES, options.scene)
+    cameras = path_cameras(archive, trajectory, settings.frames, FLICKER_FRAMES, options.scene)
     figures = evaluate_stability(
         archive, other, trajectory, cameras, device=options.device, rasterizer=options.rasterizer
     )
@@ -118,7 +127,6 @@ def _stability(run: Path, baseline: Path | None, trajectory: str, frames: int | 
 
 
 def _print(metrics: dict[str, Any]) -> None:
-
     console = make_console()
     _print_views(console, metrics)
     _print_levels(console, metrics)
@@ -135,12 +143,11 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 
     measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
-    missing = list(metrics["lpips_missing"])
-    headings = [f"LPIPS ({title_of(name)})" for name in (*measured, *missing)]
+    headings = [f"LPIPS ({title_of(name)})" for name in measured]
     table = Table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings, box=box.SIMPLE_HEAD)
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
-        distances = [*(f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured), *("not measured" for _ in missing)]
+        distances = [f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured]
         figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
@@ -182,8 +189,12 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
+    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS
+
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
-    where = " inside their masks (LPIPS: the photo outside)" if metrics["masked"] else ""
+    where = " inside their masks" if metrics["masked"] else ""
+    if where and any(LPIPS_KEY.format(name) in metrics for name in VARIANTS):
+        where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
@@ -192,15 +203,14 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         highlight=False,
     )
     console.print(
-        f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR on the right halves of the views, after a colour fit on "
-        "their left halves: compare this where exposure or white balance change from photo to photo"
-        + (", as in this run, whose renders have the mean exposure" if metrics["exposure_compensated"] else ""),
+        f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR of the right half of each view after a colour fit on its "
+        "left half; compare this one where photos differ in exposure or white balance"
+        + (", as they do here" if metrics["exposure_compensated"] else ""),
         highlight=False,
     )
     if metrics["exposure_predicted"]:
         console.print(
-            "the other figures are of renders with the exposure that the training photos beside each view in the order "
-            "of names predict",
+            "all other figures give each view the exposure of its neighbours by name among the training photos",
             highlight=False,
         )
     if (peak := metrics["peak_memory_bytes"]) is not None:

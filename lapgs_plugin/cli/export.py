@@ -2,56 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.rendering import refuse
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import check_values, option
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
     from lapgs_plugin.runs.archive import RunArchive
 
-FORMATS = ("ply", "spz")
+PLY, SPZ = "ply", "spz"
 PAGE, MERGED = "scene.html", "merged"
 
 
+@dataclass(frozen=True)
+class ExportSettings:
+    """Choose which fields of a run are exported, and as what.
+
+    Raises:
+        UserInputError: a value is unknown or out of range, or an option has no effect with the others.
+    """
+
+    file_format: str = option(
+        PLY,
+        "ply (the standard 3DGS layout) or spz (version 3, smaller, lossy).",
+        names=("--format",),
+        choices=(PLY, SPZ),
+    )
+    level: int | None = option(None, "Level to export; 0 is the finest. Default: all finished levels.")
+    merge: bool = option(
+        False,
+        "Fit one ordinary field to the images of a run with residuals, and write it as merged.ply instead: an "
+        "approximation for other viewers. Prints the PSNR that it keeps.",
+    )
+    iterations: int | None = option(None, "With --merge: iterations of the fit, one view each. Default: 3000.", least=1)
+    html: bool = option(
+        False,
+        "Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
+        "level_<l>_base.html or level_<l>_field.html.",
+    )
+    scene: Path | None = option(None, "With --merge or --html: the scene's folder now. Default: where it was trained.")
+    out: Path | None = option(None, "Folder to write to. Default: RUN/export.", names=("--out", "-o"))
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        if not self.merge:
+            refuse({"--iterations": self.iterations}, "needs --merge")
+            refuse({"--scene": None if self.html else self.scene}, "needs --merge or --html")
+        else:
+            refuse({"--level": self.level}, "does not go with --merge, which makes one field of all levels")
+        if self.html:
+            refuse({"--format": None if self.file_format == PLY else self.file_format}, "does not go with --html")
+
+
+@takes_settings
 def export(
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
     ],
-    file_format: Annotated[
-        str,
-        typer.Option("--format", help="ply (the standard 3DGS layout) or spz (version 3, smaller, lossy)."),
-    ] = "ply",
-    level: Annotated[
-        int | None, typer.Option(help="Level to export; 0 is the finest. Default: all finished levels.")
-    ] = None,
-    merge: Annotated[
-        bool,
-        typer.Option(
-            "--merge",
-            help="Fit one ordinary field to the images of a run with residuals, and write it as merged.ply instead: an "
-            "approximation for other viewers. Prints the PSNR that it keeps.",
-        ),
-    ] = False,
-    iterations: Annotated[
-        int | None, typer.Option(min=1, help="With --merge: iterations of the fit, one view each. Default: 3000.")
-    ] = None,
-    html: Annotated[
-        bool,
-        typer.Option(
-            "--html",
-            help="Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
-            "level_<l>_base.html or level_<l>_field.html.",
-        ),
-    ] = False,
-    scene: Annotated[
-        Path | None, typer.Option(help="With --merge or --html: the scene's folder now. Default: where it was trained.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to. Default: RUN/export.")] = None,
+    settings: ExportSettings,
 ) -> None:
     """Export the Gaussians of each level of RUN as PLY or SPZ for other viewers.
 
@@ -70,84 +85,62 @@ def export(
 
         lapgs export runs/garden --merge --html       (a page for the web)
     """
-    from lapgs_plugin.files import one_line_errors
     from lapgs_plugin.runs.archive import EXPORT, RunArchive
 
-    if file_format not in FORMATS:
-        raise UserInputError(f"--format {file_format}: expected {' or '.join(FORMATS)}")
     archive = RunArchive.open(run)
-    _check_together(file_format, level, merge, iterations, html, scene)
-    if html or merge:
-        _write_one(
-            archive, level, merge, iterations, html, scene, file_format, archive.path(EXPORT) if out is None else out
-        )
-        return
-    levels, folder = _levels(archive, level), archive.path(EXPORT) if out is None else out
-    fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
-    with one_line_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    for each, field in fields.items():
-        note = _note(archive, each)
-        path = folder / f"{_level_name(archive, each)}.{file_format}"
-        _write_field(field, path, note)
-        print(
-            f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
-            + (", a residual" if field.signed else "")
-        )
-
-
-def _check_together(
-    file_format: str, level: int | None, merge: bool, iterations: int | None, html: bool, scene: Path | None
-) -> None:
-    """Refuse options that would have no effect together."""
-    if not merge:
-        refuse({"--iterations": iterations}, "needs --merge")
-        refuse({"--scene": None if html else scene}, "needs --merge or --html")
+    folder = archive.path(EXPORT) if settings.out is None else settings.out
+    if settings.html or settings.merge:
+        _write_one(archive, settings, folder)
     else:
-        refuse({"--level": level}, "does not go with --merge, which makes one field of all levels")
-    if html:
-        refuse({"--format": None if file_format == "ply" else file_format}, "does not go with --html")
+        _write_levels(archive, settings, folder)
 
 
-def _write_one(
-    archive: RunArchive,
-    level: int | None,
-    merge: bool,
-    iterations: int | None,
-    html: bool,
-    scene: Path | None,
-    file_format: str,
-    folder: Path,
-) -> None:
+def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
+    """Write the field of each chosen level as a file."""
+    levels = _levels(archive, settings.level)
+    fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
+    _make(folder)
+    for each, field in fields.items():
+        path = folder / f"{_level_name(archive, each)}.{settings.file_format}"
+        _write_field(field, path, _note(archive, each))
+        _print_written(path, field, ", a residual" if field.signed else "")
+
+
+def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
     """Write one field, merged or of a level (by default the finest), as a file or a page."""
-    from lapgs_plugin.files import one_line_errors
     from lapgs_plugin.rendering.run import run_cameras
     from lapgs_plugin.reports.splat_page import write_splat_page
 
-    chosen = archive.manifest.record(0 if level is None else level).level
-    field = _merged(archive, scene, iterations) if merge else archive.field(chosen)
+    chosen = archive.manifest.record(settings.level or 0).level
+    field = _merged(archive, settings.scene, settings.iterations) if settings.merge else archive.field(chosen)
     if field.signed:
         raise UserInputError(
             f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
             "field to the run"
         )
-    path = folder / _one_name(archive, level, html, file_format)
-    cameras = list(run_cameras(archive, scene)[0].values()) if html else []
+    if not settings.html:
+        _make(folder)
+        path = folder / f"{MERGED}.{settings.file_format}"
+        _write_field(field, path, f"one field fitted to the images of {archive.path().name}")
+        _print_written(path, field)
+        return
+    cameras = list(run_cameras(archive, settings.scene)[0].values())
+    _make(folder)
+    # Pages of several levels can lie beside each other.
+    path = folder / (PAGE if settings.level is None else f"{_level_name(archive, settings.level)}.html")
+    write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
+    _print_written(path, field, ", opens in a browser without a network")
+
+
+def _make(folder: Path) -> None:
+    from lapgs_plugin.files import one_line_errors
+
     with one_line_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    if html:
-        write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
-    else:
-        _write_field(field, path, f"one field fitted to the images of {archive.path().name}")
-    opens = ", opens in a browser without a network" if html else ""
-    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{opens}")
 
 
-def _one_name(archive: RunArchive, level: int | None, html: bool, file_format: str) -> str:
-    """Return the name of the one file to write: pages of several levels can lie beside each other."""
-    if not html:
-        return f"{MERGED}.{file_format}"
-    return PAGE if level is None else f"{_level_name(archive, level)}.html"
+def _print_written(path: Path, field: GaussianField, remark: str = "") -> None:
+    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{remark}")
 
 
 def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> GaussianField:
@@ -162,6 +155,7 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
     line = f"{merged.kept:.2f} dB PSNR against the run's own images of {merged.views} views that it was not fitted to"
     if merged.photo_psnr is not None:
         line += f"; against the photos {merged.photo_psnr[1]:.2f} dB, where the run has {merged.photo_psnr[0]:.2f}"
+        line += ", both after a colour fit" if merged.colors_fitted else ""
     print(f"merged field: {line}")
     return merged.field
 

@@ -1,8 +1,10 @@
-"""Make the console on which a command prints its tables."""
+"""Print tables, and name the command that comes next."""
 
 from __future__ import annotations
 
 import os
+import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -23,3 +25,9 @@ def make_console(*, stderr: bool = False) -> Console:
     if not made.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
         made.width = UNLIMITED
     return made
+
+
+def train_command(scene: Path) -> str:
+    """Return the command that trains a scene, as a user can paste it."""
+    run = Path("runs") / scene.absolute().name
+    return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval"

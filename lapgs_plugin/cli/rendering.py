@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from lapgs_plugin.options import option
 class RenderOptions:
     """Choose where a run's scene is, and where and with which rasterizer the run is rendered."""
 
-    scene: Path | None = option(None, "Scene folder, if it was moved after training.")  # noqa: RUF009  # ruff knows no field specifiers
+    scene: Path | None = option(None, "Scene folder, if it was moved after training.")
     device: str = option("auto", "cuda, cpu, or auto: CUDA if there is a CUDA device, else the CPU.")
     rasterizer: str = option(
         "auto",
@@ -29,16 +30,16 @@ def show_log() -> None:
     logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
 
 
-def refuse(options: dict[str, object], why: str) -> None:
+def refuse(options: Mapping[str, object], why: str) -> None:
     """Refuse options that would have no effect.
 
     Args:
-        options: values by name; None for an option that was not given.
+        options: values by name; None or False for an option that was not given.
         why: the reason, as it follows the option's name.
 
     Raises:
         UserInputError: one was given.
     """
     for option_name, value in options.items():
-        if value is not None:
+        if value is not None and value is not False:
             raise UserInputError(f"{option_name} {why}; leave it out")

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MAY_CHANGE = ("images_on", "prediction_precision")
 """Settings that may change when a run is continued."""
+CHOSEN_ONCE = ("rasterizer", "strategy")
+"""Options whose value "auto" stands for the choice that the run was started with when it is continued."""
 
 
 @takes_settings
@@ -62,17 +64,19 @@ def train(
 
     Examples:
 
-        lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
+        lapgs train data/garden -o runs/garden --eval
 
-        lapgs train data/garden -o runs/plain --levels 1       (baseline: one field)
+        lapgs train data/garden -o runs/small --resolution 1/4 --iterations 3000
 
-        lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
+        lapgs train data/garden -o runs/plain --levels 1    (a single field)
 
-        lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+        lapgs train data/garden -o runs/nested --hierarchy nested    (one PLY)
 
-        lapgs train data/garden -o runs/garden --resume --iterations 40000       (extends a finished run)
+        lapgs train data/garden -o runs/garden --resume    (after Ctrl-C)
 
-        lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
+        lapgs train data/garden -o runs/garden --resume --iterations 40000
+
+        lapgs train --config runs/garden/run.toml -o runs/again --seed 1
     """
     from rich.markup import escape
 
@@ -101,7 +105,7 @@ def train(
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
     console = make_console(stderr=True)
     if resume:
-        given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
+        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
         archive, loaded = _create(out, reference, settings, choose_rasterizer(control.rasterizer), overwrite)
@@ -109,7 +113,8 @@ def train(
     with archive:
         _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
         if resume and settings.extended:
-            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended)
+            strategy = settings.densification.strategy
+            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
     keep_preview(out.absolute())
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     console.print(
@@ -169,6 +174,11 @@ def _resume(
             given = given - {"iterations"}
         started_with = _wanted(manifest.scene, settings, manifest.rasterizer)
         for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+            if name not in started_with:  # another strategy's
+                raise UserInputError(
+                    f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
+                    f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
+                )
             if wanted[name] != started_with[name]:
                 raise UserInputError(
                     f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant, nearest
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
 from lapgs_plugin.untrusted import STRICT
@@ -84,23 +85,6 @@ class PlannedRun:
     variant: str
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The part of an experiment to run; None leaves the file's.
-
-    Attributes:
-        scenes, backbones, variants: names of those to run.
-        seeds: replace the file's.
-        iterations: replace the file's; those of variants change in proportion.
-    """
-
-    scenes: Collection[str] | None = None
-    backbones: Collection[str] | None = None
-    variants: Collection[str] | None = None
-    seeds: Sequence[int] | None = None
-    iterations: int | None = None
-
-
 def scenes_of(experiment: Experiment, selection: Selection) -> list[SceneSpec]:
     """Return the selected scenes in the file's order.
 
@@ -135,7 +119,7 @@ def plan_runs(experiment: Experiment, selection: Selection) -> list[PlannedRun]:
         raise UserInputError("no run is left: the selected variants are not for the selected backbones")
     planned: list[PlannedRun] = []
     rounds = 0
-    for seed in experiment.seeds if selection.seeds is None else selection.seeds:
+    for seed in selection.seeds_or(experiment.seeds):
         for scene in scenes_of(experiment, selection):
             first = rounds % len(pairs)
             for name, backbone, variant in (*pairs[first:], *pairs[:first]):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.expansion import PlannedRun, Selection
+from lapgs_plugin.experiments.expansion import PlannedRun
 from lapgs_plugin.experiments.schema import Experiment, ExperimentError
+from lapgs_plugin.experiments.settings import Selection
 
 
 class Mistakes:
@@ -62,9 +63,11 @@ def keys_of(experiment: Experiment, selection: Selection, run: PlannedRun) -> di
     number = next(i for i, variant in enumerate(experiment.variants) if variant.name == run.variant)
     variant, backbone = experiment.variants[number], experiment.backbones[spec.backbone]
     own, its = f"variants.{number}", f"backbones.{spec.backbone}"
-    seeds: Sequence[int] = experiment.seeds if selection.seeds is None else selection.seeds
     keys: dict[str, tuple[str, Any]] = {
-        "seed": (f"seeds.{seeds.index(spec.seed)}" if selection.seeds is None else "--seeds", spec.seed),
+        "seed": (
+            "--seeds" if selection.seeds else f"seeds.{experiment.seeds.index(spec.seed)}",
+            spec.seed,
+        ),
         "iterations": (
             "--iterations" if selection.iterations else f"{own}.iterations" if variant.iterations else "iterations",
             spec.iterations,

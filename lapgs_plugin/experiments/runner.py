@@ -9,10 +9,11 @@ from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.commands import Locations, run_steps
-from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec, Selection
+from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
 from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 

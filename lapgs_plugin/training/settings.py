@@ -10,7 +10,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.options import check_bounds, option, option_name, options_of
+from lapgs_plugin.options import check_values, option, option_name, options_of
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
@@ -117,7 +117,7 @@ class Densification:
         f"{LONG_RUN} iterations on, else 3dgs.",
         panel=PANEL,
     )
-    options: Strategy = options_of(STRATEGIES, "strategy")  # noqa: RUF009  # a field, made by `dataclasses.field`
+    options: Strategy = options_of(STRATEGIES, "strategy")
 
     def __post_init__(self) -> None:
         if self.options is None:
@@ -125,7 +125,7 @@ class Densification:
 
     def check(self) -> None:
         """Raise a UserInputError about a value out of range, or options of another strategy."""
-        check_bounds(self)
+        check_values(self)
         if type(self.options) is not type(STRATEGIES[self.strategy]):
             raise UserInputError(f"--strategy {self.strategy} with options of {type(self.options).__name__}")
         self.options.check()
@@ -203,7 +203,7 @@ class TrainSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds(self)
+        check_values(self)
         self._choose_strategy()
         self.learning_rates.check()
         self.densification.check()
@@ -232,7 +232,8 @@ class TrainSettings(HierarchySettings):
         """
         density, paper = self.densification, self.protocol == "paper"
         if isinstance(density.options, Auto):
-            name = density.options.choose(self.scheduled, paper or bool(self._idle(STRATEGIES[MCMC])))
+            heuristics = ["--protocol paper"] if paper else self._idle(STRATEGIES[MCMC])
+            name = density.options.choose(self.scheduled, heuristics)
             chosen = replace(density, strategy=name, options=density.options.options_for(name))
             object.__setattr__(self, "densification", chosen)  # the dataclass is frozen
         elif paper and density.strategy != GRADIENTS:

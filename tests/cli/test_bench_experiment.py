@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from lapgs_plugin.cli.bench import bench_app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.expansion import Selection, plan_runs
+from lapgs_plugin.experiments.expansion import plan_runs
 from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import DONE, FAILED, Job, ResultStore
 from lapgs_plugin.scenes.sample import make_sample_scene
 

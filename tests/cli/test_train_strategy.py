@@ -120,7 +120,7 @@ def command(**animals: Any) -> Any:
     @dataclass(frozen=True)
     class Settings:
         animal: str = option("tame", "Which.")
-        options: Any = options_of(registry, "animal")  # noqa: RUF009  # a field
+        options: Any = options_of(registry, "animal")
 
     def show(settings: Any) -> dict[str, Any]:
         return asdict(settings)

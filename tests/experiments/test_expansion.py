@@ -17,8 +17,9 @@ from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import commands
 from lapgs_plugin.experiments.commands import Locations, run_steps
-from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
 from lapgs_plugin.experiments.schema import Experiment
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.standard import PRESETS
 from tests.experiments.examples import SMALL, run_spec
 
@@ -74,7 +75,7 @@ def test_variants_trained_alike_share_their_runs_and_a_new_name_repeats_none() -
     ]
     ids = {
         run.variant: run.spec.run_id
-        for run in plan_runs(experiment(variants=alike), Selection(scenes=["a"], seeds=[0], backbones=["cpu"]))
+        for run in plan_runs(experiment(variants=alike), Selection(scenes=["a"], seeds="0", backbones=["cpu"]))
     }
     assert ids["xyz"] == ids["rho = 1"] != ids["other"]
 
@@ -86,7 +87,7 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
         {"name": "default"},
         {"name": "residuals", "options": {"hierarchy": "laplacian"}},
     ]
-    planned = plan_runs(experiment(variants=variants), Selection(scenes=["a"], seeds=[0]))
+    planned = plan_runs(experiment(variants=variants), Selection(scenes=["a"], seeds="0"))
     for backbone in ("cpu", "fast"):
         specs = {run.variant: run.spec for run in planned if run.spec.backbone == backbone}
         found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
@@ -99,7 +100,7 @@ def test_a_variant_may_have_a_preset_of_its_own() -> None:
         {"name": "bare", "method": "bare"},
         {"name": "own", "preset": {"fast": "graphdeco.ours"}, "options": {"sh_rate": 3.0}},
     ]
-    planned = plan_runs(experiment(variants=variants), Selection(backbones=["fast"], scenes=["a"], seeds=[0]))
+    planned = plan_runs(experiment(variants=variants), Selection(backbones=["fast"], scenes=["a"], seeds="0"))
     bare, own = (run.spec for run in planned)
     assert bare.arguments == list(PRESETS["fastgs.big"].common)
     assert own.arguments == list(PRESETS["graphdeco.ours"].common)
@@ -108,7 +109,7 @@ def test_a_variant_may_have_a_preset_of_its_own() -> None:
 
 
 def test_only_selected_runs_are_planned() -> None:
-    selection = Selection(scenes=["b"], backbones=["fast"], variants=["bare"], seeds=[7], iterations=9)
+    selection = Selection(scenes=["b"], backbones=["fast"], variants=["bare"], seeds="7", iterations=9)
     (run,) = plan_runs(experiment(), selection)
     spec = run.spec
     assert (spec.scene, spec.backbone, spec.seed, spec.iterations) == ("b", "fast", 7, 9)
@@ -123,7 +124,7 @@ def test_only_selected_runs_are_planned() -> None:
 def test_fewer_iterations_are_fewer_for_all() -> None:
     variants = [{"name": "usual"}, {"name": "longer", "iterations": 60}]
     planned = plan_runs(
-        experiment(variants=variants), Selection(iterations=10, scenes=["a"], seeds=[0], backbones=["cpu"])
+        experiment(variants=variants), Selection(iterations=10, scenes=["a"], seeds="0", backbones=["cpu"])
     )
     assert {run.variant: run.spec.iterations for run in planned} == {"usual": 10, "longer": 15}, "of 40 and 60"
 

@@ -10,8 +10,9 @@ import pytest
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.aggregate import check_table
-from lapgs_plugin.experiments.expansion import Selection, plan_runs
+from lapgs_plugin.experiments.expansion import plan_runs
 from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.experiments.settings import Selection
 
 BENCHMARKS = sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml"))
 

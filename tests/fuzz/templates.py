@@ -28,11 +28,12 @@ from plyfile import PlyData
 
 from lapgs_plugin import __version__
 from lapgs_plugin.experiments.commands import Locations
-from lapgs_plugin.experiments.expansion import Selection, plan_runs, scenes_of
+from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
 from lapgs_plugin.experiments.runner import Folder, prepare
 from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import ResultStore
 from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.patching.recipe import patches_folder

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_bounds, option
+from lapgs_plugin.options import check_values, option
 
 AUTO = "auto"
 EXHAUSTIVE, SEQUENTIAL, RETRIEVAL = "exhaustive", "sequential", "retrieval"
@@ -49,7 +49,7 @@ class PrepareSettings:
     max_size: int | None = option(
         None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
     )
-    masks: Path | None = option(  # noqa: RUF009  # ruff knows no field specifiers
+    masks: Path | None = option(
         None,
         "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
         "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
@@ -67,4 +67,4 @@ class PrepareSettings:
                 raise UserInputError(
                     f"--camera-model {self.camera_model!r}: expected auto or one of {', '.join(CAMERA_MODELS)}"
                 )
-        check_bounds(self)
+        check_values(self)
