@@ -211,12 +211,15 @@ class Mcmc(Regularized):
 
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
-    unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
+    unused: ClassVar[tuple[str, ...]] = (
+        *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
+    )
 
     cap_max: int | None = option(
         None,
         f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
-        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}.",
+        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A "
+        "level that starts with more keeps them.",
         panel=PANEL,
         least=1,
     )
