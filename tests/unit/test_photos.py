@@ -31,7 +31,7 @@ from lapgs_plugin.scenes.prepare.colmap import chosen_matcher
 from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.prepare.inputs import one_camera
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.left_out import left_out_because
+from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
 from lapgs_plugin.scenes.prepare.photos import find_photos
 from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
@@ -324,6 +324,11 @@ def test_reasons_for_photos_without_a_place(tmp_path: Path) -> None:
         left_out.UNSURE: ["mirror.jpg"],
         left_out.APART: ["other_room.jpg"],
     }
+
+
+def test_cameras_that_rest_on_few_points_are_told() -> None:
+    assert few_points(557, 29).startswith("557 points are few for 29 photos: cameras may be wrong")  # a museum piece
+    assert not few_points(12540, 50)  # fox
 
 
 def test_many_photos_are_matched_by_retrieval(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tell why COLMAP could not place some photos, and what to try."""
+"""Tell why COLMAP could not place some photos, or not reliably, and what to try."""
 
 from __future__ import annotations
 
@@ -20,6 +20,19 @@ UNSURE = (
     "they match placed photos, but not at one place: repeated patterns, mirrors or things that moved; hide these by "
     "--masks, or take more photos around there"
 )
+
+FEW_POINTS = 30
+"""Points for each placed photo below which the cameras rest on little; well-covered scenes have hundreds."""
+
+
+def few_points(points: int, photos: int) -> str:
+    """Return what to do about a scene with so few points that its cameras may be wrong, else nothing."""
+    if points >= FEW_POINTS * photos:
+        return ""
+    return (
+        f"{points} points are few for {photos} photos: cameras may be wrong; what may help: --matcher exhaustive, "
+        "larger masks, or more photos, sharp, in more light and a step aside from each other"
+    )
 
 
 def left_out_because(

@@ -16,7 +16,7 @@ from lapgs_plugin.scenes.output import check_output, one_line_errors
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
 from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
 from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
-from lapgs_plugin.scenes.prepare.left_out import left_out_because
+from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
 from lapgs_plugin.scenes.prepare.photos import Photos, find_photos, listed
 from lapgs_plugin.scenes.prepare.placement import place_cameras
 from lapgs_plugin.scenes.prepare.settings import SEQUENTIAL, PrepareSettings
@@ -129,6 +129,8 @@ def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRes
             logger.warning("%s: %s", listed(names), reason)
         if chosen_matcher(job) == SEQUENTIAL and job.found.clip is None:
             logger.warning("--matcher sequential compares neighbours by name; try --matcher exhaustive")
+    if warning := few_points(best.num_points3D(), len(registered)):
+        logger.warning(warning)
     return PrepareResult(
         registered=tuple(registered),
         left_out=tuple(left_out),
