@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 @takes_settings
 def report(
-    options: RenderOptions,
     run: Annotated[
         Path | None,
         typer.Argument(
@@ -29,9 +28,11 @@ def report(
             "Default: the newest one in runs/.",
         ),
     ] = None,
+    *,
     baseline: Annotated[
         Path | None, typer.Option(help="Another run to compare with, such as one trained with --levels 1.")
     ] = None,
+    options: RenderOptions,
 ) -> None:
     """Print the metrics of RUN and write RUN/report.html with curves and images.
 
