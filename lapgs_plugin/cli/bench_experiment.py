@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +18,6 @@ from lapgs_plugin.limits import LONGEST_NAME
 if TYPE_CHECKING:
     from lapgs_plugin.experiments.commands import Locations
     from lapgs_plugin.experiments.expansion import PlannedRun
-    from lapgs_plugin.experiments.launchers import WorkOrder
     from lapgs_plugin.experiments.mistakes import Mistakes
     from lapgs_plugin.experiments.runner import Folder
     from lapgs_plugin.experiments.schema import Experiment
@@ -94,12 +92,11 @@ def _run(
     """Check all runs, then execute them, or print their commands with --dry-run."""
     from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.expansion import scenes_of
-    from lapgs_plugin.experiments.launchers import check_order
+    from lapgs_plugin.experiments.launchers import check_launcher
     from lapgs_plugin.experiments.runner import make_samples, prepare
 
-    order = _order(engine, folder)
     if not results.dry_run:
-        check_order(engine.launcher, order)
+        check_launcher(engine)
         _require_place(folder.path)
     scenes = scenes_of(experiment, selection)
     measuring = _measuring(results)
@@ -111,7 +108,7 @@ def _run(
         _print_commands(jobs)
         return
     make_samples(scenes, folder)
-    _follow(jobs, folder, engine.launcher, order)
+    _follow(jobs, folder, engine)
 
 
 def _option_names() -> dict[str, set[str]]:
@@ -178,25 +175,11 @@ def _print_commands(jobs: Sequence[Job]) -> None:
             print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
-def _order(engine: WorkerSettings, folder: Folder) -> WorkOrder:
-    """Return the settings of the workers; the runs are filled in later."""
-    from lapgs_plugin.experiments.launchers import WorkOrder
-
-    return WorkOrder(
-        store=folder.store.absolute(),
-        run_ids=(),
-        workers=engine.workers,
-        gpus=None if engine.gpus is None else engine.gpus.split(","),
-        logs=folder.logs("workers").absolute(),
-        options=engine.launcher_options,
-    )
-
-
-def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder) -> None:
+def _follow(jobs: Sequence[Job], folder: Folder, engine: WorkerSettings) -> None:
     """Run the jobs with a progress bar and a line for each finished run."""
     from rich.markup import escape
 
-    from lapgs_plugin.experiments.launchers import launch
+    from lapgs_plugin.experiments.launchers import WorkOrder, launch
     from lapgs_plugin.experiments.runner import execute
     from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
     from lapgs_plugin.progress import item_progress
@@ -204,7 +187,7 @@ def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder
     store = ResultStore.create(folder.store)
     store.plan(jobs)
     run_ids = [job.run_id for job in jobs]
-    order = replace(order, run_ids=run_ids)
+    order = WorkOrder(folder.store.absolute(), run_ids, folder.logs("workers").absolute(), engine)
     finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
     if finished:
         make_console(stderr=True).print(f"{finished} of {len(run_ids)} runs are done already")
@@ -220,7 +203,7 @@ def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder
             progress.console.print(text, soft_wrap=True, highlight=False)
 
         try:
-            execute(store, run_ids, lambda: launch(launcher, order), say)
+            execute(store, run_ids, lambda: launch(order), say)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 

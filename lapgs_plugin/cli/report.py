@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, make_table
 from lapgs_plugin.cli.rendering import RenderOptions, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
 
@@ -86,14 +86,12 @@ def _newest(folder: Path) -> Path:
 
 
 def _print(runs: Sequence[MeasuredRun]) -> None:
-    from rich import box
     from rich.markup import escape
-    from rich.table import Table
 
     from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
     names = [escape(each.archive.path().name) for each in runs]
-    table = Table("", *names, *(["change"] if len(runs) > 1 else []), box=box.SIMPLE_HEAD)
+    table = make_table("", *names, *(["change"] if len(runs) > 1 else []))
     for row in comparison_rows([each.metrics for each in runs]):
         cells = ["\n".join([cell.text, *(f"[dim]{part}[/dim]" for part in cell.parts)]) for cell in row.cells]
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))

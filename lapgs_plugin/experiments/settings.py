@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
@@ -94,7 +95,7 @@ class WorkerSettings:
     )
 
     @property
-    def launcher_options(self) -> dict[str, str | int]:
+    def launcher_options(self) -> dict[str, Any]:
         """The values of --launcher-option by name.
 
         Raises:
