@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -84,6 +84,8 @@ def run(
     script's output folder (-m) with one folder per level; `lapgs render`, `lapgs eval` and `lapgs report` read it.
     After Ctrl-C, repeat the command with --resume to continue after the last finished level.
     """
+    import logging
+
     from lapgs_plugin.checkouts.script import require_script
     from lapgs_plugin.runs.gpu_busy import require_cuda
 
@@ -102,6 +104,10 @@ def run(
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
+    attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
+    attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
     _execute(path, words, kind, root, device, options, settings, measuring, watcher)
 
 
@@ -117,17 +123,12 @@ def _execute(
     watcher: Watcher,
 ) -> None:
     """Execute the script: with a hierarchy, or unchanged with --off."""
-    import logging
-
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_rasterizer import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
 
-    logging.basicConfig(format="lapgs: %(message)s")
-    logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
-    attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
-    attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
     on_device: AbstractContextManager[None] = nullcontext()
     if device == "cpu":
         on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, arguments))
@@ -139,40 +140,23 @@ def _execute(
             if options.off:
                 BareRunRecorder(kind(loaded), device, measuring.gpu_busy).run()
                 return
-            folder = _train(kind(loaded), device, options, settings, measuring, watcher)
-        if folder is not None:
-            keep_preview(folder, device)
+            driver = HierarchyDriver(
+                kind(loaded),
+                settings,
+                device=device,
+                resume=options.resume,
+                overwrite=options.overwrite,
+                watcher=watcher,
+                **asdict(measuring),
+            )
+            driver.run()
+        if driver.folder is not None:
+            keep_preview(driver.folder, device)
     except ImportError as error:
         line = None if options.off else explain_import_error(error, script, on_cpu=device == "cpu")
         if line is None:
             raise
         raise line from error
-
-
-def _train(
-    adapter: BackboneAdapter,
-    device: str,
-    options: ScriptOptions,
-    settings: RunSettings,
-    measuring: MeasuringOptions,
-    watcher: Watcher,
-) -> Path | None:
-    """Train with a hierarchy, and return the run's folder."""
-    from lapgs_plugin.runner.driver import HierarchyDriver
-
-    driver = HierarchyDriver(
-        adapter,
-        settings,
-        device=device,
-        resume=options.resume,
-        overwrite=options.overwrite,
-        breakdown=measuring.breakdown,
-        gpu_busy=measuring.gpu_busy,
-        watcher=watcher,
-        test_every=measuring.test_every,
-    )
-    driver.run()
-    return driver.folder
 
 
 def _chosen_device(device: str) -> str:

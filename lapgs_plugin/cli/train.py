@@ -173,7 +173,7 @@ def _resume(
         UserInputError: the scene or an option differs from those that the run was started with.
     """
     from lapgs_plugin.files import MANIFEST
-    from lapgs_plugin.rendering.run import require_same_scene
+    from lapgs_plugin.rendering.run import load_reference, require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.planning import check_storage
@@ -181,12 +181,7 @@ def _resume(
     archive = RunArchive.open(out, resume=True)
     try:
         manifest = archive.manifest
-        before = Path(manifest.scene.path)
-        if before.exists() and scene.exists() and not before.samefile(scene):
-            raise UserInputError(
-                f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
-                "start again with --overwrite"
-            )
+        _require_same_folder(out, Path(manifest.scene.path), scene)
         settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
         if manifest.complete:
             settings = _extended(archive, settings, int(wanted["iterations"]) if "iterations" in given else None)
@@ -200,12 +195,21 @@ def _resume(
             if anew:
                 raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
-        loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
+        loaded = load_reference(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:
         archive.close()
         raise
     return archive, loaded, settings
+
+
+def _require_same_folder(out: Path, before: Path, scene: Path) -> None:
+    """Refuse another scene than that of the run, which may have been moved."""
+    if before.exists() and scene.exists() and not before.samefile(scene):
+        raise UserInputError(
+            f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or start "
+            "again with --overwrite"
+        )
 
 
 def _require_same(out: Path, given: set[str], wanted: Mapping[str, Any], started_with: Mapping[str, Any]) -> None:
@@ -238,23 +242,11 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     return replace(settings, iterations=goal, extended=settings.extended + goal - done)
 
 
-def _load(reference: SceneReference) -> Scene:
-    from lapgs_plugin.scenes import load_scene
-
-    return load_scene(
-        reference.path,
-        resolution=reference.resolution,
-        images=reference.images,
-        eval=reference.eval,
-        masks=reference.masks,
-        background=reference.background,
-    )
-
-
 def _create(
     out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
 ) -> tuple[RunArchive, Scene]:
     """Read the scene and check the settings before the run folder is made."""
+    from lapgs_plugin.rendering.run import load_reference
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
@@ -263,7 +255,7 @@ def _create(
     RunArchive.require_room(out, overwrite)
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
-    loaded = _load(reference)
+    loaded = load_reference(reference)
     make_plan(loaded.smallest_size, settings, len(loaded.train))
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
