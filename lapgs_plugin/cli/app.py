@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from typing import Annotated, Any
 
@@ -83,6 +84,20 @@ app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)
 app.add_typer(patch.app, name="patch")
 app.command("doctor")(doctor)
+
+
+def _flowing_help(group: typer.Typer) -> None:
+    """Join the lines of each paragraph of the help texts, which typer would print broken as they are in the source."""
+    for each in [*group.registered_commands, group.registered_callback]:
+        if each is not None and each.callback is not None:
+            paragraphs = inspect.cleandoc(each.callback.__doc__ or "").split("\n\n")
+            each.help = "\n\n".join(text.replace("\n", " ") for text in paragraphs)
+    for inner in group.registered_groups:
+        if inner.typer_instance is not None:
+            _flowing_help(inner.typer_instance)
+
+
+_flowing_help(app)
 
 
 def run() -> None:

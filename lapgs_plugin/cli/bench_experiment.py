@@ -52,7 +52,7 @@ def bench_experiment(
 
         lapgs bench benchmarks/smoke.toml
 
-        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360 --path fastgs=~/FastGS --scene bonsai
+        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360
     """
     from lapgs_plugin.experiments.aggregate import check_table
     from lapgs_plugin.experiments.commands import Locations

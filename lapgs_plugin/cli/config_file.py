@@ -13,6 +13,7 @@ import typer
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.training.strategies import AUTO, GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_toml
 
 RUN_CONFIG = "run.toml"
@@ -61,14 +62,32 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
         if not isinstance(value, str | int | float):
             raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")
         values[name] = value
+    return _of_this_version(values)
+
+
+def _of_this_version(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of a file that may be of an older version, which wrote defaults that have changed since."""
+    strategy = values.get("strategy")
+    if strategy == "default":  # its name once
+        values["strategy"] = GRADIENTS
+    if strategy not in (None, AUTO, MCMC) and values.get("cap_max") == 1_000_000:  # written with every strategy
+        del values["cap_max"]
     return values
 
 
-def extend_config(path: Path, iterations: int, extended: int) -> None:
-    """Replace the iterations in the settings file of a run that was extended; older runs have no such file."""
+def extend_config(path: Path, iterations: int, extended: int, strategy: str) -> None:
+    """Replace what the extension of a run changed in its settings file; older runs have no such file.
+
+    Args:
+        path: of the file.
+        iterations: of the longer run.
+        extended: those after the schedule's end.
+        strategy: of the run; "auto" could choose another one for so many iterations.
+    """
     if path.is_file():
         line = f"iterations = {iterations}  # the last {extended} extended the finished run"
         text = re.sub(r"(?m)^iterations = .*$", line, path.read_text(encoding="utf-8"))
+        text = re.sub(r'(?m)^strategy = "auto"$', f"strategy = {json.dumps(strategy)}", text)
         with one_line_errors(path), atomic_write(path) as file:
             file.write(text.encode())
 

@@ -138,12 +138,11 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 
     measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
-    missing = list(metrics["lpips_missing"])
-    headings = [f"LPIPS ({title_of(name)})" for name in (*measured, *missing)]
+    headings = [f"LPIPS ({title_of(name)})" for name in measured]
     table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings)
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
-        distances = [*(f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured), *("not measured" for _ in missing)]
+        distances = [f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured]
         figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
@@ -177,8 +176,12 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
+    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS
+
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
-    where = " inside their masks (LPIPS: the photo outside)" if metrics["masked"] else ""
+    where = " inside their masks" if metrics["masked"] else ""
+    if where and any(LPIPS_KEY.format(name) in metrics for name in VARIANTS):
+        where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
@@ -187,15 +190,14 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         highlight=False,
     )
     console.print(
-        f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR on the right halves of the views, after a colour fit on "
-        "their left halves: compare this where exposure or white balance change from photo to photo"
-        + (", as in this run, whose renders have the mean exposure" if metrics["exposure_compensated"] else ""),
+        f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR of the right half of each view after a colour fit on its "
+        "left half; compare this one where photos differ in exposure or white balance"
+        + (", as they do here" if metrics["exposure_compensated"] else ""),
         highlight=False,
     )
     if metrics["exposure_predicted"]:
         console.print(
-            "the other figures are of renders with the exposure that the training photos beside each view in the order "
-            "of names predict",
+            "all other figures give each view the exposure of its neighbours by name among the training photos",
             highlight=False,
         )
     if (peak := metrics["peak_memory_bytes"]) is not None:

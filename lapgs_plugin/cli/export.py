@@ -155,6 +155,7 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
     line = f"{merged.kept:.2f} dB PSNR against the run's own images of {merged.views} views that it was not fitted to"
     if merged.photo_psnr is not None:
         line += f"; against the photos {merged.photo_psnr[1]:.2f} dB, where the run has {merged.photo_psnr[0]:.2f}"
+        line += ", both after a colour fit" if merged.colors_fitted else ""
     print(f"merged field: {line}")
     return merged.field
 

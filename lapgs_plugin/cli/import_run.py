@@ -49,7 +49,7 @@ def import_run(
 
         lapgs import-run output/garden --backbone fastgs
 
-        lapgs import-run output/garden -o runs/garden -s /data/garden --backbone taming
+        lapgs import-run output/garden -o runs/garden --backbone taming
     """
     from lapgs_plugin.runner.imported import import_run as make_run
     from lapgs_plugin.runner.imported import read_foreign_run

@@ -1,8 +1,10 @@
-"""Make the console and the tables that a command prints."""
+"""Print tables, and name the command that comes next."""
 
 from __future__ import annotations
 
 import os
+import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -32,3 +34,9 @@ def make_table(*headings: str) -> Table:
     from rich.table import Table
 
     return Table(*headings, box=box.SIMPLE_HEAD)
+
+
+def train_command(scene: Path) -> str:
+    """Return the command that trains a scene, as a user can paste it."""
+    run = Path("runs") / scene.absolute().name
+    return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval"

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.output import train_command
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 
 
@@ -38,7 +39,7 @@ def prepare(
 
     logging.basicConfig(format="%(message)s")
     logging.getLogger("lapgs_plugin.scenes").setLevel(logging.INFO)
-    advise("repeat the command to go on where it stopped")
+    advise(f"{out} keeps the finished steps, repeat the command to continue")
     result = prepare_scene(photos, out, settings, overwrite=overwrite)
     total = len(result.registered) + len(result.left_out)
     typer.echo(
@@ -46,4 +47,4 @@ def prepare(
         f"mean reprojection error {result.reprojection_error:.2f} pixels, "
         + ", ".join(f"{step.lower()} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
-    typer.echo(f"next: lapgs train {out} -o RUN")
+    typer.echo(f"next: {train_command(out)}")

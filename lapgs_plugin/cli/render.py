@@ -115,11 +115,11 @@ def render(
 
         lapgs render runs/garden --views all --format exr --out /tmp/garden
 
-        lapgs render runs/garden --trajectory orbit --size 1280x720 --out garden.mp4
+        lapgs render runs/garden --trajectory orbit --out garden.mp4
 
         lapgs render runs/garden --fps --size 3840x2160
 
-        lapgs render runs/garden --trajectory spline --panels --format exr --out frames/
+        lapgs render runs/garden --trajectory spline --panels --out frames/
     """
     from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.rendering.run import run_renderer

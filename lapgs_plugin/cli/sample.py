@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from lapgs_plugin.cli.output import train_command
+
 
 def sample(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write. It appears when complete.")],
@@ -28,4 +30,4 @@ def sample(
         out, width=width, height=height, views=views, points=points, seed=seed, overwrite=overwrite, progress=True
     )
     typer.echo(f"{out}: {views} images of {width}x{height}, {points} points")
-    typer.echo(f"next: lapgs train {out} -o RUN")
+    typer.echo(f"next: {train_command(out)}")

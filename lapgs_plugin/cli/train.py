@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MAY_CHANGE = ("images_on", "prediction_precision")
 """Settings that may change when a run is continued."""
+CHOSEN_ONCE = ("rasterizer", "strategy")
+"""Options whose value "auto" stands for the choice that the run was started with when it is continued."""
 
 
 @dataclass(frozen=True)
@@ -74,17 +76,19 @@ def train(
 
     Examples:
 
-        lapgs train data/garden -o runs/garden --resolution 1/4 --iterations 3000 --eval
+        lapgs train data/garden -o runs/garden --eval
 
-        lapgs train data/garden -o runs/plain --levels 1       (baseline: one field)
+        lapgs train data/garden -o runs/small --resolution 1/4 --iterations 3000
 
-        lapgs train data/garden -o runs/nested --hierarchy nested       (ends as one plain PLY)
+        lapgs train data/garden -o runs/plain --levels 1    (a single field)
 
-        lapgs train data/garden -o runs/garden --resume        (after Ctrl-C or a crash)
+        lapgs train data/garden -o runs/nested --hierarchy nested    (one PLY)
 
-        lapgs train data/garden -o runs/garden --resume --iterations 40000       (extends a finished run)
+        lapgs train data/garden -o runs/garden --resume    (after Ctrl-C)
 
-        lapgs train --config runs/garden/run.toml -o runs/again --seed 1       (the same with another seed)
+        lapgs train data/garden -o runs/garden --resume --iterations 40000
+
+        lapgs train --config runs/garden/run.toml -o runs/again --seed 1
     """
     from lapgs_plugin.scenes.masks import resolve_masks
 
@@ -96,7 +100,7 @@ def train(
     reference = replace(reference, masks=resolve_masks(scene, photos.masks))
     _require_measuring(settings, control)
     if start.resume:
-        given = given_options(context) - ({"rasterizer"} if control.rasterizer == AUTO else set())
+        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
         archive, loaded = _create(out, reference, settings, control.rasterizer, start.overwrite)
@@ -215,6 +219,11 @@ def _require_same_folder(out: Path, before: Path, scene: Path) -> None:
 def _require_same(out: Path, given: set[str], wanted: Mapping[str, Any], started_with: Mapping[str, Any]) -> None:
     """Refuse given options that are not those of the run."""
     for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+        if name not in started_with:  # another strategy's
+            raise UserInputError(
+                f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
+                f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
+            )
         if wanted[name] != started_with[name]:
             raise UserInputError(
                 f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "
@@ -309,7 +318,8 @@ def _run(
         )
         trainer.run(resume)
     if resume and settings.extended:
-        extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended)
+        strategy = settings.densification.strategy
+        extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
 
 
 def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:

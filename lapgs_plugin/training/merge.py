@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import render_image
 from lapgs_plugin.hierarchy.settings import AUTO
@@ -28,6 +28,7 @@ from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.strategies import GRADIENTS
 from lapgs_plugin.training.trainer import Trainer
 
 ITERATIONS = 3000
@@ -47,12 +48,15 @@ class Merged:
         views: number of these views.
         photo_psnr: PSNR in dB of the run and of the field against the held-out photos, inside of masks; None without
             held-out views.
+        colors_fitted: whether these two were measured after a colour fit, as `lapgs eval` prints them, because the run
+            compensates exposure.
     """
 
     field: GaussianField
     kept: float
     views: int
     photo_psnr: tuple[float, float] | None
+    colors_fitted: bool
 
 
 def merge_levels(
@@ -95,7 +99,8 @@ def merge_levels(
                 first_field=start,
             ).run()
             field = fitted.field(0)
-        return _measured(field, teacher, scene, placed)
+        colors_fitted = archive.exposure(archive.available_levels[-1]) is not None
+        return _measured(field, teacher, scene, placed, colors_fitted)
 
 
 def first_field(fields: dict[int, GaussianField]) -> GaussianField:
@@ -134,7 +139,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSetti
         exposure=OFF,  # what the run learned of its photos' exposure is part of its images
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
-        densification=Densification(until=0, reset_every=0),
+        densification=Densification(until=0, reset_every=0, strategy=GRADIENTS),  # the field stays as it is
         antialiased=bool(manifest.settings.get("antialiased", False)),
     )
 
@@ -157,15 +162,18 @@ def _composed(renderer: HierarchyRenderer, scene: Scene) -> Scene:
 
 
 @torch.no_grad()
-def _measured(field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer) -> Merged:
+def _measured(
+    field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer, colors_fitted: bool
+) -> Merged:
     on_device, photos = field.to(placed.device), {view.name: view for view in scene.test}
     background = torch.tensor(scene.background, device=placed.device)
+    to_photo = color_fitted_psnr if colors_fitted else psnr
     kept, against_photos = [], []
     for view in teacher.test:
         image = render_image(placed.rasterizer, on_device, view.camera, background).cpu()
         kept.append(psnr(image, view.image))
         if (photo := photos.get(view.name)) is not None:
-            run_and_field = (psnr(each, photo.image, photo.mask) for each in (view.image, image))
+            run_and_field = (to_photo(each, photo.image, photo.mask) for each in (view.image, image))
             against_photos.append(tuple(run_and_field))
     means = tuple(map(fmean, zip(*against_photos, strict=True)))
-    return Merged(field, fmean(kept), len(kept), (means[0], means[1]) if means else None)
+    return Merged(field, fmean(kept), len(kept), (means[0], means[1]) if means else None, colors_fitted)

@@ -159,10 +159,10 @@ class TrainableField:
 
     @property
     def _touched(self) -> Tensor:
-        """(n,) whether each Gaussian has got a gradient since the last step."""
-        gradient = self.params["opacities"].grad
+        """(n,) whether a view has shown each Gaussian since the last step."""
+        gradient = self.params["means"].grad  # opacities and scales have one of regularization, too
         assert gradient is not None, "no backward pass since the last step"
-        return gradient != 0
+        return (gradient != 0).any(-1)
 
     @torch.no_grad()
     def overwrite(self, rows: Tensor, source: Tensor) -> None:

@@ -95,8 +95,9 @@ def _of_this_version(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
         every = {each.name for name in ("multiview", "mcmc") for each in fields(STRATEGIES[name])}
         listed = {name: density.pop(name) for name in every & density.keys()}
         options = {each.name: listed[each.name] for each in fields(strategy) if each.name in listed}
-    if "coarse_threshold" in strategy.unused:
-        values["coarse_threshold"] = None  # manifests name the hierarchy's all the same
+    for name, neutral in (("coarse_threshold", None), ("residual_resets", False)):
+        if name in strategy.unused:
+            values[name] = neutral  # manifests name the hierarchy's all the same
     if values["hierarchy"] == Hierarchy.NESTED.value:
         values["inherit"] = None  # the same
     values.setdefault("antialiased", bool(values.get("raster")))

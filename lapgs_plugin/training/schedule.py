@@ -87,7 +87,8 @@ class StageSchedule:
 
         resets = constant(given.reset_every, 3000, 300)
         keeps_opacities = before or (stage.signed and not settings.residual_resets)
-        if given.reset_every == 0 or (keeps_opacities and given.reset_every is None):
+        never = given.reset_every == 0 or "reset_every" in given.options.unused
+        if never or (keeps_opacities and given.reset_every is None):
             resets = stage.iterations + 1  # never
         until = constant(given.until, given.options.densify_until, 1)
         of_stage = round(until * stage.iterations / settings.scheduled)

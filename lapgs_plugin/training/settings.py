@@ -232,7 +232,8 @@ class TrainSettings(HierarchySettings):
         """
         density, paper = self.densification, self.protocol == "paper"
         if isinstance(density.options, Auto):
-            name = density.options.choose(self.scheduled, paper or bool(self._idle(STRATEGIES[MCMC])))
+            heuristics = ["--protocol paper"] if paper else self._idle(STRATEGIES[MCMC])
+            name = density.options.choose(self.scheduled, heuristics)
             chosen = replace(density, strategy=name, options=density.options.options_for(name))
             object.__setattr__(self, "densification", chosen)  # the dataclass is frozen
         elif paper and density.strategy != GRADIENTS:

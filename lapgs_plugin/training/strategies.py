@@ -7,11 +7,12 @@ Each strategy here says what differs between strategies in the rest of training;
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option
+from lapgs_plugin.options import check_values, option, option_name
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -210,12 +211,15 @@ class Mcmc(Regularized):
 
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
-    unused: ClassVar[tuple[str, ...]] = ("prune", "coarse_threshold", "residual_threshold", "reset_every")
+    unused: ClassVar[tuple[str, ...]] = (
+        *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
+    )
 
     cap_max: int | None = option(
         None,
         f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
-        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}.",
+        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A "
+        "level that starts with more keeps them.",
         panel=PANEL,
         least=1,
     )
@@ -243,24 +247,26 @@ class Mcmc(Regularized):
 class Auto(Mcmc, Gradients):
     """Choose between MCMC and 3DGS's heuristics by the length of a run, and by options that only one of them has."""
 
-    def choose(self, iterations: int, heuristics: bool) -> str:
+    def choose(self, iterations: int, heuristics: Sequence[str]) -> str:
         """Return the name of the strategy to train with.
 
         Args:
             iterations: of the run.
-            heuristics: whether its settings need those of 3DGS.
+            heuristics: options that were given and that only 3DGS's heuristics have, besides those declared here.
 
         Raises:
             UserInputError: options of both were given.
         """
-        limits = [name for name in ("cap_max", "base_cap_max") if getattr(self, name) is not None]
-        thresholds = [name for name in ("grow_grad2d", "absgrad") if getattr(self, name) not in (None, False)]
-        if limits and (thresholds or heuristics):
+        values = {each.name: (option_name(each), getattr(self, each.name)) for each in fields(self)}
+        given = {name: shown for name, (shown, value) in values.items() if value is not None and value is not False}
+        limits = [given[name] for name in ("cap_max", "base_cap_max") if name in given]
+        heuristics = [*(given[name] for name in ("grow_grad2d", "absgrad") if name in given), *heuristics]
+        if limits and heuristics:
             raise UserInputError(
-                f"--{limits[0].replace('_', '-')} is an option of --strategy {MCMC}, which does not take "
-                f"{'--densify-threshold or --absgrad' if thresholds else 'other settings given'}; leave one out"
+                f"{limits[0]} is an option of --strategy {MCMC}, which does not take {', '.join(heuristics)}; leave "
+                "one out"
             )
-        if thresholds or heuristics:
+        if heuristics:
             return GRADIENTS
         return MCMC if limits or iterations >= LONG_RUN else GRADIENTS
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +14,13 @@ import torch
 from scipy.spatial.distance import cdist
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.run import run_cameras, run_renderer
+from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.training import stage_start
+from lapgs_plugin.training import merge, stage_start
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -50,6 +52,36 @@ def test_the_merged_field_keeps_most_of_the_image(tmp_path: Path) -> None:
     started = _kept(run, first_field({level: archive.field(level) for level in (1, 0)}))
     assert float(kept) > started + 2  # seen 3.1
     assert float(photo) == pytest.approx(float(before), abs=0.5)  # seen 0.02
+
+
+def test_a_run_that_compensates_exposure_is_compared_with_photos_after_a_colour_fit(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    run = write_run(tmp_path / "run", scene)
+    identity = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    (run / "level_0" / "exposure.json").write_text(json.dumps({"0.png": identity}))
+    output = lapgs_export(run, "--merge", "--iterations", 2)
+    (before,) = re.findall(r"where the run has ([0-9.]+), both after a colour fit", output)
+    archive = RunArchive.open(run)
+    renderer, photos = run_renderer(archive), run_scene(archive).test
+    fitted = [color_fitted_psnr(renderer.images([view.camera], 0)[0].cpu(), view.image) for view in photos]
+    assert float(before) == pytest.approx(fmean(fitted), abs=0.01)
+
+
+def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its opacities and sizes are right already, and nothing is to shake the positions."""
+    found = []
+
+    def trainer(**given: Any) -> None:
+        found.append(given["settings"].densification.options)
+        raise UserInputError("far enough")
+
+    monkeypatch.setattr(merge, "Trainer", trainer)
+    archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
+    for iterations in (3_000, 30_000):
+        with pytest.raises(UserInputError, match="far enough"):
+            merge.merge_levels(archive, iterations=iterations)
+    assert found[0] == found[1]
+    assert (found[0].opacity_weight, found[0].scale_weight) == (0.0, 0.0)
 
 
 def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:

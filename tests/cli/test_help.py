@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -62,3 +64,15 @@ def test_first_line_is_a_sentence_and_every_option_is_described(words: list[str]
     assert [each.name for each in described if not each.help] == []
     shown = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*words, "--help"]).output
     assert first in " ".join(shown.split())
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_paragraphs_fill_the_lines_of_a_terminal_and_examples_take_one_each(words: list[str]) -> None:
+    shown = CliRunner(env={"COLUMNS": "80"}).invoke(app, [*words, "--help"]).output
+    paragraphs = re.split(r"\n *\n", shown.split("╭")[0])
+    assert len(paragraphs) > 2  # usage, help text
+    for paragraph in paragraphs:
+        lines = [line.strip() for line in paragraph.splitlines() if line.strip()]
+        for line, following in pairwise(lines):
+            assert "lapgs " not in line[:6], f"an example that does not fit: {line} {following}"
+            assert len(line) + 1 + len(following.split()[0]) > 78, line

@@ -246,7 +246,7 @@ main()
 def test_a_stopped_prepare_says_that_repeating_it_continues() -> None:
     done = subprocess.run([sys.executable, "-c", PREPARING], capture_output=True, text=True, check=False)
     assert done.returncode == 130
-    assert done.stderr == "lapgs: stopped by Ctrl-C; repeat the command to go on where it stopped\n"
+    assert done.stderr == "lapgs: stopped by Ctrl-C; scene keeps the finished steps, repeat the command to continue\n"
 
 
 CAMPAIGN = 150

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.training import tensorboard
+from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import read_json_lines, read_toml
 from tests.cli.commands import succeeding
 
@@ -58,11 +60,42 @@ def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: 
     for asked in (7, 8):
         with pytest.raises(UserInputError, match=f"--iterations {asked}: the run in .* is finished with 8; give more"):
             lapgs(*words, asked)
-    assert read_toml(run / "run.toml")["iterations"] == 8
-    lapgs(*words, 11)
-    assert read_toml(run / "run.toml")["iterations"] == 11
+    assert [read_toml(run / "run.toml")[name] for name in ("iterations", "strategy")] == [8, "auto"]
+    lapgs(*words, 11, "--strategy", "auto")
+    assert [read_toml(run / "run.toml")[name] for name in ("iterations", "strategy")] == [11, "3dgs"]
     settings = RunArchive.open(run).manifest.settings
     assert (settings["iterations"], settings["extended"]) == (11, 3)
+
+
+def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path) -> None:
+    """Auto means MCMC for as many iterations as are the default, which the run does not have."""
+    run = tmp_path / "run"
+    lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)
+    lapgs("train", scene, "-o", run, "--resume", "--strategy", "auto")
+    for asked, message in (
+        (("--strategy", "mcmc"), "--strategy asks for mcmc, but the run in .* was started with 3dgs"),
+        (("--cap-max", 50), "--cap-max is no option of --strategy 3dgs, with which the run in .* was started"),
+    ):
+        with pytest.raises(UserInputError, match=message):
+            lapgs("train", scene, "-o", run, "--resume", *asked)
+
+
+def test_files_of_older_versions_name_strategies_as_they_are_now(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, density = tmp_path / "run.toml", []
+
+    def create(out: Path, reference: object, settings: TrainSettings, *rest: object) -> None:
+        density.append(settings.densification)
+        raise UserInputError("far enough")
+
+    monkeypatch.setattr(sys.modules["lapgs_plugin.cli.train"], "_create", create)
+    for old in ("default", "multiview", "mcmc"):
+        config.write_text(f'strategy = "{old}"\ncap-max = 1000000\niterations = 8000\n')
+        with pytest.raises(UserInputError, match="far enough"):
+            lapgs("train", scene, "--config", config, "-o", tmp_path / "run")
+    assert [each.strategy for each in density] == ["3dgs", "multiview", "mcmc"]
+    assert [getattr(each.options, "cap_max", None) for each in density] == [None, None, 1_000_000]
 
 
 @pytest.mark.parametrize(

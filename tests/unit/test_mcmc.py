@@ -26,6 +26,7 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training import mcmc
 from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, mcmc_start, shake
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
@@ -174,6 +175,11 @@ def test_a_short_run_grows_in_larger_steps() -> None:
     assert len(model) == 150
 
 
+def test_nothing_is_due_for_resets_that_never_come() -> None:
+    schedule = schedule_of(9000)  # 3DGS's heuristics reset every 900 iterations
+    assert schedule.sampled(5) == {1800, 3600, 5400, 7200, 9000}
+
+
 def test_limits_follow_the_pixels_of_a_level() -> None:
     plan = StagePlan.create((800, 533), 30_000, 2, hierarchy=Hierarchy.LAPLACIAN)
 
@@ -198,6 +204,7 @@ def test_limits_follow_the_pixels_of_a_level() -> None:
         ({"densification": Densification(options=Auto(absgrad=True))}, GRADIENTS),
         ({"densification": Densification(reset_every=500)}, GRADIENTS),
         ({"prune": 0.01}, GRADIENTS),
+        ({"residual_resets": True}, GRADIENTS),
         ({"protocol": "paper"}, GRADIENTS),
     ],
 )
@@ -212,10 +219,26 @@ def test_auto_follows_the_length_of_a_run_and_what_was_given(options: dict[str, 
 
 
 def test_options_of_both_are_refused() -> None:
-    with pytest.raises(UserInputError, match="--cap-max is an option of --strategy mcmc, which does not take"):
-        TrainSettings(densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
+    message = "--cap-max is an option of --strategy mcmc, which does not take --densify-threshold, --prune; leave"
+    with pytest.raises(UserInputError, match=message):
+        TrainSettings(prune=0.01, densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
+    with pytest.raises(UserInputError, match=r"--base-cap-max is an option .* does not take --protocol paper"):
+        TrainSettings(protocol="paper", densification=Densification(options=Auto(base_cap_max=9)))
+    with pytest.raises(UserInputError, match=r"--densify-threshold 0\.0: expected a positive gradient"):
+        TrainSettings(densification=Densification(options=Auto(grow_grad2d=0.0)))
     with pytest.raises(UserInputError, match="--strategy mcmc with --protocol paper: the paper has 3dgs"):
         TrainSettings(protocol="paper", densification=Densification(strategy=MCMC))
+
+
+@pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
+def test_manifests_of_any_version_are_read(hierarchy: str) -> None:
+    density = Densification(strategy=MCMC, options=Mcmc(cap_max=9))
+    chosen = TrainSettings(hierarchy=hierarchy, densification=density)
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
+    assert settings_from_manifest(manifest).for_manifest() == chosen.for_manifest()
+    older = {name: value for name, value in manifest.settings.items() if name != "residual_resets"}
+    assert settings_from_manifest(replace(manifest, settings=older)).for_manifest() == chosen.for_manifest()
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
@@ -233,6 +256,22 @@ def test_runs_stay_under_their_limits_and_learn(hierarchy: str, tmp_path: Path) 
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))
     assert last < first
+
+
+def test_a_sparse_step_leaves_out_what_no_view_shows_although_the_loss_has_all_opacities() -> None:
+    scene = ring_scene()
+    first = blob_field(40)
+    means = torch.cat([first.means[:30], first.means[30:] + 1000.0])
+    model = model_of(first.with_parameters({"means": means}))
+    result = CpuRasterizer()(model.field, scene.train[0].camera, background=torch.zeros(3))
+    loss = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=40)).regularization(model.field)
+    assert loss is not None
+    (result.image.square().mean() + loss).backward()  # type: ignore[no-untyped-call]  # torch's
+    assert (model.params["opacities"].grad != 0).all()
+    touched = model._touched
+    assert touched[:30].any()
+    assert not (touched & (result.radii.reshape(40, -1).amax(-1) == 0)).any()
+    assert not touched[30:].any()
 
 
 def test_a_base_starts_small_and_half_opaque() -> None:

@@ -27,7 +27,7 @@ from lapgs_plugin.training.quality import (
     spread_views,
 )
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import ring_scene
@@ -54,7 +54,7 @@ def test_no_fall(then: list[tuple[float, float]]) -> None:
 
 
 def test_samples_are_spread_and_avoid_resets() -> None:
-    settings = TrainSettings(iterations=7000)
+    settings = TrainSettings(iterations=7000, densification=Densification(strategy="3dgs"))
     stage = Stage(1, (100, 100), 3500, signed=False)
     schedule = StageSchedule.create(settings, stage, views=8)
     assert schedule.reset_every == 700

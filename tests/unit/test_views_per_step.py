@@ -36,7 +36,7 @@ from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
-from lapgs_plugin.training.strategies import Default
+from lapgs_plugin.training.strategies import Gradients
 from lapgs_plugin.training.trainer import Trainer
 from tests.convergence.test_training import StopAt, plys
 from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
@@ -210,7 +210,7 @@ def test_the_loss_of_several_views_is_their_mean() -> None:
 def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     """Two launches of three and one views and a refinement, against the views one after the other."""
     density = Densification(start=2, until=60, every=4, reset_every=1000)
-    options = Default(grow_grad2d=2e-4, absgrad=absgrad)
+    options = Gradients(grow_grad2d=2e-4, absgrad=absgrad)
     settings = TrainSettings(iterations=100, densification=density)
     (stage,) = StagePlan.create((64, 48), 100, 1)
     schedule = StageSchedule.create(settings, stage)

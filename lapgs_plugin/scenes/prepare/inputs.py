@@ -33,16 +33,12 @@ def make_photos(job: Job) -> None:
             write_frames(found.clip, numbers, partial, seen)
         logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
     else:
-
-        def make(name: str) -> None:
-            source, target = found.files[name], partial / name
-            if source.suffix.lower() in HEIC:
-                convert_heic(source, target)
-            else:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(source, target)
-
-        job.each_photo("Reading HEIC photos", make, list(found.files))
+        heic = [name for name, source in found.files.items() if source.suffix.lower() in HEIC]
+        for name, source in found.files.items():
+            (partial / name).parent.mkdir(parents=True, exist_ok=True)
+            if name not in heic:
+                shutil.copy2(source, partial / name)
+        job.each_photo("Reading HEIC photos", lambda name: convert_heic(found.files[name], partial / name), heic)
     partial.rename(folder)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,7 +76,7 @@ def prepare_scene(
     settings = settings or PrepareSettings()
     require_colmap_for(settings)
     found = _checked_photos(photos, out, settings, overwrite)
-    with one_line_errors(out), _said_on_interruption(out):
+    with one_line_errors(out):
         job = Job(out / WORK, found, settings, progress)
         with opened_work(job.work, _identity(found, settings), overwrite):
             make_photos(job)
@@ -118,16 +117,6 @@ def _identity(found: Photos, settings: PrepareSettings) -> dict[str, Any]:
         "--masks": None if settings.masks is None else str(settings.masks.absolute()),
         "pycolmap": pycolmap.__version__,
     }
-
-
-@contextmanager
-def _said_on_interruption(out: Path) -> Iterator[None]:
-    """Tell that the same command continues."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        logger.info("%s: the finished steps are kept; repeat the command to continue", out)
-        raise
 
 
 def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareResult:
