@@ -76,7 +76,7 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
         (("--packed", "--sparse-adam", "--rasterizer", "cpu"), "--packed, --sparse-adam with --rasterizer cpu"),
         (
             ("--cap-max", "7", "--absgrad"),
-            "--cap-max is an option of --strategy mcmc, which does not take --densify-threshold",
+            "--cap-max is an option of --strategy mcmc, which does not take --absgrad",
         ),
         (("--strategy", "mcmc", "--absgrad"), "--absgrad True with --strategy mcmc: an option of --strategy auto"),
         (("--strategy", "mcmc", "--error-pixels", "3"), "--error-pixels 3.0 with --strategy mcmc: an option of --str"),
