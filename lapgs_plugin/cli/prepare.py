@@ -44,6 +44,6 @@ def prepare(
     typer.echo(
         f"{out}: {len(result.registered)} of {total} photos, {result.points} points, "
         f"mean reprojection error {result.reprojection_error:.2f} pixels, "
-        + ", ".join(f"{step.lower()} {seconds:.0f} s" for step, seconds in result.seconds.items())
+        + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
     typer.echo(f"next: {train_command(out)}")

@@ -36,6 +36,9 @@ MAY_CHANGE = ("images_on", "prediction_precision")
 CHOSEN_ONCE = ("rasterizer", "strategy")
 """Options whose value "auto" stands for the choice that the run was started with when it is continued."""
 
+LONG_ON_A_CPU = 4e9
+"""Pixels to render, over all iterations, from which the command says that a CPU takes long."""
+
 
 @takes_settings
 def train(
@@ -286,6 +289,8 @@ def _run(
             markup=False,
         )
     placed = training_rasterizer(manifest.rasterizer, settings)
+    if placed.device.type == "cpu" and (hint := long_on_a_cpu(scene.smallest_size, settings.iterations)):
+        console.print(hint, highlight=False, soft_wrap=True)
     with one_pool(), ExitStack() as opened:
         monitor: Monitor = opened.enter_context(ProgressMonitor(console, manifest.levels))
         if control.log is not None:
@@ -305,3 +310,14 @@ def _run(
             watcher=watcher,
         )
         trainer.run(resume)
+
+
+def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:
+    """Return what to try where training takes hours on a CPU, else nothing."""
+    width, height = size
+    if iterations * width * height <= LONG_ON_A_CPU:
+        return ""
+    return (
+        f"without a GPU {iterations:,} iterations of {width}x{height} pixels can take hours; "
+        "--resolution 1/4 --iterations 3000 takes minutes"
+    )

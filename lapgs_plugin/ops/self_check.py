@@ -12,6 +12,12 @@ logger = logging.getLogger(__name__)
 
 Difference = Callable[[torch.device], float]
 
+FUSED = {"enable_fp_fusion": True}
+"""Option of every launch of our kernels: a product and a sum are one instruction.
+
+Triton 3.9 warns where it is not said, and announces that later versions will make two, which takes longer.
+"""
+
 
 class SelfCheck:
     """Decide whether Triton kernels are used here: they have to compile and to agree with PyTorch's operations.
@@ -41,8 +47,11 @@ class SelfCheck:
         try:
             with torch.inference_mode(False), torch.enable_grad():  # whatever mode the caller is in
                 found = self.difference(device)
+        except ImportError as error:  # Triton comes with PyTorch for CUDA on Linux only
+            logger.info("%s: %s", self._fallback, _in_one_line(error))
+            return False
         except Exception as error:  # Triton reports a missing C compiler and the like in errors of many classes
-            logger.info("%s: %s", self._fallback, str(error).strip().split("\n")[0])
+            logger.warning("%s: %s", self._fallback, _in_one_line(error))
             return False
         if not found <= self._limit:
             logger.warning("%s, because our kernels are off by %g here", self._fallback, found)
@@ -52,6 +61,14 @@ class SelfCheck:
     def forget(self) -> None:
         """Compare again at the next call."""
         self._passed = None
+
+
+def _in_one_line(error: BaseException) -> str:
+    """Return what went wrong first; Triton's errors show source code before they say it."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = str(getattr(error, "error_message", None) or error).strip()
+    return text.split("\n")[0] or type(error).__name__
 
 
 def matches_reference(fallback: str, limit: float) -> Callable[[Difference], SelfCheck]:

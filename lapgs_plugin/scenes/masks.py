@@ -17,6 +17,8 @@ MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
 AUTO, NONE, ALPHA = "auto", "none", "alpha"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+HEIC = (".heic", ".heif", ".hif")
+"""Photos of phones that neither COLMAP nor OpenImageIO reads."""
 
 
 def resolve_masks(scene: Path, setting: str) -> str:
@@ -73,7 +75,7 @@ def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | 
 
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
-    return path.with_suffix("").as_posix() if path.suffix.lower() in SUFFIXES else name
+    return path.with_suffix("").as_posix() if path.suffix.lower() in (*SUFFIXES, *HEIC) else name
 
 
 def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.cli import app
+from lapgs_plugin.cli.train import long_on_a_cpu
 from lapgs_plugin.files import LOCK, MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.sample import make_sample_scene
@@ -49,6 +50,11 @@ def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path:
     assert again.returncode == 2
     assert "--resume" in again.stderr.strip().splitlines()[-1]
     assert archive.field_path(0).read_bytes() == before
+
+
+def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_is_not() -> None:
+    assert "30,000 iterations of 1600x1200 pixels can take hours" in long_on_a_cpu((1600, 1200), 30_000)
+    assert not long_on_a_cpu((400, 300), 3_000)
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,8 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
             mask = hidden[::-1, ::-1]
         else:
             picture.save(photos / f"{index:02d}.png")
-        write_image(masks / f"{index:02d}_mask.png", torch.from_numpy(mask.copy()).permute(2, 0, 1))
+        name = "01.HEIC.png" if index == 1 else f"{index:02d}_mask.png"
+        write_image(masks / name, torch.from_numpy(mask.copy()).permute(2, 0, 1))
     out = tmp_path / "scene"
     result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
     assert len(result.registered) == 4

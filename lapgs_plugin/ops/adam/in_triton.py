@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 
 from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
+from lapgs_plugin.ops.self_check import FUSED
 
 BLOCK = 512
 EPS = tl.constexpr(ADAM_EPS)
@@ -78,5 +79,5 @@ def step_triton(slots: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
     launch(
         *(value for slot in slots for value in (*slot, slot.values[:1].numel())),
-        gradient, keep1, 1 - keep1, keep2, 1 - keep2, n, block=BLOCK,
+        gradient, keep1, 1 - keep1, keep2, 1 - keep2, n, block=BLOCK, **FUSED,
     )  # fmt: skip

@@ -14,6 +14,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from lapgs_plugin.ops.self_check import FUSED
+
 BLOCK = 1024
 SIZES = ("n", "by_view", "by_channel", "out_view", "out_channel")
 """Arguments that differ between image sizes: one compiled kernel serves all."""
@@ -77,7 +79,7 @@ class _Transformed(torch.autograd.Function):
         out = torch.empty_like(image)
         assert out.stride() == image.stride(), "images without gaps"
         launch: Any = _apply[(triton.cdiv(n, BLOCK), views)]
-        launch(image, transform, out, n, *image.stride(), block=BLOCK)
+        launch(image, transform, out, n, *image.stride(), block=BLOCK, **FUSED)
         return out
 
     @staticmethod
@@ -87,7 +89,8 @@ class _Transformed(torch.autograd.Function):
         views, _, n = image.shape
         by_image, by_transform = torch.empty_like(image), torch.zeros_like(transform)
         launch: Any = _gradients[(triton.cdiv(n, BLOCK), views)]
-        launch(image, transform, by_out, by_image, by_transform, n, *image.stride(), *by_out.stride(), block=BLOCK)
+        strides = *image.stride(), *by_out.stride()
+        launch(image, transform, by_out, by_image, by_transform, n, *strides, block=BLOCK, **FUSED)
         return by_image, by_transform
 
 

@@ -8,6 +8,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.ops.self_check import FUSED
+
 BLOCK = 512
 
 
@@ -19,13 +21,15 @@ def _kernel(
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here = rows < n
     norm, count = tl.load(norms + rows, here, 0.0), tl.load(counts + rows, here, 0.0)
-    for view in range(views):
+    view = 0
+    while view < views:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         seen = rows + view * n.to(tl.int64)
         shown = here & (tl.load(radii + seen, here, 0) > 0)
         x = tl.load(gradient + 2 * seen, shown, 0.0) * half_width
         y = tl.load(gradient + 2 * seen + 1, shown, 0.0) * half_height
         norm += tl.sqrt(x * x + y * y)
         count += tl.where(shown, 1.0, 0.0)
+        view += 1
     tl.store(norms + rows, norm, here)
     tl.store(counts + rows, count, here)
 
@@ -36,4 +40,5 @@ def add_statistics_triton(
     """Do `add_statistics` for contiguous float32 tensors on one CUDA device."""
     n = len(norms)
     launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
-    launch(gradient, radii, norms, counts, size[0] / 2.0, size[1] / 2.0, n, radii.numel() // n, block=BLOCK)
+    halves, views = (size[0] / 2.0, size[1] / 2.0), radii.numel() // n
+    launch(gradient, radii, norms, counts, *halves, n, views, block=BLOCK, **FUSED)

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_SIGMA, as_batch
+from lapgs_plugin.ops.self_check import FUSED
 
 COLORS = 3
 BLOCK = 128
@@ -29,7 +30,7 @@ _gauss = [math.exp(-((tap - SSIM_RADIUS) ** 2) / (2 * SSIM_SIGMA**2)) for tap in
 WINDOW = tuple(each / math.fsum(_gauss) for each in _gauss)
 """The window of SSIM along one side."""
 
-CONSTANTS: dict[str, Any] = {"window": WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
+CONSTANTS: dict[str, Any] = {"window": WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK, **FUSED}
 """Arguments of both kernels that they are compiled for."""
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
+from lapgs_plugin.ops.self_check import FUSED
 
 BLOCK = 128
 MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 8, 1500
@@ -150,7 +151,7 @@ def _filter(
         *images, *rows, *columns, height, width, count,
         *(stride for image in images for stride in image.stride()),
         adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
-        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
+        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK, **FUSED,
     )  # fmt: skip
 
 

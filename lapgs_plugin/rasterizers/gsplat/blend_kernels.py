@@ -24,6 +24,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.ops.self_check import FUSED
+
 TILE = 16
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
@@ -350,7 +352,7 @@ def blend_forward(
         means2d, conics, colors, opacities, background, offsets, flat, images, counts,
         flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, num_warps=shape.warps,
+        tile=TILE, batch=shape.batch, num_warps=shape.warps, **FUSED,
     )  # fmt: skip
     return images, counts
 
@@ -386,7 +388,7 @@ def blend_backward(
         by_means2d, by_absolute, by_conics, by_colors, by_opacities,
         flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, absolute=absolute, num_warps=shape.warps,
+        tile=TILE, batch=shape.batch, absolute=absolute, num_warps=shape.warps, **FUSED,
     )  # fmt: skip
     return by_absolute, by_means2d, by_conics, by_colors, by_opacities
 

@@ -14,6 +14,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.ops.self_check import FUSED
+
 BLOCK = 128
 """Gaussians in a block. Each takes 4 threads, of which 3 have a channel: Triton's sizes are powers of 2."""
 
@@ -172,7 +174,8 @@ def _block_colors(
     x, y, z, _ = _view_directions(mean, centre, channel, visible)
     color = tl.zeros((block, 4), tl.float32)
     for k in tl.static_range(coefficients):
-        wanted = visible & (channel < 3) & (k < active)
+        used = tl.full((1, 4), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
+        wanted = visible & (channel < 3) & used
         color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
     return tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
 
@@ -271,7 +274,8 @@ def _gradient_kernel(
     sums = tl.zeros((padded, block, 4), tl.float32)
     coefficient = tl.zeros_like(sums)
     for i in tl.static_range(coefficients):  # one by one, which keeps them in the thread
-        one = tl.load(sh + (rows * coefficients + i) * 3 + channel, in_channel & (i < active), 0.0)
+        wanted = in_channel & (tl.full((1, 4), i, tl.int32) < active)
+        one = tl.load(sh + (rows * coefficients + i) * 3 + channel, wanted, 0.0)
         coefficient = tl.where(k == i, one[None], coefficient)
     of_opacity = tl.zeros((block, 1), tl.float32)
     of_x, of_y, of_z = tl.zeros_like(of_opacity), tl.zeros_like(of_opacity), tl.zeros_like(of_opacity)
@@ -412,4 +416,4 @@ def _launch(
     **constants: int,
 ) -> None:
     """Start a kernel with `programs` programs for each block of Gaussians."""
-    kernel[(triton.cdiv(n, block) * programs,)](*given, n, *numbers, block=block, **constants)
+    kernel[(triton.cdiv(n, block) * programs,)](*given, n, *numbers, block=block, **constants, **FUSED)

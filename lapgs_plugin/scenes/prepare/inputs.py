@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size
-from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, write_mask
+from lapgs_plugin.scenes.masks import HEIC, alpha_mask, find_masks, read_mask, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import HEIC, camera_of, convert_heic
+from lapgs_plugin.scenes.prepare.photos import camera_of, convert_heic
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ def make_masks(job: Job) -> None:
     if job.masks.is_dir():
         return
     given = job.settings.masks
-    files = {} if given is None else find_masks(given, job.names)
+    files = {} if given is None else _given_masks(job, given)
     names = job.names if files else [name for name in job.names if has_alpha(job.photos / name)]
     if not names:
         return
@@ -64,6 +65,15 @@ def make_masks(job: Job) -> None:
 
     if sum(job.each_photo("Reading masks", make, names)):
         partial.rename(job.masks)
+
+
+def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
+    """Return the mask of each photo by COLMAP's name. That of a.heic is named after it, not after its JPEG."""
+    found = job.found
+    own = {name: name for name in job.names}
+    own |= {name: path.relative_to(found.folder).as_posix() for name, path in found.files.items()}
+    masks = find_masks(folder, list(own.values()))
+    return {name: masks[photo] for name, photo in own.items()}
 
 
 def read_sizes(job: Job) -> dict[str, tuple[int, int]]:

@@ -13,10 +13,9 @@ from PIL import Image
 from lapgs_plugin.errors import MissingExtraError, SceneError, printable
 from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG_QUALITY
+from lapgs_plugin.scenes.masks import HEIC
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-HEIC = (".heic", ".heif", ".hif")
-"""Photos of phones that neither COLMAP nor OpenImageIO reads."""
 SHOWN = 10
 """File names in a message, at most."""
 MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 271, 272, 0x8769, 37386, 41989

@@ -1,0 +1,163 @@
+"""A kernel that raises at its first use, as on a Triton that does not compile it: other operations take its place."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.adam import GpuFieldAdam
+from lapgs_plugin.ops.color_transform import transform_colors
+from lapgs_plugin.ops.densification_statistics import add_statistics
+from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.ops.self_check import SelfCheck
+from lapgs_plugin.ops.upsample import upsample_add
+from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat import rasterizer as rasterizer_module
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import our_kernels_blend
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.settings import LearningRates
+from tests.gsplat_on_cpu import Compiled, Finishing, direct_on_cpu, gsplat_on_cpu
+
+Pair = tuple[Tensor, Tensor]
+AROUND_GSPLAT = ("activate", "visible_colors", "finish_gradients")
+
+
+class CompilationError(Exception):
+    """As Triton's: its text begins with a place and source code."""
+
+    error_message = "module 'triton.language' has no attribute 'join'\nsecond line"
+
+
+def raises(*args: Any, **kwargs: Any) -> Any:
+    raise RuntimeError("at 3:4:\n    x = tl.join(x, x)") from CompilationError("at 3:4:\n    x = tl.join(x, x)")
+
+
+def broken(*names: str) -> ModuleType:
+    kernels = ModuleType("kernels")
+    vars(kernels).update(dict.fromkeys(names, raises))
+    return kernels
+
+
+@pytest.fixture(autouse=True)
+def _as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Check kernels on the CPU and use them there."""
+    monkeypatch.setattr(SelfCheck, "__call__", lambda check, *tensors: check.passes_on(torch.device("cpu")))
+    caplog.set_level(logging.WARNING)
+
+
+def said(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.name == "lapgs_plugin.ops.self_check"]
+
+
+def loss() -> Pair:
+    prediction, target = torch.rand(2, 3, 13, 17, generator=torch.Generator().manual_seed(0))
+    return photometric_loss(prediction, target, 0.2), photometric_loss_torch(prediction, target, 0.2)
+
+
+def statistics() -> Pair:
+    sums = torch.zeros(2), torch.zeros(2)
+    add_statistics(torch.tensor([[0.75, 2.0], [1.0, 1.0]]), torch.tensor([1, 0]).int(), (8, 2), *sums)
+    return torch.stack(sums), torch.tensor([[(3.0**2 + 2.0**2) ** 0.5, 0.0], [1.0, 0.0]])
+
+
+def colors() -> Pair:
+    transform = torch.tensor([[0.0, 2.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    image = torch.rand(3, 4, 5)
+    return transform_colors(image, transform), torch.stack([2 * image[1] + 0.5, image[0], image[2] - 1])
+
+
+def upsampled() -> Pair:
+    coarse, fine = torch.rand(3, 4, 5), torch.rand(3, 8, 10)
+    return upsample_add(Pyramid(), coarse, fine), Pyramid().up(coarse, (8, 10)) + fine
+
+
+@pytest.mark.parametrize(
+    ("operation", "kernels", "compute", "instead"),
+    [
+        ("photometric_loss", ("photometric_loss_triton",), loss, "the photometric loss in many operations"),
+        ("densification_statistics", ("add_statistics_triton",), statistics, "densification statistics in several"),
+        ("color_transform", ("transform_colors_triton",), colors, "colour transforms as products of matrices"),
+        ("upsample", ("upsample_add_triton", "upsample_triton"), upsampled, "upsampling in many small operations"),
+    ],
+)
+def test_an_operation(
+    operation: str,
+    kernels: tuple[str, ...],
+    compute: Callable[[], Pair],
+    instead: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setitem(sys.modules, f"lapgs_plugin.ops.{operation}.in_triton", broken(*kernels))
+    found, expected = compute()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)  # float32 of about 1; worst seen 2e-7
+    (line,) = said(caplog)
+    assert line.startswith(instead)
+    assert line.endswith(": module 'triton.language' has no attribute 'join'")
+
+
+def field(device: str = "cpu") -> GaussianField:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(20, 3, generator=generator) + torch.tensor([0.0, 0.0, 4.0])
+    others = torch.randn(20, 4, generator=generator), torch.full((20, 3), -2.0), torch.zeros(20)
+    return GaussianField(means, *others, torch.rand(20, 4, 3, generator=generator)).to(device)
+
+
+def test_adam(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.ops.adam.in_triton", broken("step_triton"))
+    model = TrainableField.create(field("meta"), LearningRates(), extent=1.0)
+    assert not any(isinstance(optimizer, GpuFieldAdam) for optimizer in model.optimizers.values())
+    (line,) = said(caplog)
+    assert line == "Adam in a launch for each tensor: module 'triton.language' has no attribute 'join'"
+
+
+def test_blending(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(direct, "compiled_functions", Compiled)
+    name = "lapgs_plugin.rasterizers.gsplat.blend_kernels"
+    monkeypatch.setitem(sys.modules, name, broken("blend_forward", "blend_backward"))
+    assert not our_kernels_blend(torch.zeros(1, 3), 1_000_000)
+    (line,) = said(caplog)
+    assert line == "blending by gsplat's kernels, which take longer: module 'triton.language' has no attribute 'join'"
+
+
+@pytest.mark.parametrize("name", AROUND_GSPLAT)
+def test_one_of_the_kernels_around_gsplats(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    camera, black = Camera(20, 16, 20.0, 20.0, 10.0, 8.0, torch.eye(4)), torch.zeros(3)
+    kernels = broken(name)
+    vars(kernels).update((other, getattr(Finishing, other)) for other in AROUND_GSPLAT if other != name)
+    with gsplat_on_cpu():
+        expected = GsplatRasterizer(device="cpu", direct=False).render_image(field(), camera, background=black)
+        with direct_on_cpu(kernels):
+            rasterizer = GsplatRasterizer(device="cpu")
+            rasterizer._may_be_direct = True
+            found = rasterizer.render_image(field(), camera, background=black)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    (line,) = said(caplog)
+    assert line.startswith(
+        "rendering by `gsplat.rasterization`, which takes more launches: module 'triton.language' has"
+    )
+
+
+def test_a_stack(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", broken("write_to_stack"))
+    chosen: dict[str, bool] = {}
+    monkeypatch.setattr(rasterizer_module, "direct_works", lambda: True)
+    monkeypatch.setattr(rasterizer_module, "GsplatStack", lambda fields, device, **options: chosen.update(options))
+    rasterizer = GsplatRasterizer(device="cpu")
+    rasterizer._device = torch.device("cuda")
+    rasterizer.stack([field()])
+    assert chosen == {"antialiased": False, "direct": False}
+    (line,) = said(caplog)
+    assert line.startswith("rendering the fields of a view together with gsplat's functions")
