@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,13 +12,12 @@ import typer
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
-from lapgs_plugin.experiments.settings import PlaceSettings, ResultSettings, Selection, WorkerSettings
+from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
 from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
     from lapgs_plugin.experiments.commands import Locations
     from lapgs_plugin.experiments.expansion import PlannedRun
-    from lapgs_plugin.experiments.launchers import WorkOrder
     from lapgs_plugin.experiments.mistakes import Mistakes
     from lapgs_plugin.experiments.runner import Folder
     from lapgs_plugin.experiments.schema import Experiment
@@ -43,10 +41,7 @@ def bench_experiment(
     experiment: Annotated[
         Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
     ],
-    selection: Selection,
-    places: PlaceSettings,
-    engine: WorkerSettings,
-    results: ResultSettings,
+    settings: BenchSettings,
 ) -> None:
     """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
 
@@ -70,48 +65,46 @@ def bench_experiment(
     loaded = load_experiment(experiment, _option_names())
     with mistakes.at("table"):
         check_table(loaded)
-    planned = plan_runs(loaded, selection)
-    folder = Folder(Path("runs", "bench", loaded.name) if places.out is None else places.out)
-    if results.tables_only:
+    planned = plan_runs(loaded, settings.selection)
+    folder = Folder(Path("runs", "bench", loaded.name) if settings.out is None else settings.out)
+    if settings.tables_only:
         mistakes.refuse()
     else:
-        locations = Locations(places.folders, experiment.parent)
-        _run(loaded, selection, planned, folder, locations, engine, results, mistakes)
-    if results.tables_only or not results.dry_run:
+        locations = Locations(settings.folders, experiment.parent)
+        _run(loaded, planned, folder, locations, settings, mistakes)
+    if settings.tables_only or not settings.dry_run:
         _write(loaded, planned, folder)
 
 
 def _run(
     experiment: Experiment,
-    selection: Selection,
     planned: Sequence[PlannedRun],
     folder: Folder,
     locations: Locations,
-    engine: WorkerSettings,
-    results: ResultSettings,
+    settings: BenchSettings,
     mistakes: Mistakes,
 ) -> None:
     """Check all runs, then execute them, or print their commands with --dry-run."""
     from lapgs_plugin.cli.bench_check import check_runs
     from lapgs_plugin.experiments.expansion import scenes_of
-    from lapgs_plugin.experiments.launchers import check_order
+    from lapgs_plugin.experiments.launchers import check_launcher
     from lapgs_plugin.experiments.runner import make_samples, prepare
 
-    order = _order(engine, folder)
-    if not results.dry_run:
-        check_order(engine.launcher, order)
+    if not settings.dry_run:
+        check_launcher(settings.engine)
         _require_place(folder.path)
+    selection = settings.selection
     scenes = scenes_of(experiment, selection)
-    measuring = _measuring(results)
+    measuring = _measuring(settings)
     jobs, found = prepare(planned, scenes, locations, folder, measuring, experiment, selection, mistakes)
-    here = engine.launcher == "local" and not results.dry_run
+    here = settings.engine.launcher == "local" and not settings.dry_run
     check_runs(experiment, selection, planned, jobs, found, mistakes, here=here)
     mistakes.refuse()
-    if results.dry_run:
+    if settings.dry_run:
         _print_commands(jobs)
         return
     make_samples(scenes, folder)
-    _follow(jobs, folder, engine.launcher, order)
+    _follow(jobs, folder, settings.engine)
 
 
 def _option_names() -> dict[str, set[str]]:
@@ -144,7 +137,7 @@ def _require_place(folder: Path) -> None:
         raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
-def _measuring(results: ResultSettings) -> list[str] | None:
+def _measuring(settings: BenchSettings) -> list[str] | None:
     """Return the options of `lapgs eval`, None without it.
 
     Raises:
@@ -154,9 +147,9 @@ def _measuring(results: ResultSettings) -> list[str] | None:
 
     from lapgs_plugin.cli.bench_check import READS_SCENES
 
-    if not results.evaluate:
+    if not settings.evaluate:
         return None
-    weights = results.lpips_weights or []
+    weights = settings.lpips_weights or []
     for file in weights:
         if not os.path.isfile(file):  # noqa: PTH113  # Path.is_file raises where a name is too long
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
@@ -178,25 +171,11 @@ def _print_commands(jobs: Sequence[Job]) -> None:
             print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
-def _order(engine: WorkerSettings, folder: Folder) -> WorkOrder:
-    """Return the settings of the workers; the runs are filled in later."""
-    from lapgs_plugin.experiments.launchers import WorkOrder
-
-    return WorkOrder(
-        store=folder.store.absolute(),
-        run_ids=(),
-        workers=engine.workers,
-        gpus=None if engine.gpus is None else engine.gpus.split(","),
-        logs=folder.logs("workers").absolute(),
-        options=engine.launcher_options,
-    )
-
-
-def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder) -> None:
+def _follow(jobs: Sequence[Job], folder: Folder, engine: WorkerSettings) -> None:
     """Run the jobs with a progress bar and a line for each finished run."""
     from rich.markup import escape
 
-    from lapgs_plugin.experiments.launchers import launch
+    from lapgs_plugin.experiments.launchers import WorkOrder, launch
     from lapgs_plugin.experiments.runner import execute
     from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
     from lapgs_plugin.progress import item_progress
@@ -204,7 +183,7 @@ def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder
     store = ResultStore.create(folder.store)
     store.plan(jobs)
     run_ids = [job.run_id for job in jobs]
-    order = replace(order, run_ids=run_ids)
+    order = WorkOrder(folder.store.absolute(), run_ids, folder.logs("workers").absolute(), engine)
     finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
     if finished:
         make_console(stderr=True).print(f"{finished} of {len(run_ids)} runs are done already")
@@ -220,7 +199,7 @@ def _follow(jobs: Sequence[Job], folder: Folder, launcher: str, order: WorkOrder
             progress.console.print(text, soft_wrap=True, highlight=False)
 
         try:
-            execute(store, run_ids, lambda: launch(launcher, order), say)
+            execute(store, run_ids, lambda: launch(order), say)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 

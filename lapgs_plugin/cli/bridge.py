@@ -21,16 +21,17 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 def takes_settings(command: _F) -> _F:
     """Replace the parameters of a command that are settings dataclasses by the options that their fields declare.
 
-    The command is called with an instance, which checks its values when it is made. Fields without a declaration keep
-    their defaults, unless they are settings dataclasses themselves: these add their options. A field declared with
-    `options.options_of` adds the options of everything that can be chosen there.
+    `--help` lists them in the order of the command's parameters. The command is called with an instance, which checks
+    its values when it is made. Fields without a declaration keep their defaults, unless they are settings dataclasses
+    themselves: these add their options. A field declared with `options.options_of` adds the options of everything that
+    can be chosen there, at the end.
     """
     signature = inspect.signature(command, eval_str=True)
     settings = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
-    own = [each for name, each in signature.parameters.items() if name not in settings]
-    own += [each for kind in settings.values() for each in _parameters(kind)]
+    own: list[inspect.Parameter] = []
+    for name, each in signature.parameters.items():
+        own.extend(_parameters(settings[name]) if name in settings else [each])
     added, clashes = _chosen_parameters(settings.values(), {each.name for each in own})
-    parameters = [*own, *added]
 
     @functools.wraps(command)
     def call(**given: Any) -> Any:
@@ -39,7 +40,7 @@ def takes_settings(command: _F) -> _F:
         made = {name: _build(kind, given) for name, kind in settings.items()}
         return command(**given, **made)
 
-    keyword_only = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+    keyword_only = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *added)]
     call.__signature__ = signature.replace(parameters=keyword_only)  # type: ignore[attr-defined]  # typer reads it
     call.__annotations__ = {each.name: each.annotation for each in keyword_only}
     result: Any = call

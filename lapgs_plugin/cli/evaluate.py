@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, make_table
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import printable
 from lapgs_plugin.options import check_values, option
@@ -98,9 +98,6 @@ def evaluate(
 
 def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: RenderOptions) -> None:
     """Measure flicker along a path and print it."""
-    from rich import box
-    from rich.table import Table
-
     from lapgs_plugin.evaluation.stability import evaluate_stability
     from lapgs_plugin.rendering.run import path_cameras
     from lapgs_plugin.runs.archive import STABILITY, RunArchive
@@ -112,7 +109,7 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
     figures = evaluate_stability(
         archive, other, trajectory, cameras, device=options.device, rasterizer=options.rasterizer
     )
-    table = Table("", "mean difference", "PSNR (dB)", box=box.SIMPLE_HEAD)
+    table = make_table("", "mean difference", "PSNR (dB)")
     for name, each in figures["flicker"].items():
         table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")
     console = make_console()
@@ -136,15 +133,13 @@ def _print(metrics: dict[str, Any]) -> None:
 
 
 def _print_views(console: Console, metrics: dict[str, Any]) -> None:
-    from rich import box
     from rich.markup import escape
-    from rich.table import Table
 
     from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
 
     measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
     headings = [f"LPIPS ({title_of(name)})" for name in measured]
-    table = Table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings, box=box.SIMPLE_HEAD)
+    table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings)
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
         distances = [f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured]
@@ -155,12 +150,7 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(
-        "level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR", "upsampled", box=box.SIMPLE_HEAD
-    )
+    table = make_table("level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR", "upsampled")
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]
         table.add_row(
@@ -176,11 +166,8 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
-    from rich import box
-    from rich.table import Table
-
     levels = metrics["levels"].items()
-    table = Table("part", *(f"level {level}" for level, _ in levels), "run", box=box.SIMPLE_HEAD)
+    table = make_table("part", *(f"level {level}" for level, _ in levels), "run")
     total = sum(metrics["breakdown_seconds"].values())
     for part, seconds in metrics["breakdown_seconds"].items():
         each = [f"{1e3 * f['breakdown_seconds'][part] / f['iterations']:.2f} ms" for _, f in levels]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 UNLIMITED = 10_000
 """Width in columns where there is no terminal: more than any table has."""
@@ -25,6 +26,14 @@ def make_console(*, stderr: bool = False) -> Console:
     if not made.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
         made.width = UNLIMITED
     return made
+
+
+def make_table(*headings: str) -> Table:
+    """Return a table with a line under its headings and no other lines."""
+    from rich import box
+    from rich.table import Table
+
+    return Table(*headings, box=box.SIMPLE_HEAD)
 
 
 def train_command(scene: Path) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, make_table
 from lapgs_plugin.cli.rendering import RenderOptions, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 @takes_settings
 def report(
-    options: RenderOptions,
     run: Annotated[
         Path | None,
         typer.Argument(
@@ -29,9 +28,11 @@ def report(
             "Default: the newest one in runs/.",
         ),
     ] = None,
+    *,
     baseline: Annotated[
         Path | None, typer.Option(help="Another run to compare with, such as one trained with --levels 1.")
     ] = None,
+    options: RenderOptions,
 ) -> None:
     """Print the metrics of RUN and write RUN/report.html with curves and images.
 
@@ -85,14 +86,12 @@ def _newest(folder: Path) -> Path:
 
 
 def _print(runs: Sequence[MeasuredRun]) -> None:
-    from rich import box
     from rich.markup import escape
-    from rich.table import Table
 
     from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
     names = [escape(each.archive.path().name) for each in runs]
-    table = Table("", *names, *(["change"] if len(runs) > 1 else []), box=box.SIMPLE_HEAD)
+    table = make_table("", *names, *(["change"] if len(runs) > 1 else []))
     for row in comparison_rows([each.metrics for each in runs]):
         cells = ["\n".join([cell.text, *(f"[dim]{part}[/dim]" for part in cell.parts)]) for cell in row.cells]
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,13 +13,15 @@ import typer
 from lapgs_plugin.adapters.registry import OWN, adapter_class
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.rehearsal import Rehearsal
-from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
+from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.options import MeasuringOptions
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
+    from lapgs_plugin.runs.watcher import Watcher
 
 OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose"}
 """Parameters that `--off` can be combined with."""
@@ -26,46 +30,49 @@ CONTEXT = {"allow_interspersed_args": False}
 """Options after the script are passed to the script."""
 
 
+@dataclass(frozen=True)
+class ScriptOptions:
+    """Choose what is done with a checkout's script, and on which device.
+
+    Raises:
+        UserInputError: the device is unknown, or an option has no effect with the others.
+    """
+
+    off: bool = option(False, "Run the script unchanged, without a hierarchy.")
+    record: bool = option(
+        False, "With --off: record time, Gaussians, memory and held-out PSNR of the unchanged run in its -m folder."
+    )
+    backbone: str | None = option(
+        None, f"{', '.join(OWN)}, or a backbone of an installed package. Default: recognised from the checkout."
+    )
+    device: str = option(
+        "auto",
+        "cuda, cpu (the checkout on CPU stand-ins for its CUDA extensions), or auto: CUDA if there is a CUDA device, "
+        "else the CPU.",
+        choices=("auto", "cuda", "cpu"),
+    )
+    resume: bool = option(False, "Continue the run in -m after its last finished level.")
+    overwrite: bool = option(False, "Replace the run in -m.")
+    viewing: ViewOptions = field(default_factory=ViewOptions)
+    verbose: bool = option(False, "Log which symbols are replaced, and where they are used.", names=("--verbose", "-v"))
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        if self.record and not self.off:
+            raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
+
+
 @takes_settings
 def run(
     context: typer.Context,
     script: Annotated[Path, typer.Argument(help="Training script of a checkout: its train.py.", metavar="SCRIPT")],
-    settings: RunSettings,
-    measuring: MeasuringOptions,
     arguments: Annotated[
         list[str] | None, typer.Argument(help="Arguments of the script, as without lapgs.", metavar="ARGUMENTS...")
     ] = None,
-    off: Annotated[bool, typer.Option("--off", help="Run the script unchanged, without a hierarchy.")] = False,
-    record: Annotated[
-        bool,
-        typer.Option(
-            "--record",
-            help="With --off: record time, Gaussians, memory and held-out PSNR of the unchanged run in its -m folder.",
-        ),
-    ] = False,
-    backbone: Annotated[
-        str | None,
-        typer.Option(
-            help=f"{', '.join(OWN)}, or a backbone of an installed package. Default: recognised from the checkout."
-        ),
-    ] = None,
-    device: Annotated[
-        str,
-        typer.Option(
-            help="cuda, cpu (the checkout on CPU stand-ins for its CUDA extensions), or auto: CUDA if there is a CUDA "
-            "device, else the CPU."
-        ),
-    ] = "auto",
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in -m after its last finished level.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in -m.")] = False,
-    view: ViewOption = False,
-    view_port: ViewPortOption = None,
-    verbose: Annotated[
-        bool,
-        typer.Option("--verbose", "-v", help="Log which symbols are replaced, and where they are used."),
-    ] = False,
+    *,
+    options: ScriptOptions,
+    settings: RunSettings,
+    measuring: MeasuringOptions,
 ) -> None:
     """Train with a 3DGS checkout's own train.py, coarse to fine; its files stay unchanged.
 
@@ -79,60 +86,74 @@ def run(
     """
     import logging
 
-    from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
-    from lapgs_plugin.checkouts.script import loaded_script, require_script
-    from lapgs_plugin.runner.driver import HierarchyDriver
-    from lapgs_plugin.runner.installed_rasterizer import explain_import_error
-    from lapgs_plugin.runner.recording import BareRunRecorder
+    from lapgs_plugin.checkouts.script import require_script
     from lapgs_plugin.runs.gpu_busy import require_cuda
 
-    if off and (idle := sorted(given_options(context) - OF_OFF)):
+    if options.off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
-    if record and not off:
-        raise UserInputError("--record needs --off: the run folder of a hierarchy has these figures; leave it out")
-    if measuring.gpu_busy and off and not record:
+    plain = options.off and not options.record
+    if measuring.gpu_busy and plain:
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
-    chosen = _chosen_device(device)
+    device = _chosen_device(options.device)
     if measuring.gpu_busy:
-        require_cuda(chosen)
+        require_cuda(device)
     path, words = require_script(script), arguments or []
-    watcher = context.with_resource(watching(view, view_port, path.parent.name, chosen))
-    plain = off and not record
-    kind, root = _recognised(path, backbone, needed=not plain)
+    watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
+    kind, root = _recognised(path, options.backbone, needed=not plain)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
-    logging.getLogger("lapgs_plugin.checkouts.attachment").setLevel(logging.INFO if verbose else logging.WARNING)
+    attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
+    attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
+    _execute(path, words, kind, root, device, options, settings, measuring, watcher)
+
+
+def _execute(
+    script: Path,
+    arguments: Sequence[str],
+    kind: type[BackboneAdapter] | None,
+    root: Path,
+    device: str,
+    options: ScriptOptions,
+    settings: RunSettings,
+    measuring: MeasuringOptions,
+    watcher: Watcher,
+) -> None:
+    """Execute the script: with a hierarchy, or unchanged with --off."""
+    from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+    from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.runner.driver import HierarchyDriver
+    from lapgs_plugin.runner.installed_rasterizer import explain_import_error
+    from lapgs_plugin.runner.recording import BareRunRecorder
+
     on_device: AbstractContextManager[None] = nullcontext()
-    if chosen == "cpu":
-        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, words))
+    if device == "cpu":
+        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, arguments))
     try:
-        with on_device, loaded_script(script, words) as loaded:
-            if kind is None or plain:
+        with on_device, loaded_script(script, arguments) as loaded:
+            if kind is None or (options.off and not options.record):
                 loaded.run_main()
                 return
-            if off:
-                BareRunRecorder(kind(loaded), chosen, measuring.gpu_busy).run()
+            if options.off:
+                BareRunRecorder(kind(loaded), device, measuring.gpu_busy).run()
                 return
             driver = HierarchyDriver(
                 kind(loaded),
                 settings,
-                device=chosen,
-                resume=resume,
-                overwrite=overwrite,
-                breakdown=measuring.breakdown,
-                gpu_busy=measuring.gpu_busy,
+                device=device,
+                resume=options.resume,
+                overwrite=options.overwrite,
                 watcher=watcher,
-                test_every=measuring.test_every,
+                **asdict(measuring),
             )
             driver.run()
         if driver.folder is not None:
-            keep_preview(driver.folder, chosen)
+            keep_preview(driver.folder, device)
     except ImportError as error:
-        line = None if off else explain_import_error(error, path, on_cpu=chosen == "cpu")
+        line = None if options.off else explain_import_error(error, script, on_cpu=device == "cpu")
         if line is None:
             raise
         raise line from error
@@ -142,8 +163,6 @@ def _chosen_device(device: str) -> str:
     """Return "cuda" or "cpu" for a value of --device."""
     import torch
 
-    if device not in ("auto", "cuda", "cpu"):
-        raise UserInputError(f"--device {device}: expected auto, cuda or cpu")
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise UserInputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,10 +15,10 @@ from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, extend_config, write_config
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
-from lapgs_plugin.cli.viewing import ViewOption, ViewPortOption, keep_preview, watching
+from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.options import option_values
+from lapgs_plugin.options import option, option_values
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
@@ -40,26 +40,38 @@ LONG_ON_A_CPU = 4e9
 """Pixels to render, over all iterations, from which the command says that a CPU takes long."""
 
 
+@dataclass(frozen=True)
+class StartOptions:
+    """Choose whether a run is new, continued or replaced, and whether it is shown meanwhile.
+
+    Raises:
+        UserInputError: options that contradict each other.
+    """
+
+    resume: bool = option(
+        False,
+        "Continue the run in --out with its settings. A finished run is extended to --iterations, a larger number than "
+        "it has.",
+    )
+    overwrite: bool = option(False, "Replace the run in --out.")
+    viewing: ViewOptions = field(default_factory=ViewOptions)
+
+    def __post_init__(self) -> None:
+        if self.resume and self.overwrite:
+            raise UserInputError("--resume and --overwrite contradict each other; give one of them")
+
+
 @takes_settings
 def train(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Blender-style scene.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
+    *,
+    start: StartOptions,
+    config: ConfigOption = None,
     photos: SceneOptions,
     settings: TrainSettings,
     control: TrainingControl,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Continue the run in --out with its settings. A finished run is extended to --iterations, a larger "
-            "number than it has.",
-        ),
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
-    view: ViewOption = False,
-    view_port: ViewPortOption = None,
-    config: ConfigOption = None,
 ) -> None:
     """Train a scene coarse to fine with the built-in trainer, on a GPU (gsplat) or a CPU.
 
@@ -81,46 +93,57 @@ def train(
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1
     """
-    from rich.markup import escape
-
-    from lapgs_plugin.runs.gpu_busy import require_cuda
-    from lapgs_plugin.runs.manifest import SceneReference
     from lapgs_plugin.scenes.masks import resolve_masks
-    from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-    from lapgs_plugin.training.tensorboard import require_tensorboard
 
-    if resume and overwrite:
-        raise UserInputError("--resume and --overwrite contradict each other; give one of them")
-    watcher = context.with_resource(watching(view, view_port, out.absolute().name))
-    reference = SceneReference(
+    watcher = context.with_resource(watching(start.viewing, out.absolute().name))
+    reference = _reference(scene, photos)
+    if isinstance(context.obj, Rehearsal):
+        context.obj.train(settings, reference, control.rasterizer)
+        return
+    reference = replace(reference, masks=resolve_masks(scene, photos.masks))
+    _require_measuring(settings, control)
+    if start.resume:
+        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
+        archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
+    else:
+        archive, loaded = _create(out, reference, settings, control.rasterizer, start.overwrite)
+        write_config(archive.path(RUN_CONFIG), context, masks=reference.masks)
+    with archive:
+        _run(archive, loaded, settings, control, resume=start.resume, watcher=watcher)
+    _finish(out)
+
+
+def _reference(scene: Path, photos: SceneOptions) -> SceneReference:
+    """Return the scene, and how it is read, for the manifest; the scene is not read yet."""
+    from lapgs_plugin.runs.manifest import SceneReference
+
+    return SceneReference(
         *(str(scene.absolute()), photos.resolution, photos.eval, photos.background_color),
         images=photos.images,
         kind="",
         masks=photos.masks,
     )
-    if isinstance(context.obj, Rehearsal):
-        context.obj.train(settings, reference, control.rasterizer)
-        return
-    reference = replace(reference, masks=resolve_masks(scene, photos.masks))
+
+
+def _require_measuring(settings: TrainSettings, control: TrainingControl) -> None:
+    """Check that this machine can log and measure as asked."""
+    from lapgs_plugin.runs.gpu_busy import require_cuda
+    from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
+    from lapgs_plugin.training.tensorboard import require_tensorboard
+
     if control.log is not None:
         require_tensorboard()
     if control.gpu_busy:
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
-    console = make_console(stderr=True)
-    if resume:
-        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
-        archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
-    else:
-        archive, loaded = _create(out, reference, settings, choose_rasterizer(control.rasterizer), overwrite)
-        write_config(archive.path(RUN_CONFIG), context, masks=reference.masks)
-    with archive:
-        _run(archive, loaded, settings, control, console, resume=resume, watcher=watcher)
-        if resume and settings.extended:
-            strategy = settings.densification.strategy
-            extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
+
+
+def _finish(out: Path) -> None:
+    """Render a preview of the run, and say what can be done with it."""
+    from rich.markup import escape
+
     keep_preview(out.absolute())
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
-    console.print(
+    make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
         soft_wrap=True,
     )
@@ -157,7 +180,7 @@ def _resume(
         UserInputError: the scene or an option differs from those that the run was started with.
     """
     from lapgs_plugin.files import MANIFEST
-    from lapgs_plugin.rendering.run import require_same_scene
+    from lapgs_plugin.rendering.run import load_reference, require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.planning import check_storage
@@ -165,28 +188,12 @@ def _resume(
     archive = RunArchive.open(out, resume=True)
     try:
         manifest = archive.manifest
-        before = Path(manifest.scene.path)
-        if before.exists() and scene.exists() and not before.samefile(scene):
-            raise UserInputError(
-                f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or "
-                "start again with --overwrite"
-            )
+        _require_same_folder(out, Path(manifest.scene.path), scene)
         settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
         if manifest.complete:
             settings = _extended(archive, settings, int(wanted["iterations"]) if "iterations" in given else None)
             given = given - {"iterations"}
-        started_with = _wanted(manifest.scene, settings, manifest.rasterizer)
-        for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
-            if name not in started_with:  # another strategy's
-                raise UserInputError(
-                    f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
-                    f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
-                )
-            if wanted[name] != started_with[name]:
-                raise UserInputError(
-                    f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "
-                    f"{started_with[name]}; leave the option out to continue it, or start again with --overwrite"
-                )
+        _require_same(out, given, wanted, _wanted(manifest.scene, settings, manifest.rasterizer))
         anew = {name: wanted[name] for name in MAY_CHANGE if name in given}
         settings = replace(settings, **anew)
         try:
@@ -195,12 +202,36 @@ def _resume(
             if anew:
                 raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
-        loaded = _load(replace(manifest.scene, path=str(scene.absolute())))
+        loaded = load_reference(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
     except BaseException:
         archive.close()
         raise
     return archive, loaded, settings
+
+
+def _require_same_folder(out: Path, before: Path, scene: Path) -> None:
+    """Refuse another scene than that of the run, which may have been moved."""
+    if before.exists() and scene.exists() and not before.samefile(scene):
+        raise UserInputError(
+            f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or start "
+            "again with --overwrite"
+        )
+
+
+def _require_same(out: Path, given: set[str], wanted: Mapping[str, Any], started_with: Mapping[str, Any]) -> None:
+    """Refuse given options that are not those of the run."""
+    for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+        if name not in started_with:  # another strategy's
+            raise UserInputError(
+                f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
+                f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
+            )
+        if wanted[name] != started_with[name]:
+            raise UserInputError(
+                f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "
+                f"{started_with[name]}; leave the option out to continue it, or start again with --overwrite"
+            )
 
 
 def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -> TrainSettings:
@@ -223,31 +254,20 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     return replace(settings, iterations=goal, extended=settings.extended + goal - done)
 
 
-def _load(reference: SceneReference) -> Scene:
-    from lapgs_plugin.scenes import load_scene
-
-    return load_scene(
-        reference.path,
-        resolution=reference.resolution,
-        images=reference.images,
-        eval=reference.eval,
-        masks=reference.masks,
-        background=reference.background,
-    )
-
-
 def _create(
     out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
 ) -> tuple[RunArchive, Scene]:
     """Read the scene and check the settings before the run folder is made."""
+    from lapgs_plugin.rendering.run import load_reference
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
-    from lapgs_plugin.training.backend import training_rasterizer
+    from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
     from lapgs_plugin.training.planning import check_storage, make_plan
 
     RunArchive.require_room(out, overwrite)
+    rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
-    loaded = _load(reference)
+    loaded = load_reference(reference)
     make_plan(loaded.smallest_size, settings, len(loaded.train))
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
@@ -262,7 +282,6 @@ def _run(
     scene: Scene,
     settings: TrainSettings,
     control: TrainingControl,
-    console: Console,
     *,
     resume: bool,
     watcher: Watcher,
@@ -271,7 +290,6 @@ def _run(
     import torch
 
     from lapgs_plugin.jit.threads import one_pool
-    from lapgs_plugin.scenes.masks import share_inside
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.monitor import Monitor, ProgressMonitor
     from lapgs_plugin.training.planning import make_plan
@@ -280,14 +298,8 @@ def _run(
 
     if control.threads is not None:
         torch.set_num_threads(control.threads)
-    manifest = archive.manifest
-    masks = [view.mask for view in (*scene.train, *scene.test)]
-    if any(mask is not None for mask in masks):
-        console.print(
-            f"masks ({manifest.scene.masks}): {share_inside(masks):.0%} of the pixels are trained on and measured",
-            highlight=False,
-            markup=False,
-        )
+    console, manifest = make_console(stderr=True), archive.manifest
+    _say_masked(console, scene, manifest.scene.masks)
     placed = training_rasterizer(manifest.rasterizer, settings)
     if placed.device.type == "cpu" and (hint := long_on_a_cpu(scene.smallest_size, settings.iterations)):
         console.print(hint, highlight=False, soft_wrap=True)
@@ -310,6 +322,22 @@ def _run(
             watcher=watcher,
         )
         trainer.run(resume)
+    if resume and settings.extended:
+        strategy = settings.densification.strategy
+        extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
+
+
+def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:
+    """Print the share of the pixels inside masks, if there are masks."""
+    from lapgs_plugin.scenes.masks import share_inside
+
+    masks = [view.mask for view in (*scene.train, *scene.test)]
+    if any(mask is not None for mask in masks):
+        console.print(
+            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured",
+            highlight=False,
+            markup=False,
+        )
 
 
 def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:

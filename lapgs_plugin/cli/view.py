@@ -22,7 +22,7 @@ def view(
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Run folder of `lapgs train`, `lapgs run` or `lapgs import-run`.")
     ],
-    options: RenderOptions,
+    *,
     baseline: Annotated[
         Path | None, typer.Option(help="Another run of the same scene, shown beside RUN behind a movable divider.")
     ] = None,
@@ -30,6 +30,7 @@ def view(
         str, typer.Option(help="Address to listen on. The default accepts this machine only; 0.0.0.0 accepts all.")
     ] = HOST,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, the next free one.")] = PORT,
+    options: RenderOptions,
 ) -> None:
     """Show RUN in a web browser, with a switch and a gain for each frequency band.
 

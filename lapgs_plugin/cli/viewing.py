@@ -5,12 +5,12 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runs.watcher import Watcher
 
 if TYPE_CHECKING:
@@ -20,11 +20,24 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8080
 
-ViewOption = Annotated[bool, typer.Option("--view", help="Show training in a web browser.")]
-ViewPortOption = Annotated[
-    int | None,
-    typer.Option(min=1, max=65535, help=f"Port of --view; if it is taken, the next free one. Default: {PORT}."),
-]
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Choose whether a run is shown while it is trained.
+
+    Raises:
+        UserInputError: a port without --view.
+    """
+
+    view: bool = option(False, "Show training in a web browser.")
+    view_port: int | None = option(
+        None, f"Port of --view; if it is taken, the next free one. Default: {PORT}.", least=1, most=65535
+    )
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        if not self.view and self.view_port is not None:
+            raise UserInputError(f"--view-port {self.view_port} needs --view; leave it out")
 
 
 def require_viser(what: str) -> None:
@@ -59,25 +72,23 @@ def open_page(host: str, port: int, label: str, until: str, preview: Image | Non
 
 
 @contextmanager
-def watching(view: bool, port: int | None, label: str, device: str = "auto") -> Iterator[Watcher]:
+def watching(options: ViewOptions, label: str, device: str = "auto") -> Iterator[Watcher]:
     """Return a watcher for a training run: the viewer with `--view`, else one that does nothing.
 
     Args:
-        view, port: values of --view and --view-port.
+        options: whether to show the run, and where.
         label: title of the page.
         device: where images are rendered.
 
     Raises:
-        UserInputError: a port without --view, or no port is free.
+        UserInputError: no port is free.
         MissingExtraError: viser is not installed.
     """
-    if not view:
-        if port is not None:
-            raise UserInputError(f"--view-port {port} needs --view; leave it out")
+    if not options.view:
         yield Watcher()
         return
     require_viser("--view")
-    with open_page(HOST, PORT if port is None else port, label, "it shows the run while it is trained") as page:
+    with open_page(HOST, options.view_port or PORT, label, "it shows the run while it is trained") as page:
         from lapgs_plugin.viewer.live import LiveView
 
         yield LiveView(page, device)

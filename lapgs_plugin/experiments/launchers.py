@@ -12,13 +12,14 @@ import subprocess
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.worker import Slot, work
 
 
@@ -29,18 +30,14 @@ class WorkOrder:
     Attributes:
         store: the store of results, on a disk that all workers see.
         run_ids: the runs to do.
-        workers: number of workers; None leaves it to the launcher.
-        gpus: for the local launcher, values of CUDA_VISIBLE_DEVICES; None uses all GPUs.
         logs: folder for the workers' own output.
-        options: of the engine behind the launcher.
+        settings: where and how many at a time.
     """
 
     store: Path
     run_ids: Sequence[str]
-    workers: int | None
-    gpus: Sequence[str] | None
     logs: Path
-    options: Mapping[str, Any] = field(default_factory=dict)
+    settings: WorkerSettings
 
 
 class Launcher(ABC):
@@ -52,7 +49,7 @@ class Launcher(ABC):
         """Refuse unknown options, or an engine that is not installed.
 
         Raises:
-            UserInputError, MissingExtraError: see `check_order`.
+            UserInputError, MissingExtraError: see `check_launcher`.
         """
 
     @abstractmethod
@@ -72,35 +69,31 @@ class Launcher(ABC):
         return []
 
 
-def launch(name: str, order: WorkOrder) -> Launcher:
+def launch(order: WorkOrder) -> Launcher:
     """Start workers.
 
-    Args:
-        name: "local", "slurm" or "ray".
-        order: the work.
+    Raises:
+        UserInputError, MissingExtraError: see `check_launcher`.
+    """
+    check_launcher(order.settings)
+    return _KINDS[order.settings.launcher](order)
+
+
+def check_launcher(settings: WorkerSettings) -> None:
+    """Refuse settings that `launch` would refuse, before anything is written.
 
     Raises:
-        UserInputError: the name or an option is not known.
+        UserInputError: the launcher or an option of it is not known.
         MissingExtraError: the engine is not installed.
     """
-    check_order(name, order)
-    return _KINDS[name](order)
-
-
-def check_order(name: str, order: WorkOrder) -> None:
-    """Refuse an order that `launch` would refuse, before anything is written.
-
-    Raises:
-        UserInputError: the name or an option is not known.
-        MissingExtraError: the engine is not installed.
-    """
+    name, gpus = settings.launcher, settings.gpus
     if name not in _KINDS:
         raise UserInputError(f"--launcher {name}: expected {', '.join(_KINDS)}")
-    if order.gpus is not None and name != "local":
-        raise UserInputError(f"--gpus {','.join(order.gpus)}: {name} assigns GPUs itself; leave it out")
-    if order.gpus is not None and not all(gpu.strip() for gpu in order.gpus):
-        raise UserInputError(f"--gpus {','.join(order.gpus)!r}: expected names separated by commas, such as 0,1")
-    _KINDS[name].check(order.options)
+    if gpus is not None and name != "local":
+        raise UserInputError(f"--gpus {gpus}: {name} assigns GPUs itself; leave it out")
+    if gpus is not None and not all(gpu.strip() for gpu in gpus.split(",")):
+        raise UserInputError(f"--gpus {gpus!r}: expected names separated by commas, such as 0,1")
+    _KINDS[name].check(settings.launcher_options)
 
 
 class LocalLauncher(Launcher):
@@ -156,7 +149,7 @@ class SlurmLauncher(Launcher):
     def __init__(self, order: WorkOrder) -> None:
         import submitit
 
-        options = dict(order.options)
+        options = order.settings.launcher_options
         cluster = options.pop("cluster", "slurm")
         try:
             executor = submitit.AutoExecutor(folder=order.logs, cluster=cluster)
@@ -164,7 +157,9 @@ class SlurmLauncher(Launcher):
         except (NameError, TypeError, ValueError, RuntimeError, AssertionError) as error:
             raise UserInputError(f"--launcher-option: {error}") from error
         self._failed: list[str] = []
-        self._jobs = [executor.submit(work, order.store, list(order.run_ids)) for _ in range(order.workers or 1)]
+        self._jobs = [
+            executor.submit(work, order.store, list(order.run_ids)) for _ in range(order.settings.workers or 1)
+        ]
 
     def running(self) -> bool:
         return not all(job.done() for job in self._jobs)
@@ -203,7 +198,7 @@ class RayLauncher(Launcher):
     def __init__(self, order: WorkOrder) -> None:
         import ray
 
-        options = dict(order.options)
+        options = order.settings.launcher_options
         self._ray = ray
         self._started = not ray.is_initialized()
         if self._started:
@@ -211,7 +206,7 @@ class RayLauncher(Launcher):
         resources = ray.cluster_resources()
         gpus = float(options.get("num_gpus", 1 if resources.get("GPU") else 0))
         cpus = float(options.get("num_cpus", 1))
-        count = order.workers or max(1, int(resources["GPU"] / gpus if gpus else resources["CPU"] / cpus))
+        count = order.settings.workers or max(1, int(resources["GPU"] / gpus if gpus else resources["CPU"] / cpus))
         task = ray.remote(num_gpus=gpus, num_cpus=cpus, max_retries=3)(work)
         self._tasks = [task.remote(order.store, list(order.run_ids)) for _ in range(count)]
 
@@ -240,8 +235,8 @@ _KINDS: dict[str, type[Launcher]] = {"local": LocalLauncher, "slurm": SlurmLaunc
 
 def _slots(order: WorkOrder) -> list[Slot]:
     """Divide this machine among the workers."""
-    gpus = visible_gpus() if order.gpus is None else list(order.gpus)
-    count = order.workers or max(1, len(gpus))
+    gpus = visible_gpus() if order.settings.gpus is None else order.settings.gpus.split(",")
+    count = order.settings.workers or max(1, len(gpus))
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [tuple(cores[i * len(cores) // count : (i + 1) * len(cores) // count]) for i in range(count)]
     return [Slot(gpus[i % len(gpus)] if gpus else None, share) for i, share in enumerate(shares)]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
@@ -51,34 +52,12 @@ class Selection:
 
 
 @dataclass(frozen=True)
-class PlaceSettings:
-    """Choose where results are written, and say where data sets, scenes and checkouts are."""
-
-    out: Path | None = option(
-        None, "Folder for runs and results. Default: runs/bench/NAME.", panel=PLACES, names=("--out", "-o")
-    )
-    paths: list[str] | None = option(
-        None,
-        "Folder of a data set, scene or checkout that the file names. Repeatable. LAPGS_<NAME> in the environment does "
-        "the same.",
-        panel=PLACES,
-        names=("--path",),
-        metavar="NAME=FOLDER",
-    )
-
-    @property
-    def folders(self) -> dict[str, Path]:
-        """The folders of --path by name.
-
-        Raises:
-            UserInputError: a value is no NAME=FOLDER, or the home folder of an unknown user.
-        """
-        return {name: _folder(name, text) for name, text in _pairs(self.paths, "--path").items()}
-
-
-@dataclass(frozen=True)
 class WorkerSettings:
-    """Choose where runs are executed, and how many at a time."""
+    """Choose where runs are executed, and how many at a time.
+
+    Raises:
+        UserInputError: a number is out of range, or an option of the launcher is no NAME=VALUE.
+    """
 
     launcher: str = option("local", "Where runs are executed: local, slurm (with submitit) or ray.", panel=ENGINE)
     workers: int | None = option(
@@ -93,21 +72,34 @@ class WorkerSettings:
         metavar="NAME=VALUE",
     )
 
-    @property
-    def launcher_options(self) -> dict[str, str | int]:
-        """The values of --launcher-option by name.
+    def __post_init__(self) -> None:
+        check_values(self)
+        _ = self.launcher_options
 
-        Raises:
-            UserInputError: a value is no NAME=VALUE.
-        """
+    @property
+    def launcher_options(self) -> dict[str, Any]:
+        """The values of --launcher-option by name."""
         pairs = _pairs(self.launcher_option, "--launcher-option")
         return {name: int(value) if value.isdecimal() else value for name, value in pairs.items()}
 
 
 @dataclass(frozen=True)
-class ResultSettings:
-    """Choose how finished runs are measured, or what is printed instead of running any."""
+class BenchSettings:
+    """Choose the runs of an experiment, where they are executed and written, and how they are measured."""
 
+    selection: Selection = field(default_factory=Selection)
+    out: Path | None = option(
+        None, "Folder for runs and results. Default: runs/bench/NAME.", panel=PLACES, names=("--out", "-o")
+    )
+    paths: list[str] | None = option(
+        None,
+        "Folder of a data set, scene or checkout that the file names. Repeatable. LAPGS_<NAME> in the environment does "
+        "the same.",
+        panel=PLACES,
+        names=("--path",),
+        metavar="NAME=FOLDER",
+    )
+    engine: WorkerSettings = field(default_factory=WorkerSettings)
     evaluate: bool = option(
         True,
         "Measure every run with `lapgs eval`, or use the metrics that training recorded at its end.",
@@ -116,6 +108,15 @@ class ResultSettings:
     lpips_weights: list[Path] | None = option(None, "Weights of an LPIPS network for `lapgs eval`. Repeatable.")
     dry_run: bool = option(False, "Print the commands of all runs.")
     tables_only: bool = option(False, "Only write the tables from existing results.")
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """The folders of --path by name.
+
+        Raises:
+            UserInputError: a value is no NAME=FOLDER, or the home folder of an unknown user.
+        """
+        return {name: _folder(name, text) for name, text in _pairs(self.paths, "--path").items()}
 
 
 def _pairs(texts: Sequence[str] | None, name_of_option: str) -> dict[str, str]:

@@ -43,6 +43,18 @@ def run_renderer(
     return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device, finest=finest)
 
 
+def load_reference(reference: SceneReference) -> Scene:
+    """Load the scene that a manifest names, and read it as the manifest says."""
+    return load_scene(
+        reference.path,
+        resolution=reference.resolution,
+        images=reference.images,
+        eval=reference.eval,
+        masks=reference.masks,
+        background=reference.background,
+    )
+
+
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
     """Load the scene of a run with the settings of the training.
 
@@ -60,14 +72,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
             f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
             "put them back"
         )
-    scene = load_scene(
-        path,
-        resolution=reference.resolution,
-        images=reference.images,
-        eval=reference.eval,
-        masks=reference.masks,
-        background=reference.background,
-    )
+    scene = load_reference(replace(reference, path=str(path)))
     require_same_scene(archive, scene.path, scene.smallest_size)
     return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
 

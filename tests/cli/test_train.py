@@ -82,7 +82,7 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
         (("--packed", "--sparse-adam", "--rasterizer", "cpu"), "--packed, --sparse-adam with --rasterizer cpu"),
         (
             ("--cap-max", "7", "--absgrad"),
-            "--cap-max is an option of --strategy mcmc, which does not take --densify-threshold",
+            "--cap-max is an option of --strategy mcmc, which does not take --absgrad",
         ),
         (("--strategy", "mcmc", "--absgrad"), "--absgrad True with --strategy mcmc: an option of --strategy auto"),
         (("--strategy", "mcmc", "--error-pixels", "3"), "--error-pixels 3.0 with --strategy mcmc: an option of --str"),

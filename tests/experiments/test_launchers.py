@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import launchers
 from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
 from lapgs_plugin.experiments.runner import execute
+from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
 from tests.experiments.examples import COPY, START, copying_jobs
 
@@ -25,15 +27,13 @@ NOTE_ENVIRONMENT = START + (
 
 
 def order(
-    tmp_path: Path, count: int, workers: int, code: str = COPY, seconds: float = 0.0, **changes: object
+    tmp_path: Path, count: int, workers: int, code: str = COPY, seconds: float = 0.0, **settings: Any
 ) -> WorkOrder:
     jobs = copying_jobs(tmp_path, count, seconds, code)
     store = ResultStore.create(tmp_path / "results.sqlite")
     store.plan(jobs)
-    values = {"gpus": None, "options": {}, **changes}
-    return WorkOrder(
-        tmp_path / "results.sqlite", [job.run_id for job in jobs], workers, logs=tmp_path / "logs" / "workers", **values
-    )
+    logs, engine = tmp_path / "logs" / "workers", WorkerSettings(workers=workers, **settings)
+    return WorkOrder(tmp_path / "results.sqlite", [job.run_id for job in jobs], logs, engine)
 
 
 def run_all(order: WorkOrder, start: Callable[[], Launcher]) -> list[Outcome]:
@@ -49,8 +49,8 @@ def starts(tmp_path: Path) -> Counter[str]:
 
 def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
     code = COPY.replace(START, NOTE_ENVIRONMENT)
-    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus=["3", "5"])
-    outcomes = run_all(work_order, lambda: launch("local", work_order))
+    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus="3,5")
+    outcomes = run_all(work_order, lambda: launch(work_order))
     assert [outcome.state for outcome in outcomes] == [DONE] * 6
     assert set((tmp_path / "started-gpus").read_text().split()) == {"3", "5"}
     assert starts(tmp_path) == dict.fromkeys(work_order.run_ids, 1)
@@ -70,13 +70,13 @@ def test_workers_that_do_nothing_are_an_error(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(launchers, "work", broken)
     work_order = order(tmp_path, 1, 1)
     with pytest.raises(UserInputError, match=r"workers end without finishing a run: .*no space left"):
-        run_all(work_order, lambda: launch("local", work_order))
+        run_all(work_order, lambda: launch(work_order))
 
 
 def test_jobs_through_submitit(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
-    work_order = order(tmp_path, 3, 2, options={"cluster": "local"})
-    outcomes = run_all(work_order, lambda: launch("slurm", work_order))
+    work_order = order(tmp_path, 3, 2, launcher="slurm", launcher_option=["cluster=local"])
+    outcomes = run_all(work_order, lambda: launch(work_order))
     assert [outcome.state for outcome in outcomes] == [DONE] * 3
     assert starts(tmp_path) == dict.fromkeys(work_order.run_ids, 1)
     assert list((tmp_path / "logs" / "workers").glob("*_log.out")), "what the workers said"
@@ -85,7 +85,7 @@ def test_jobs_through_submitit(tmp_path: Path) -> None:
 def test_an_option_that_submitit_does_not_know(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
     with pytest.raises(UserInputError, match=r"--launcher-option: .*slurm_partiton"):
-        launch("slurm", order(tmp_path, 1, 1, options={"cluster": "local", "slurm_partiton": "gpu"}))
+        launch(order(tmp_path, 1, 1, launcher="slurm", launcher_option=["cluster=local", "slurm_partiton=gpu"]))
 
 
 @pytest.mark.slow
@@ -93,7 +93,8 @@ def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -
     """Needs Ray: pip install 'lapgs_plugin[ray]'."""
     ray = pytest.importorskip("ray")
     killing = "import os; open(started + '-worker', 'w').write(str(os.getppid())); "
-    work_order = order(tmp_path, 6, 2, COPY.replace(START, START + killing), seconds=1.0, options={"num_cpus": 1})
+    code, options = COPY.replace(START, START + killing), ["num_cpus=1"]
+    work_order = order(tmp_path, 6, 2, code, seconds=1.0, launcher="ray", launcher_option=options)
     killed: list[int] = []
 
     def say(outcome: Outcome) -> None:
@@ -103,7 +104,7 @@ def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -
 
     try:
         ray.init(num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False)
-        outcomes = execute(ResultStore(work_order.store), work_order.run_ids, lambda: launch("ray", work_order), say)
+        outcomes = execute(ResultStore(work_order.store), work_order.run_ids, lambda: launch(work_order), say)
     finally:
         ray.shutdown()
     assert killed

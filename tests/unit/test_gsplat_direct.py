@@ -17,7 +17,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import blend_gradients
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import GSPLAT, SWITCH, TRITON, triton_works
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.backend import training_rasterizer
@@ -51,6 +51,7 @@ def moved(by: float) -> Camera:
 
 def test_it_is_used() -> None:
     assert direct_works()
+    assert stacking_works()
     assert triton_works()
 
 

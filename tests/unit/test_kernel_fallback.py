@@ -23,6 +23,7 @@ from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.ops.self_check import SelfCheck
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat import rasterizer as rasterizer_module
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.training.model import TrainableField
@@ -147,3 +148,16 @@ def test_one_of_the_kernels_around_gsplats(name: str, caplog: pytest.LogCaptureF
     assert line.startswith(
         "rendering by `gsplat.rasterization`, which takes more launches: module 'triton.language' has"
     )
+
+
+def test_a_stack(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", broken("write_to_stack"))
+    chosen: dict[str, bool] = {}
+    monkeypatch.setattr(rasterizer_module, "direct_works", lambda: True)
+    monkeypatch.setattr(rasterizer_module, "GsplatStack", lambda fields, device, **options: chosen.update(options))
+    rasterizer = GsplatRasterizer(device="cpu")
+    rasterizer._device = torch.device("cuda")
+    rasterizer.stack([field()])
+    assert chosen == {"antialiased": False, "direct": False}
+    (line,) = said(caplog)
+    assert line.startswith("rendering the fields of a view together with gsplat's functions")

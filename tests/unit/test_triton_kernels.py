@@ -103,8 +103,10 @@ add_statistics_triton(pixels, torch.where(shown, 5, 0).int(), (40, 30), norms, c
 close(norms, expected[0])
 close(counts, expected[1])
 
+from lapgs_plugin.rasterizers.gsplat.self_check import stacking_works
 from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss
 torch.set_default_device(None)
+assert stacking_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5

@@ -22,7 +22,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
 
@@ -164,7 +164,7 @@ class GsplatRasterizer:
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.StackingRasterizer`."""
         antialiased = self._stock.antialiased
-        direct = self._device.type == "cuda" and not antialiased and direct_works()
+        direct = self._device.type == "cuda" and not antialiased and direct_works() and stacking_works()
         return GsplatStack(fields, self._device, antialiased=antialiased, direct=direct)
 
     @property

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.ops.self_check import largest, matches_reference
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
@@ -59,6 +61,23 @@ def direct_works(device: torch.device) -> float:
             found.append([result.image, visible, *by_screen, *(leaf.grad for leaf in leaves)])
         differences += [(one - theirs).abs() / theirs.abs().max() for theirs, one in zip(*found, strict=True)]
     return largest(differences)
+
+
+@matches_reference("rendering the fields of a view together with gsplat's functions, which takes longer", 1e-4)
+def stacking_works(device: torch.device) -> float:
+    """Return the largest difference of what one field writes to a stack; values are about 1."""
+    from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
+
+    means, rotations, scales, depths, sh = (
+        value.to(device) for value in _random_parameters(300, torch.Generator().manual_seed(0))
+    )
+    centre, radii = torch.tensor([0.3, -0.2, 0.5], device=device), torch.ones(300, 2, dtype=torch.int32, device=device)
+    projected = radii, rotations[:, :2].contiguous(), depths, scales
+    stacked = [torch.zeros_like(part) for part in (*projected, means)]
+    write_to_stack(means, centre, sh, False, projected, stacked, 0)
+    degree = math.isqrt(sh.shape[1]) - 1
+    colors = sh_to_color(sh, torch.nn.functional.normalize(means - centre, dim=-1), degree, signed=False)
+    return largest((one - other).abs().float() for one, other in zip(stacked, (*projected, colors), strict=True))
 
 
 def _random_parameters(count: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
