@@ -82,6 +82,11 @@ class Strategy:
         """Return the options of one stage."""
         return self
 
+    @property
+    def most(self) -> int | None:
+        """Most Gaussians of a stage, of what `of_stage` returned; None if there is no limit."""
+        return None
+
     def start(self, field: GaussianField) -> GaussianField:
         """Return the field to train, given one that was made from points."""
         return field
@@ -231,6 +236,10 @@ class Mcmc(Regularized):
         own = self.base_cap_max if part.base and self.base_cap_max is not None else self.cap_max
         most = MOST_GAUSSIANS if part.finest else MOST_GAUSSIANS // 2
         return replace(self, cap_max=own or max(1, min(most, part.pixels // PIXELS_A_GAUSSIAN)))
+
+    @property
+    def most(self) -> int | None:
+        return self.cap_max
 
     def start(self, field: GaussianField) -> GaussianField:
         from lapgs_plugin.training.mcmc import mcmc_start

@@ -43,6 +43,7 @@ from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_images import StageImages
 from lapgs_plugin.training.stage_progress import StageProgress
 from lapgs_plugin.training.stage_start import first_exposures, first_model, first_poses, joint_fields
+from lapgs_plugin.training.strategies import Strategy
 from lapgs_plugin.training.views import level_views
 from lapgs_plugin.training.warm_up import warm_up
 
@@ -131,6 +132,8 @@ class Trainer:
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
                 few = few_views_line(len(context.scene.train), plan.iterations, bool(context.scene.test))
+                if not resume:
+                    self.monitor.say(self._strategy_line())
                 if few is not None and not resume:
                     self.monitor.say(few)
                 if self.settings.refine_poses and self.device.type == "cuda" and not resume:
@@ -144,6 +147,17 @@ class Trainer:
                     self._run_stage(stage, here, stop)
             except torch.cuda.OutOfMemoryError as error:
                 raise self._out_of_memory() from error
+
+    def _strategy_line(self) -> str:
+        """Say how Gaussians are added, and up to which numbers, coarsest level first."""
+        found = [self._strategy_of(stage).most for stage in self._context.plan]
+        limits = [f"{most:,}" for most in found if most is not None]
+        words = f", at most {' and '.join(limits)} Gaussians" if limits else ""
+        return f"--strategy {self.settings.densification.strategy}{words}"
+
+    def _strategy_of(self, stage: Stage) -> Strategy:
+        views = level_views(self._context.scene.train, stage.level)
+        return self.settings.strategy_of(stage, sum(view.camera.width * view.camera.height for view in views))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""
@@ -245,8 +259,6 @@ class Trainer:
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         context, before = self._context, self._context.record_to_extend(stage)
-        views = level_views(context.scene.train, stage.level)
-        pixels = sum(view.camera.width * view.camera.height for view in views)
         breakdown, poses = self._breakdown(before, checkpoint), first_poses(context, stage)
 
         def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
@@ -258,14 +270,16 @@ class Trainer:
             stage=replace(stage, iterations=schedule.end),
             schedule=schedule,
             settings=self.settings,
-            views=views,
+            views=level_views(context.scene.train, stage.level),
             images=images.targets,
             background=torch.zeros(3, device=self.device) if stage.signed else context.background,
             extent=context.scene.extent,
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=self.settings.strategy_of(stage, pixels).density_control(schedule, context.scene.extent),
+            densifier=self.settings.strategy_of(stage, self._pixels(stage)).density_control(
+                schedule, context.scene.extent
+            ),
             coarser=CoarserLevels(
                 images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
             ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training import mcmc
 from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, mcmc_start, shake
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
@@ -241,8 +243,15 @@ def test_manifests_of_any_version_are_read(hierarchy: str) -> None:
     assert settings_from_manifest(replace(manifest, settings=older)).for_manifest() == chosen.for_manifest()
 
 
+class Listening(Monitor):
+    said: ClassVar[list[str]] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
-def test_runs_stay_under_their_limits_and_learn(hierarchy: str, tmp_path: Path) -> None:
+def test_runs_say_their_limits_stay_under_them_and_learn(hierarchy: str, tmp_path: Path) -> None:
     density = Densification(start=3, until=55, every=5, strategy=MCMC, options=Mcmc(cap_max=120, base_cap_max=110))
     chosen = TrainSettings(
         iterations=60, hierarchy=hierarchy, sh_degree=1, sh_every=10, split="1/2,1/2", densification=density
@@ -251,7 +260,8 @@ def test_runs_stay_under_their_limits_and_learn(hierarchy: str, tmp_path: Path) 
     with RunArchive.create(
         tmp_path / "run", Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
     ) as run:
-        Trainer(ring_scene(), chosen, run, CpuRasterizer()).run()
+        Trainer(ring_scene(), chosen, run, CpuRasterizer(), monitor=Listening()).run()
+    assert "--strategy mcmc, at most 110 and 120 Gaussians" in Listening.said
     assert [record.num_gaussians for record in run.manifest.records] == [110, 120]
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))
