@@ -277,9 +277,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=self.settings.strategy_of(stage, self._pixels(stage)).density_control(
-                schedule, context.scene.extent
-            ),
+            densifier=self._strategy_of(stage).density_control(schedule, context.scene.extent),
             coarser=CoarserLevels(
                 images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
             ),
