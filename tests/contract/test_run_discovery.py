@@ -24,8 +24,9 @@ OTHER = "diff_gaussian_rasterization_abs"
 
 
 @pytest.fixture
-def fork(tmp_path: Path) -> Path:
+def fork(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a fork whose scripts are in a folder, and whose renderer imports another rasterizer when it is called."""
+    monkeypatch.delenv("COLUMNS", raising=False)  # set where tests run in parallel, and it would wrap what is printed
     root = Path(shutil.copytree(CHECKOUTS / "graphdeco", tmp_path / "fork", ignore=shutil.ignore_patterns("__pyc*")))
     (root / "scripts").mkdir()
     script = (root / "train.py").read_text(encoding="utf-8")
