@@ -56,6 +56,7 @@ def bench(experiment: Path, *more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=experiment.parent, capture_output=True, text=True, check=False, timeout=300)
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experiment: Path) -> None:
     torn = experiment.parent / "torn"
     make_sample_scene(torn, width=48, height=32, views=8, points=100, progress=False)

@@ -146,7 +146,12 @@ def test_a_signal_while_a_command_starts(which: signal.Signals, delay: float, sc
 
 @pytest.mark.parametrize(
     ("name", "which"),
-    [("sample", signal.SIGTERM), ("render", signal.SIGTERM), ("view", signal.SIGTERM), ("view", signal.SIGINT)],
+    [
+        ("sample", signal.SIGTERM),
+        ("render", signal.SIGTERM),
+        ("view", signal.SIGTERM),
+        pytest.param("view", signal.SIGINT, marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_in_the_middle_of_a_command(
     name: str, which: signal.Signals, scene: Path, run: Path, tmp_path: Path

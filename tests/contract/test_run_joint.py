@@ -249,6 +249,7 @@ def plys(archive: RunArchive) -> list[bytes]:
     return [archive.field_path(level).read_bytes() for level in archive.available_levels]
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_archives_them_ends_as_others(
     odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

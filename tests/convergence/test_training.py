@@ -132,6 +132,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
 
 
+@pytest.mark.slow
 def test_an_older_run_with_residuals_still_resets_opacities_in_them(scene: Scene, tmp_path: Path) -> None:
     """Manifests of that time have no `residual_resets`, and the options of all strategies beside the rest."""
     density = Densification(until=420, every=20)
