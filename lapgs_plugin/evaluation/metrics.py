@@ -15,7 +15,7 @@ from lapgs_plugin.ops.photometric_loss import in_torch
 LITTLE = 1e-6
 """Weight of the identity in a colour fit, relative to that of the pixels."""
 SMALLEST_MSE = 1e-10
-"""Smallest mean squared error that counts, near the resolution of float32 images: no PSNR is above 100 dB."""
+"""Smallest mean squared error that counts, near the resolution of float32 images; it bounds PSNR."""
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

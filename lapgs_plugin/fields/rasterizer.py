@@ -188,3 +188,8 @@ def render_transmittance(rasterizer: Rasterizer, field: GaussianField, camera: C
     """Compute `RenderResult.transmittance` with any rasterizer: render black Gaussians over white."""
     black = replace(field.with_parameters({"sh": torch.zeros_like(field.sh[:, :1])}), signed=True)
     return rasterizer(black, camera, background=torch.ones(3).to(field.means), sh_degree=0).image[0]
+
+
+def batching(rasterizer: Rasterizer) -> BatchRasterizer | None:
+    """Return the rasterizer if it renders several views together, else None. Checking a protocol is slow."""
+    return rasterizer if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch else None

@@ -64,15 +64,15 @@ def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterabl
     Returns:
         Empty if there are views that are not among the names, and neighbours tell nothing about those.
     """
-    wanted = list(views)
-    if unknown := [name for name in wanted if name not in names]:
+    wanted, known = list(views), dict(zip(names, values, strict=True))
+    if unknown := [name for name in wanted if name not in known]:
         if len(names) < 3:
             return {}
         middle = values[1:-1]
         by_neighbours = (middle - (values[:-2] + values[2:]) / 2).square().sum()
         if by_neighbours > LARGEST_ERROR * (middle - neutral).square().sum():
             return {}
-    found = {name: values[names.index(name)] for name in wanted if name in names}
+    found = {name: known[name] for name in wanted if name in known}
     for name in unknown:
         place = bisect(names, name)
         found[name] = values[max(place - 1, 0) : place + 1].mean(dim=0)

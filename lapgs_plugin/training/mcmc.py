@@ -7,6 +7,7 @@ In plain PyTorch, so that a CPU trains with it as well; gsplat has the same step
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -75,8 +76,7 @@ class McmcDensifier(DensityControl):
         camera: Camera,
         scores: ViewScores | None = None,
     ) -> bool:
-        refines = iteration < self._schedule.densify_until and self._schedule.refines(iteration)
-        if refines:
+        if refines := self._schedule.refines(iteration):
             self._move_dead(model)
             self._add(model)
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
@@ -135,10 +135,17 @@ def copies_of(opacities: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     single = opacities.double()  # the sum has alternating signs
     each = 1.0 - (1.0 - single) ** (1.0 / counts.double())
     order = torch.arange(1, MOST_COPIES + 1, device=opacities.device)
-    table = [[math.comb(n, m) * (-1) ** (m - 1) / math.sqrt(m) for m in order.tolist()] for n in range(MOST_COPIES + 1)]
-    coefficients = torch.tensor(table, dtype=single.dtype, device=opacities.device)
-    factors = single / (coefficients[counts] * each[:, None] ** order).sum(1)
+    factors = single / (_coefficients(opacities.device)[counts] * each[:, None] ** order).sum(1)
     return each.to(opacities.dtype), factors.to(opacities.dtype)
+
+
+@lru_cache(maxsize=4)
+@torch.inference_mode(False)  # cached for later calls, whatever mode the first one is in
+def _coefficients(device: torch.device) -> Tensor:
+    """Return (N + 1, N) C(n, m) (-1)^(m - 1) / sqrt(m), m from 1, for up to N = `MOST_COPIES` copies."""
+    orders = range(1, MOST_COPIES + 1)
+    table = [[math.comb(n, m) * (-1) ** (m - 1) / math.sqrt(m) for m in orders] for n in range(MOST_COPIES + 1)]
+    return torch.tensor(table, dtype=torch.float64, device=device)
 
 
 @torch.no_grad()

@@ -105,8 +105,7 @@ class MultiviewDensifier(Densifier):
 
     def score_threshold(self, iteration: int) -> float | None:
         late = iteration in self._schedule.late_prunes
-        refines = iteration < self._schedule.densify_until and self._schedule.refines(iteration)
-        return self._options.error_threshold if late or refines else None
+        return self._options.error_threshold if late or self._schedule.refines(iteration) else None
 
     def after_step(
         self,

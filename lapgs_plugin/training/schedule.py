@@ -126,7 +126,7 @@ class StageSchedule:
 
     def refines(self, iteration: int) -> bool:
         """Return whether Gaussians are added and removed after this iteration, while densification lasts."""
-        return iteration > self.densify_start and iteration % self.densify_every == 0
+        return self.densify_start < iteration < self.densify_until and iteration % self.densify_every == 0
 
     def gathers(self, iteration: int) -> bool:
         """Return whether the step of this iteration is a late one, which keeps the step sizes of one view."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import torch
 from gsplat.strategy.ops import remove
@@ -16,7 +16,7 @@ from torch import Tensor
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, render_image
+from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, batching, render_image
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
@@ -198,8 +198,7 @@ class StageRun:
 
         The gradient by a pose follows from the Gaussians' gradients of that view alone.
         """
-        able = self.poses is None and isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
-        return cast(BatchRasterizer, self.rasterizer) if able else None
+        return batching(self.rasterizer) if self.poses is None else None
 
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""

@@ -11,7 +11,7 @@ import torch
 
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer
+from lapgs_plugin.fields.rasterizer import Rasterizer, batching
 from lapgs_plugin.hierarchy.plan import Stage, continues_field
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
@@ -131,15 +131,8 @@ class Trainer:
                 residuals = any(stage.signed for stage in plan)
                 warm_up(self.rasterizer, self.settings, self.device, residuals=residuals, joint=joint)
                 self.watcher.run_started(self.archive)
-                few = few_views_line(len(context.scene.train), plan.iterations, bool(context.scene.test))
                 if not resume:
-                    self.monitor.say(self._strategy_line())
-                if few is not None and not resume:
-                    self.monitor.say(few)
-                if self.settings.refine_poses and self.device.type == "cuda" and not resume:
-                    self.monitor.say(
-                        "--refine-poses: views are rendered one by one, which takes longer than several at once"
-                    )
+                    self._say_what_is_chosen()
                 for stage in plan:
                     if stage.level in self.archive.available_levels and context.record_to_extend(stage) is None:
                         continue
@@ -147,6 +140,15 @@ class Trainer:
                     self._run_stage(stage, here, stop)
             except torch.cuda.OutOfMemoryError as error:
                 raise self._out_of_memory() from error
+
+    def _say_what_is_chosen(self) -> None:
+        """Tell the user what the settings mean for this scene and device."""
+        scene, say = self._context.scene, self.monitor.say
+        say(self._strategy_line())
+        if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
+            say(few)
+        if self.settings.refine_poses and self.device.type == "cuda":
+            say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 
     def _strategy_line(self) -> str:
         """Say how Gaussians are added, and up to which numbers, coarsest level first."""
@@ -244,8 +246,7 @@ class Trainer:
     @property
     def _batches(self) -> bool:
         """Whether the rasterizer renders several views together; poses are refined with each view alone."""
-        able = isinstance(self.rasterizer, BatchRasterizer) and self.rasterizer.can_batch
-        return able and not self.settings.refine_poses
+        return not self.settings.refine_poses and batching(self.rasterizer) is not None
 
     def _stage_run(
         self,
