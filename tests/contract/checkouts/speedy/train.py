@@ -20,11 +20,15 @@ def score_func(view, gaussians, pipeline, background, scores):
 
 
 def prune(scene, gaussians, pipe, background, prune_ratio):
+    iter_start, iter_end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    iter_start.record()
     with torch.enable_grad():
         scores = torch.zeros_like(gaussians.get_opacity)
         for view in scene.getTrainCameras():
             score_func(view, gaussians, pipe, background, scores)
     gaussians.prune_gaussians(prune_ratio, scores)
+    iter_end.record()
+    return iter_start.elapsed_time(iter_end)
 
 
 def training(
