@@ -176,7 +176,7 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
-    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS
+    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, missing_lines
 
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
     where = " inside their masks" if metrics["masked"] else ""
@@ -206,7 +206,5 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     if (busy := metrics["gpu_busy_seconds"]) is not None:
         console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
     console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
-    missing = metrics["lpips_missing"]
-    for reason in dict.fromkeys(missing.values()):
-        names = ", ".join(name for name in missing if missing[name] == reason)
-        console.print(f"LPIPS ({names}) not measured: {reason}", highlight=False, markup=False, soft_wrap=True)
+    for line in missing_lines(metrics["lpips_missing"]):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -88,6 +88,7 @@ def _newest(folder: Path) -> Path:
 def _print(runs: Sequence[MeasuredRun]) -> None:
     from rich.markup import escape
 
+    from lapgs_plugin.evaluation.lpips import missing_lines
     from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
     names = [escape(each.archive.path().name) for each in runs]
@@ -97,5 +98,7 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))
     console = make_console()
     console.print(table)
+    for line in missing_lines({name: why for each in runs for name, why in each.metrics["lpips_missing"].items()}):
+        console.print(f"{line}; then repeat lapgs eval", highlight=False, markup=False, soft_wrap=True)
     if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
         console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}", highlight=False)

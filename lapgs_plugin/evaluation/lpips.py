@@ -212,6 +212,12 @@ class LpipsMetrics:
         return {v: self.networks[network_of(v)](image, target, as_3dgs=v == AS_3DGS) for v in self.variants}
 
 
+def missing_lines(missing: Mapping[str, str]) -> list[str]:
+    """Return a line for each reason in `LpipsMetrics.missing`."""
+    variants = {reason: [name for name in missing if missing[name] == reason] for reason in missing.values()}
+    return [f"LPIPS ({', '.join(names)}) not measured: {reason}" for reason, names in variants.items()]
+
+
 @dataclass(frozen=True)
 class LpipsRequest:
     """The distances that a user asks for.

@@ -63,7 +63,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         *(
             (LPIPS_KEY.format(name), f"LPIPS ({title_of(name)}), {views} views", "{:.4f}", _difference("{:+.4f}"))
             for name in VARIANTS
-            if any(LPIPS_KEY.format(name) in each or name in each["lpips_missing"] for each in metrics)
+            if any(LPIPS_KEY.format(name) in each for each in metrics)
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),

@@ -19,7 +19,7 @@ from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.context import RunContext
-from lapgs_plugin.training.quality import SAMPLED_VIEWS, QualityWatch, copied, spread_views
+from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatch, copied, spread_views
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_images import StageImages
 
@@ -95,17 +95,18 @@ class StageEvaluation:
     def note_best(self, run: StageRun) -> None:
         """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
         aside, iteration = self.context.aside, run.progress.iteration
+        last = iteration == run.stage.iterations
         with self.overhead.timed("evaluation"):
             fitted = run.exposures is not None
             found = fmean(self._psnr(run, view)[fitted] for view in aside)
-            if self.best is None or found > self.best["psnr"]:
+            if self.best is None or found > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
                 state = run.state()
                 parts = {name: copied(state[name]) for name in ("model", "joint", "exposure", "poses")}
                 self.best = {"psnr": found, "iteration": iteration, **parts}
-            if iteration == run.stage.iterations and self.best["iteration"] < run.stage.iterations:
+            if last and self.best["iteration"] < iteration:
                 self.context.monitor.say(
                     f"level {run.stage.level}: archives the state after iteration {self.best['iteration']} of "
-                    f"{run.stage.iterations}, {self.best['psnr'] - found:.2f} dB better than the last one on "
+                    f"{iteration}, {self.best['psnr'] - found:.2f} dB better than the last one on "
                     f"{len(aside)} training views that were set aside"
                 )
 

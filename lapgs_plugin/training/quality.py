@@ -17,6 +17,8 @@ SAMPLED_VIEWS = 8
 """Most views of such a measurement."""
 SAMPLES_TO_KEEP_BEST = 10
 """How often a stage measures the views that were set aside, to keep the best state."""
+LEAST_GAIN = 0.01
+"""Decibels by which an earlier state must be better than the last one to be archived instead of it."""
 LEAST_VIEWS = 12
 """Fewest training views of which some can be set aside."""
 FEW_VIEWS, MANY_PASSES = 24, 100

@@ -120,6 +120,20 @@ def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.
     assert "--exposure on" in line
 
 
+def test_keep_best_keeps_the_last_state_unless_another_one_is_visibly_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples = iter([20.0, 20.001] + [20.0 - 0.001 * step for step in range(8)])  # the second of ten is best by 0.008 dB
+    values = (value for value in samples for _ in range(2))
+    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: (next(values),) * 2)
+    scene = ring_scene(train=12, test=0)
+    settings = TrainSettings(iterations=40, levels=1, sh_degree=0, exposure="off", keep="best")
+    monitor = Said()
+    train(scene, settings, tmp_path / "run", monitor)
+    assert next(values, None) is None
+    assert not [line for line in monitor.lines if "better than the last one" in line]
+
+
 class Names(StageHook):
     def __init__(self) -> None:
         self.seen: set[str] = set()
