@@ -747,6 +747,37 @@ def test_the_flag_is_the_sign_bit_of_a_c_int() -> None:
     assert signed_degree(0) == SIGNED_COLOR_BIT
 
 
+TILES = """
+int processTiles(Ends bbox_min, Ends bbox_max, Ends rect_min)
+{
+	Ends intersect_max_line;
+	int min_line = 0;
+	min_line = rect_min.x * BLOCK_U;
+	return min_line + BLOCK_U > bbox_max.x ? intersect_max_line.y - intersect_max_line.x : 0;
+}
+int duplicateToTilesTouched() { return processTiles({ 1, 2 }, { 3, 7 }, { 0, 0 }); }
+"""
+"""The structure of Speedy-Splat's count of tiles: a line that is used before it is set where an ellipse ends early."""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+def test_speedy_splats_tiles_are_counted_with_a_value_that_is_set(rasterizer: Path, tmp_path: Path) -> None:
+    (rasterizer / "cuda_rasterizer/auxiliary.h").write_text(TILES)
+    main = '#define BLOCK_U 16\nstruct Ends { int x = 1000, y = 2000; };\n#include "cuda_rasterizer/auxiliary.h"\n'
+    (rasterizer / "main.cpp").write_text(main + "int main() { return duplicateToTilesTouched() == 2 - 7 ? 0 : 1; }\n")
+
+    def status_of(name: str) -> int:
+        subprocess.run(["c++", "-std=c++17", "-o", str(tmp_path / name), "main.cpp"], cwd=rasterizer, check=True)
+        return subprocess.run([str(tmp_path / name)], check=False).returncode
+
+    (target,) = find_targets(rasterizer)
+    assert target.recipe.name == "speedy-splat"
+    apply(target, ALL_SETS)
+    assert status_of("before") == 1, "not part of all"
+    apply(target, "robustness")
+    assert status_of("after") == 0
+
+
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
 def test_patched_code_is_signed_when_asked_and_otherwise_what_it_was(rasterizer: Path, tmp_path: Path) -> None:
     (rasterizer / "main.cpp").write_text(MAIN)
