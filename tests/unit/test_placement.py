@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pycolmap
 import pytest
 
 from lapgs_plugin.scenes.prepare import placement
+from lapgs_plugin.scenes.prepare.colmap import MOST_GUIDED, match_more
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import Photos
 from lapgs_plugin.scenes.prepare.settings import GLOBAL, INCREMENTAL, PrepareSettings
@@ -80,3 +82,15 @@ def test_the_attempt_that_places_most_photos_is_kept(
     expected = [(None, None, None), (SIMPLE, None, None), (SIMPLE, INCREMENTAL, more), (SIMPLE, GLOBAL, more)]
     assert asked == expected[:attempts]
     assert models[0].num_reg_images() == kept
+
+
+@pytest.mark.parametrize("pairs", [0, MOST_GUIDED + 1])
+def test_no_more_matches_without_pairs_or_with_too_many(pairs: int, tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "database.db") as database:
+        database.execute("CREATE TABLE two_view_geometries (pair_id INTEGER, rows INTEGER)")
+        database.executemany(
+            "INSERT INTO two_view_geometries VALUES (?, ?)", [(0, 14), *((0, 15) for _ in range(pairs))]
+        )
+    database.close()
+    assert match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False)) is None
+    assert [file.name for file in tmp_path.iterdir()] == ["database.db"]

@@ -22,6 +22,8 @@ from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRI
 
 VERIFIED = 15
 """Fewest matches that agree on a geometry for two photos to count as showing the same, as in COLMAP's mapper."""
+MOST_GUIDED = 500
+"""Most pairs that are matched again, guided by their geometry, which takes seconds a pair on a processor."""
 MOST_EXHAUSTIVE = 500
 """Most photos of which all pairs are compared, unless a matcher was chosen; of more, those that look alike."""
 SIMILAR = 40
@@ -95,18 +97,24 @@ def match_pairs(job: Job) -> None:
     )
 
 
-def match_more(job: Job) -> Path:
+def match_more(job: Job) -> Path | None:
     """Match more features of the pairs with a known geometry, guided by it, and return a database with these matches.
 
-    It takes COLMAP seconds a pair on a processor.
+    Returns:
+        The database; None if there are no such pairs, or more than `MOST_GUIDED`.
     """
     found = job.work / "guided.db"
+    with closing(sqlite3.connect(job.database)) as connection:
+        known = "FROM two_view_geometries WHERE rows >= ?"
+        (total,) = connection.execute(f"SELECT COUNT(*) {known}", (VERIFIED,)).fetchone()
+    if not 0 < total <= MOST_GUIDED:
+        return None
     if not found.is_file():
         partial = found.with_suffix(".partial")
         shutil.copyfile(job.database, partial)
         with closing(sqlite3.connect(partial)) as connection, connection:
             # COLMAP matches pairs without a geometry again.
-            total = connection.execute("DELETE FROM two_view_geometries WHERE rows >= ?", (VERIFIED,)).rowcount
+            connection.execute(f"DELETE {known}", (VERIFIED,))
         before = _rows(partial, "two_view_geometries")
         options = {**_pairing(job), "database": str(partial.absolute()), "guided": True}
         _run_step(

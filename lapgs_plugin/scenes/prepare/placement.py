@@ -72,7 +72,7 @@ def _with_more_matches(job: Job, models: list[pycolmap.Reconstruction]) -> list[
     """Return the best of these models and those with more matches, by the incremental and then the global mapper."""
     logger.info("only %d photos could be placed; looking for more matches", _placed(models))
     database = match_more(job)
-    mappers = [INCREMENTAL, GLOBAL] if HAS_GLOBAL else [INCREMENTAL]
+    mappers = [*([INCREMENTAL] if database is not None else []), *([GLOBAL] if HAS_GLOBAL else [])]
     for mapper in mappers:
         if _few(job, models):
             found = _mapped(job, f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database)
