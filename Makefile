@@ -18,17 +18,17 @@ demo: $(VENV)/.installed
 	$(BIN)/lapgs render $(DEMO)/hierarchy
 	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
 
-# The smoke benchmark compiles the CPU kernels that the tests use, while mypy takes the other core. Two processes of one
-# thread each take half the time of one process of two: most tests start others or hardly compute. A browser that draws in
-# software needs the machine for itself.
+# The smoke benchmark compiles the CPU kernels that the tests use, beside mypy. Processes of one thread each take less time
+# than one process of two: most tests start others, wait for them or hardly compute. Files are tested in the order of
+# tests/conftest.py, so that none of the long ones is left to one process at the end.
 test: $(VENV)/.installed
 	$(MAKE) -j2 --output-sync=target check smoke
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m 'not slow and not browser'
-	$(BIN)/pytest -m 'browser and not slow'
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# One of the experiment's two seeds: whether everything works needs no deviations.
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)
-	$(BIN)/lapgs bench benchmarks/smoke.toml --out $(SMOKE)
+	OMP_NUM_THREADS=1 $(BIN)/lapgs bench benchmarks/smoke.toml --seeds 0 --workers 2 --out $(SMOKE)
 
 # Whether tests that compare two computations hold on other processors: raster, unit and contract tests, with PyTorch and
 # Numba told to compute as for narrower ones. Takes several times as long as `make test` and is no part of it.
@@ -40,9 +40,10 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Python compiles each module when it is imported first. pip would compile all, most of which nothing imports.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	touch $@
 
 clean:
