@@ -5,9 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
 SMOKE := runs/smoke
+KERNELS := runs/kernels
 DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
-.PHONY: demo test smoke portability check clean
+.PHONY: demo test kernels smoke portability check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
@@ -18,17 +19,20 @@ demo: $(VENV)/.installed
 	$(BIN)/lapgs render $(DEMO)/hierarchy
 	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
 
-# The smoke benchmark compiles the CPU kernels that the tests use, beside mypy. Processes of one thread each take less time
-# than one process of two: most tests start others, wait for them or hardly compute. Files are tested in the order of
-# tests/conftest.py, so that none of the long ones is left to one process at the end.
+# Kernels that most tests use are compiled once, beside mypy, instead of by both test processes. Processes of one thread
+# each take less time than one process of two: most tests start others, wait for them or hardly compute. Files are tested in
+# the order of tests/conftest.py, so that none of the long ones is left to one process at the end.
 test: $(VENV)/.installed
-	$(MAKE) -j2 --output-sync=target check smoke
+	$(MAKE) -j2 --output-sync=target check kernels
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# One of the experiment's two seeds: whether everything works needs no deviations.
+kernels: $(VENV)/.installed
+	$(BIN)/lapgs sample $(KERNELS)/scene --size 64x48 --views 3 --points 50 --overwrite
+	$(BIN)/lapgs train $(KERNELS)/scene -o $(KERNELS)/run --iterations 4 --eval --rasterizer cpu --overwrite
+
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)
-	OMP_NUM_THREADS=1 $(BIN)/lapgs bench benchmarks/smoke.toml --seeds 0 --workers 2 --out $(SMOKE)
+	$(BIN)/lapgs bench benchmarks/smoke.toml --out $(SMOKE)
 
 # Whether tests that compare two computations hold on other processors: raster, unit and contract tests, with PyTorch and
 # Numba told to compute as for narrower ones. Takes several times as long as `make test` and is no part of it.
@@ -47,4 +51,4 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(DEMO) $(SMOKE) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(DEMO) $(SMOKE) $(KERNELS) .mypy_cache .pytest_cache .ruff_cache
