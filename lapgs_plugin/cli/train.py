@@ -240,7 +240,7 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     Raises:
         UserInputError: not more iterations than it has, or others than those of its interrupted extension.
     """
-    from lapgs_plugin.runs.archive import CHECKPOINT
+    from lapgs_plugin.runs.layout import CHECKPOINT
 
     begun, done, run = archive.extends_to, settings.iterations, archive.path()
     if asked is not None and begun not in (None, asked):

@@ -15,8 +15,9 @@ from lapgs_plugin.fields.rasterizer import Rasterizer, batching
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
-from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
+from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
