@@ -21,6 +21,9 @@ MODEL_ROLES = ("get_xyz", "training_setup")
 SCALES = re.compile(r"\w*scal.*\.repeat\(1, ([0-9])\).*", re.DOTALL)
 """Statement by which models of the family give a point one scale along each of its axes."""
 
+SCENE_SCALES = "resolution_scales"
+"""Argument of the family's scenes that says at which scales they hold images."""
+
 FOLDERS_UP = 3
 """How far above a script the root of its checkout is searched."""
 
@@ -119,6 +122,15 @@ class CheckoutSource:
             for node in (each for model in models for each in ast.walk(model) if isinstance(each, ast.Assign)):
                 if found := SCALES.fullmatch(ast.unparse(node)):
                     return int(found[1]), place(path, self.root, node.lineno)
+        return None
+
+    @property
+    def image_scales(self) -> tuple[str, str] | None:
+        """Scales at which the training function asks its scene for images, and the place; None if it asks for one."""
+        calls = (node for node in ast.walk(self.training) if isinstance(node, ast.Call))
+        for given in (each.value for call in calls for each in call.keywords if each.arg == SCENE_SCALES):
+            if isinstance(given, (ast.List, ast.Tuple)) and len(given.elts) > 1:
+                return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
     @property

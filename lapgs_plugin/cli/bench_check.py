@@ -108,10 +108,10 @@ class _Check(Rehearsal):
 
     def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
         from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-        from lapgs_plugin.training.planning import check_storage, make_plan
+        from lapgs_plugin.training.planning import check_storage, make_plan, require_pruning
 
         if self.size is not None:
-            make_plan(self.size(reference.resolution) or ANY_SIZE, settings)
+            require_pruning(make_plan(self.size(reference.resolution) or ANY_SIZE, settings), settings)
         if self.here or rasterizer != AUTO:  # auto may choose another one elsewhere
             check_storage(settings, training_rasterizer(choose_rasterizer(rasterizer), settings).device)
 

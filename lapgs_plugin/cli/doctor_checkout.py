@@ -126,6 +126,9 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 def _kinds(source: CheckoutSource) -> list[Finding]:
     from lapgs_plugin.environment.findings import Finding
 
+    if (several := source.image_scales) is not None:
+        why = f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
+        return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     taken = {module: set[str]() for module in source.rasterizer_modules}
     for use in source.rasterizers:
         taken[use.module] |= use.inputs & COLORS

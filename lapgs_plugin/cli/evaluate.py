@@ -86,7 +86,8 @@ def evaluate(
         return
     from lapgs_plugin.evaluation.figures import evaluate_run
     from lapgs_plugin.evaluation.lpips import LpipsRequest
-    from lapgs_plugin.runs.archive import METRICS, RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
+    from lapgs_plugin.runs.layout import METRICS
 
     wanted = LpipsRequest.parse(settings.lpips, settings.lpips_weights or ())
     archive = RunArchive.open(run)
@@ -100,7 +101,8 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
     """Measure flicker along a path and print it."""
     from lapgs_plugin.evaluation.stability import evaluate_stability
     from lapgs_plugin.rendering.run import path_cameras
-    from lapgs_plugin.runs.archive import STABILITY, RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
+    from lapgs_plugin.runs.layout import STABILITY
 
     archive = RunArchive.open(run)
     other = None if settings.baseline is None else RunArchive.open(settings.baseline)

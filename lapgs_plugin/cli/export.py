@@ -85,7 +85,8 @@ def export(
 
         lapgs export runs/garden --merge --html       (a page for the web)
     """
-    from lapgs_plugin.runs.archive import EXPORT, RunArchive
+    from lapgs_plugin.runs.archive import RunArchive
+    from lapgs_plugin.runs.layout import EXPORT
 
     archive = RunArchive.open(run)
     folder = archive.path(EXPORT) if settings.out is None else settings.out

@@ -143,7 +143,7 @@ def _write_clip(
     """Render along a camera path, as a video or a folder of images."""
     from lapgs_plugin.rendering.clip import VIDEO, clip_size, is_video, parse_size, render_clip
     from lapgs_plugin.rendering.run import path_cameras
-    from lapgs_plugin.runs.archive import RENDERS
+    from lapgs_plugin.runs.layout import RENDERS
 
     path = settings.trajectory
     assert path is not None
@@ -213,7 +213,7 @@ def _write_views(
 ) -> None:
     """Render the views, a folder for each split."""
     from lapgs_plugin.rendering.run import run_scene
-    from lapgs_plugin.runs.archive import RENDERS
+    from lapgs_plugin.runs.layout import RENDERS
 
     folder = archive.path(RENDERS) if settings.out is None else settings.out
     for split, chosen in _choose(run_scene(archive, scene), settings.views).items():

@@ -240,7 +240,7 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     Raises:
         UserInputError: not more iterations than it has, or others than those of its interrupted extension.
     """
-    from lapgs_plugin.runs.archive import CHECKPOINT
+    from lapgs_plugin.runs.layout import CHECKPOINT
 
     begun, done, run = archive.extends_to, settings.iterations, archive.path()
     if asked is not None and begun not in (None, asked):
@@ -262,13 +262,13 @@ def _create(
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
     from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-    from lapgs_plugin.training.planning import check_storage, make_plan
+    from lapgs_plugin.training.planning import check_storage, make_plan, require_pruning
 
     RunArchive.require_room(out, overwrite)
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = load_reference(reference)
-    make_plan(loaded.smallest_size, settings, len(loaded.train))
+    require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
         rasterizer=rasterizer,

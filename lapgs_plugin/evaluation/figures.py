@@ -22,7 +22,8 @@ from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
-from lapgs_plugin.runs.archive import METRICS, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import METRICS
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.training_figures import training_figures

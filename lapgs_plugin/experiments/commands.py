@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +15,9 @@ from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
+from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
+from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import STRICT
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
@@ -142,6 +145,24 @@ def run_steps(
     if evaluate is not None:
         steps.append(Step((*LAPGS, "eval", str(measured), *evaluate), str(folder.parent)))
     return steps
+
+
+def defaults_of(spec: RunSpec) -> str:
+    """Return, as JSON, the settings that a run's training command has without options, to notice a changed default."""
+    if spec.checkout is None:
+        settings = TrainSettings(iterations=spec.iterations).resolved()
+    else:
+        settings = {} if spec.method == "bare" else RunSettings().resolved()
+    return json.dumps(dict(_flat(settings)), sort_keys=True, default=str)
+
+
+def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield settings by name, those of nested dictionaries too."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value)
+        else:
+            yield name, value
 
 
 def measured_folder(spec: RunSpec, folder: Path) -> Path:

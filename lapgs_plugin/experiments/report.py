@@ -31,7 +31,8 @@ from lapgs_plugin.reports.report import (
     view_table,
     write_page,
 )
-from lapgs_plugin.runs.archive import REPORT, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.untrusted import read_text, shortened
 

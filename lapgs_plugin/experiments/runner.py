@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.commands import Locations, run_steps
+from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
@@ -83,7 +83,10 @@ def prepare(
             scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
             steps = run_steps(spec, scene_folder, checkout, own, evaluate)
             log = str(folder.logs(f"{spec.run_id}.log").absolute())
-            jobs.setdefault(spec.run_id, Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None))
+            jobs.setdefault(
+                spec.run_id,
+                Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None, defaults_of(spec)),
+            )
     return list(jobs.values()), where
 
 

@@ -28,13 +28,15 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.files import one_line_errors
-from lapgs_plugin.untrusted import STRICT, parse_json
+from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 
 FORMAT_VERSION = 1
 LEASE = 120.0
 """Seconds that a claim lasts without renewal. Clocks of machines that share a store must differ by less."""
 MAX_CLAIMS = 3
 """Claims after which a run fails, because it probably kills its workers."""
+SHOWN = 3
+"""Most changed defaults that a message names."""
 LOCK_TIMEOUT = 60.0
 """Seconds to wait for another process."""
 
@@ -68,6 +70,7 @@ class Job:
         log: file for the output of its commands.
         steps: its commands.
         evaluate: whether the last command is `lapgs eval`.
+        defaults: see `commands.defaults_of`.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -78,6 +81,7 @@ class Job:
     log: str
     steps: tuple[Step, ...]
     evaluate: bool
+    defaults: str = ""
 
     def attempt(self, number: int) -> Job:
         """Return the job in a separate folder: a worker that lost its claim may still write to the previous one."""
@@ -179,8 +183,13 @@ class ResultStore:
         return cls(path)
 
     def plan(self, jobs: Sequence[Job]) -> None:
-        """Add runs in this order. Finished runs stay; failed runs become pending again."""
+        """Add runs in this order. Finished runs stay; failed runs become pending again.
+
+        Raises:
+            RunFolderError: the other runs would have other defaults than those that are finished or running.
+        """
         with self._transaction() as connection:
+            self._require_same_defaults(connection, jobs)
             for position, job in enumerate(jobs):
                 values = (job.run_id, position, json.dumps(asdict(job.spec)), job.to_json(), PENDING)
                 connection.execute(
@@ -192,6 +201,18 @@ class ResultStore:
                     "UPDATE runs SET job = ?, state = ?, claims = 0, error = NULL WHERE run_id = ? AND state IN (?, ?)",
                     (job.to_json(), PENDING, job.run_id, PENDING, FAILED),
                 )
+
+    def _require_same_defaults(self, connection: sqlite3.Connection, jobs: Sequence[Job]) -> None:
+        found = connection.execute("SELECT run_id, job FROM runs WHERE state IN (?, ?)", (RUNNING, DONE)).fetchall()
+        begun = {run_id: Job.from_json(text) for run_id, text in found}
+        pairs = [(begun[job.run_id].defaults, job.defaults) for job in jobs if job.run_id in begun]
+        others = [pair for pair in pairs if pair[0] != pair[1]]
+        if others and len(pairs) < len(jobs):
+            raise RunFolderError(
+                f"{self._path}: {len(others)} of its runs have other defaults than the {len(jobs) - len(pairs)} that "
+                f"remain ({_differences(*others[0])}), and a table would mix them; choose another folder with --out, "
+                "or finish it with the version that began it"
+            )
 
     def claim(self, run_ids: Collection[str]) -> Claim | None:
         """Claim the first free run of these; None when none is free."""
@@ -287,6 +308,20 @@ class ResultStore:
             raise RunFolderError(f"{self._path} is no store of results ({error}); choose another folder") from error
         finally:
             connection.close()  # rolls back what was not committed
+
+
+def _differences(one: str, other: str) -> str:
+    """Return the first differences of two texts of `commands.defaults_of` in words."""
+    if not one:
+        return "an older version did not record them"
+    advice = "choose another folder with --out"
+    before, now = (
+        parse_json(text, "the defaults of a run", dict[str, Any], error=RunFolderError, advice=advice)
+        for text in (one, other)
+    )
+    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    words = [f"{name} was {shortened(before.get(name))}, is {shortened(now.get(name))}" for name in names]
+    return "; ".join(words[:SHOWN])
 
 
 def _put_if_absent(source: Path, target: Path) -> None:

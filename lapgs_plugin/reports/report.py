@@ -31,7 +31,8 @@ from lapgs_plugin.reports.charts import (
 )
 from lapgs_plugin.reports.comparison import Metrics, comparison_rows, setup_differences
 from lapgs_plugin.reports.pictures import Strip, make_strip
-from lapgs_plugin.runs.archive import METRICS, REPORT, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import METRICS, REPORT
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"

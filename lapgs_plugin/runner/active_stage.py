@@ -219,6 +219,11 @@ class ActiveStage:
             "level %d: %d iterations at %dx%d, images on the %s",
             *(self.stage.level, self.stage.iterations, width, height, place),
         )
+        if self._options.prune and self._prune_at is None:
+            logger.warning(
+                "--prune %s: level %d is not pruned: no densification ends in its iterations",
+                *(self._options.prune, self.stage.level),
+            )
 
     def _archived_levels(self) -> str:
         return ", ".join(map(str, self._archive.available_levels)) or "none"

@@ -47,7 +47,8 @@ from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runner.step_clock import counting_steps
-from lapgs_plugin.runs.archive import CACHE, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.watcher import Watcher
 

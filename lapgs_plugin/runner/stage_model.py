@@ -14,7 +14,8 @@ from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext, StageResult
-from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import OPTIMIZER
 
 SH_REST = "f_rest"
 """Parameter group of SH above degree 0 in the family's optimizers."""

@@ -16,7 +16,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.runner.context import RunContext, TrainingRun
 from lapgs_plugin.runner.stage_images import StageImages
 from lapgs_plugin.runner.stage_rendering import StageRendering
-from lapgs_plugin.runs.archive import CACHE
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 

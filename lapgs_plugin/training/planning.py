@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import StagePlan
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
 from lapgs_plugin.training.quality import require_views_to_set_aside
+from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import BEST, TrainSettings
 
 
@@ -29,6 +30,33 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
     if views is not None and settings.keep == BEST:
         require_views_to_set_aside(views)
     return StagePlan.create(size, settings.scheduled, settings.levels, settings.shares, settings.kind)
+
+
+def iterations_continued(plan: StagePlan, stage: Stage) -> int:
+    """Return the iterations of coarser levels that trained a stage's field before; 0 if it is a field of its own."""
+    return plan.iterations_before(stage.level) if continues_field(stage, plan.levels) else 0
+
+
+def unpruned_levels(plan: StagePlan, settings: TrainSettings) -> list[int]:
+    """Return the levels, coarsest first, that --prune leaves as they are, because their densification does not end."""
+    if not settings.prune:
+        return []
+    schedules = {s.level: StageSchedule.create(settings, s, iterations_continued(plan, s)) for s in plan}
+    return [level for level, schedule in schedules.items() if schedule.prunes_after is None]
+
+
+def require_pruning(plan: StagePlan, settings: TrainSettings) -> None:
+    """Check that some level's densification ends within its stage if a run is to be pruned then.
+
+    Raises:
+        UserInputError: none does, so that --prune would change nothing.
+    """
+    if settings.prune and len(unpruned_levels(plan, settings)) == plan.levels:
+        raise UserInputError(
+            f"--prune {settings.prune}: prunes when a level's densification ends, and at no level does one begin and "
+            "end before the last iteration; leave --prune out, or change --densify-from, --densify-until or "
+            "--iterations"
+        )
 
 
 def check_storage(settings: TrainSettings, device: torch.device) -> None:

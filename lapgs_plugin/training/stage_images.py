@@ -11,8 +11,8 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import refined_views
-from lapgs_plugin.runs.archive import CACHE
 from lapgs_plugin.runs.image_store import chosen_precision, eight_bit_levels
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages

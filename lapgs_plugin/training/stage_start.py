@@ -11,7 +11,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
 from lapgs_plugin.hierarchy.plan import Stage, continues_field
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.runs.archive import OPTIMIZER
+from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.training.checkpoint import check_moments

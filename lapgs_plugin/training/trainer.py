@@ -12,11 +12,12 @@ import torch
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, batching
-from lapgs_plugin.hierarchy.plan import Stage, continues_field
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
-from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
+from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
@@ -29,7 +30,7 @@ from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.planning import check_storage, make_plan
+from lapgs_plugin.training.planning import check_storage, iterations_continued, make_plan, unpruned_levels
 from lapgs_plugin.training.quality import (
     SAMPLES_OF_A_STAGE,
     SAMPLES_TO_KEEP_BEST,
@@ -147,6 +148,8 @@ class Trainer:
         say(self._strategy_line())
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
+        for level in unpruned_levels(self._context.plan, self.settings):
+            say(f"--prune {self.settings.prune}: level {level} is not pruned: no densification ends in its iterations")
         if self.settings.refine_poses and self.device.type == "cuda":
             say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 
@@ -231,7 +234,7 @@ class Trainer:
         schedule = StageSchedule.create(
             self.settings,
             stage,
-            plan.iterations_before(stage.level) if continues_field(stage, plan.levels) else 0,
+            iterations_continued(plan, stage),
             views_per_step(self.settings, stage, len(train), batches),
             len(train),
         )

@@ -20,7 +20,8 @@ from lapgs_plugin.cli.report import report
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.files import MANIFEST
-from lapgs_plugin.runs.archive import HISTORY, METRICS, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import HISTORY, METRICS
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_run
 from tests.mishaps import FailingWrites, disk_full

@@ -98,6 +98,7 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
         (("--protocol", "paper", "--joint", "0.5"), "--joint 0.5 with --protocol paper: the paper has 0.0"),
         (("--coarse-threshold", "0"), "--coarse-threshold 0.0: expected a positive factor"),
         (("--prune", "-0.1"), "--prune -0.1: expected a share from 0"),
+        (("--prune", "0.1", "--densify-until", "40"), "--prune 0.1: prunes when a level's densification ends"),
         (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
         (("--strategy", "luck"), "--strategy luck: expected auto, mcmc, 3dgs, multiview"),
         (("--packed", "--sparse-adam", "--rasterizer", "cpu"), "--packed, --sparse-adam with --rasterizer cpu"),

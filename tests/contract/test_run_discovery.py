@@ -164,6 +164,23 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
 
 
+def test_doctor_says_that_images_of_several_sizes_have_no_levels(
+    fork: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Mini-Splatting2 has, whose scene `lapgs run` refuses."""
+    script = fork / "scripts" / "train.py"
+    text = script.read_text(encoding="utf-8")
+    call = "Scene(dataset, gaussians)"
+    assert text.count(call) == 1
+    line = text[: text.index(call)].count("\n") + 1
+    for scales, said in (("[1.0]", None), ("[1, 2]", "the scales 1, 2 ")):
+        script.write_text(text.replace(call, f"Scene(dataset, gaussians, resolution_scales={scales})"))
+        lapgs("doctor", fork)
+        shown = capsys.readouterr().out
+        assert shown.count(f"{said}(scripts/train.py:{line})") == (0 if said is None else 2)
+        assert ("one call of the checkout's own training" in shown) == (said is None)
+
+
 def test_doctor_says_which_training_scripts_there_are(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As Mini-Splatting has `gs/train.py` and `ms/train.py`, DashGaussian `train.py` and `train_dash.py`."""
     shutil.copytree(fork / "scripts", fork / "more")

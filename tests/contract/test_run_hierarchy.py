@@ -16,7 +16,8 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.runs.archive import CACHE, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (

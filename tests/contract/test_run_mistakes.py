@@ -26,7 +26,8 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.runner.installed_rasterizer import explain_import_error
 from lapgs_plugin.runner.settings import RunSettings
-from lapgs_plugin.runs.archive import CACHE, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.viewer.preview import read_preview
 from tests.contract.stub_runs import (
     CHECKOUTS,

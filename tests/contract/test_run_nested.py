@@ -24,7 +24,8 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runner import driver
-from lapgs_plugin.runs.archive import OPTIMIZER, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (

@@ -87,6 +87,15 @@ def test_pruning_needs_an_end_of_densification(scene: Path, tmp_path: Path) -> N
     assert not folder.exists()
 
 
+def test_a_stage_that_is_not_pruned_says_so(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """In 90 iterations densification ends at 18; in stages of 30 and 60 at 6 and 12, and it begins at 10."""
+    folder, more = tmp_path / "run", ("--densify_from_iter", 10, "--densify_until_iter", 18)
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, folder, *more) as adapter:
+        drive(adapter, prune=SHARE, hierarchy="laplacian", joint=0.0)
+    (line,) = [record.getMessage() for record in caplog.records if "--prune" in record.getMessage()]
+    assert line == "--prune 0.05: level 1 is not pruned: no densification ends in its iterations"
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_looking_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If no Gaussian is pruned, the fields have the same bits as without --prune."""

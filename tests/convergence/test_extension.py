@@ -19,7 +19,8 @@ from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.runs.archive import CHECKPOINT, RunArchive
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick

@@ -9,12 +9,14 @@ import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments import store as store_module
+from lapgs_plugin.experiments.commands import defaults_of
 from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDING, RUNNING, ResultStore
 from lapgs_plugin.experiments.worker import work
 from tests.experiments.examples import COPY, START, copying_jobs
@@ -203,6 +205,22 @@ def test_a_store_of_another_version(tmp_path: Path) -> None:
         ResultStore(path)
     with pytest.raises(RunFolderError, match="does not exist"):
         ResultStore(tmp_path / "none.sqlite")
+
+
+def test_a_store_refuses_runs_with_other_defaults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    older = [replace(job, defaults=defaults_of(job.spec)) for job in copying_jobs(tmp_path, 3)]
+    store = ResultStore.create(tmp_path / "results.sqlite")
+    store.plan(older)
+    monkeypatch.setattr("lapgs_plugin.training.strategies.LONG_RUN", 10)  # what "auto" means for these runs
+    newer = [replace(job, defaults=defaults_of(job.spec)) for job in older]
+    store.plan(newer)  # nothing was begun
+    assert store.claim([newer[0].run_id]) is not None
+    store.plan(newer)
+    with pytest.raises(RunFolderError, match=r"1 of its runs .* the 2 that remain \(.*strategy was 'mcmc', is '3dgs'"):
+        store.plan(older)
+    with pytest.raises(RunFolderError, match="defaults"):
+        store.plan([replace(job, defaults="") for job in older])
+    store.plan(older[:1])  # nothing remains to be run
 
 
 def test_a_store_without_its_tables_or_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

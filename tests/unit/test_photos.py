@@ -249,7 +249,7 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
 def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
     images = {key: SimpleNamespace(camera_id=1, has_pose=True) for key in range(placed)}
     camera = SimpleNamespace(focal_length_x=fx, focal_length_y=fy)
-    return SimpleNamespace(images=images, cameras={1: camera}, num_reg_images=lambda: placed)
+    return SimpleNamespace(images=images, cameras={1: camera}, num_reg_images=lambda: placed, num_points3D=lambda: 0)
 
 
 @pytest.mark.parametrize(
@@ -276,11 +276,12 @@ def test_doubtful_lenses_are_told_and_tried_again(
     models = {"first": _model(first[0], 1000, first[1]), "second": _model(1000, 1000, again)}
     models["global"] = _model(1000, 1000, 8)
 
-    def mapped(job: object, title: str, folder: Path, model: str | None = None, mapper: str = "") -> list[object]:
+    def mapped(job: object, title: str, folder: Path, model: str | None, mapper: str | None) -> list[object]:
         assert model in (None, "SIMPLE_RADIAL")
         return [models[mapper or ("first" if model is None else "second")]]
 
     monkeypatch.setattr(placement, "map_photos", mapped)
+    monkeypatch.setattr(placement, "remove_unlinked", lambda model: None)
     found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
     job = Job(tmp_path, found, PrepareSettings(camera_model=asked), False)
     with caplog.at_level(logging.INFO):

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.training.planning import make_plan, require_pruning, unpruned_levels
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview
@@ -233,6 +234,33 @@ def test_the_papers_protocol_is_the_papers_settings_and_nothing_else() -> None:
             TrainSettings(protocol="paper", **{name: value})
     with pytest.raises(UserInputError, match="--protocol papers: expected default or paper"):
         TrainSettings(protocol="papers")
+
+
+@pytest.mark.parametrize(
+    ("values", "unpruned"),
+    [
+        ({}, []),
+        ({"until": 29_998}, []),
+        ({"until": 30_000}, [1, 0]),
+        ({"until": 400}, [1, 0]),  # before the first
+        ({"base_share": 1.0}, [1]),
+        ({"until": 30_000, "base_share": 0.5}, [0]),
+    ],
+)
+def test_pruning_without_an_end_of_densification_is_an_error(values: dict[str, Any], unpruned: list[int]) -> None:
+    density = Densification(strategy="3dgs", options=Gradients(), **values)
+    settings = TrainSettings(prune=0.01, densification=density)
+    plan = make_plan((64, 48), settings)
+    assert unpruned_levels(plan, settings) == unpruned
+    assert unpruned_levels(plan, replace(settings, prune=0.0)) == []
+    if len(unpruned) < 2:
+        require_pruning(plan, settings)
+        return
+    with pytest.raises(
+        UserInputError, match=r"--prune 0.01: .* at no level .*; leave --prune out, or change"
+    ) as caught:
+        require_pruning(plan, settings)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_base_may_densify_longer() -> None:

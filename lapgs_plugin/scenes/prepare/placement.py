@@ -1,11 +1,14 @@
-"""Place the cameras, judge whether the lens was found, and place them again with a simpler one if it was not."""
+"""Place the cameras, judge the result, and place them again with a simpler lens or all at once if it is doubtful."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 
+import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, map_photos
@@ -14,8 +17,10 @@ from lapgs_plugin.scenes.prepare.settings import AUTO, GLOBAL, INCREMENTAL
 
 SIMPLE_MODEL = "SIMPLE_RADIAL"
 """Camera model that is fitted if the result with the first one is doubtful."""
-FEW = 0.5
-"""Share of photos below which so few are placed that the lens may be wrong."""
+FEW = 0.75
+"""Share of photos below which so few are placed that another attempt may place more."""
+LINKED = 15
+"""Fewest points that two photos share if one's place says where the other is, as in COLMAP's mapper."""
 SQUARE = 0.04
 """Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
 
@@ -31,7 +36,7 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
     Raises:
         SceneError: no photo could be placed.
     """
-    models = map_photos(job, "Placing cameras", job.work / "models")
+    models = _mapped(job, "Placing cameras", "models")
     if (doubt := _doubt(job, models)) is not None:
         if job.settings.camera_model != AUTO:
             logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.settings.camera_model)
@@ -48,12 +53,12 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
 def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
     """Return the best models of doubtful ones, those of a simpler lens, and if few are placed, of the other mapper."""
     logger.info("%s; placing the cameras again with a simpler lens", doubt)
-    again = map_photos(job, "Placing again", job.work / "models_simple", SIMPLE_MODEL)
+    again = _mapped(job, "Placing again", "models_simple", SIMPLE_MODEL)
     if _placed(again) >= _placed(models):
         models = again
     if _placed(models) < FEW * len(job.names) and job.settings.mapper == INCREMENTAL and HAS_GLOBAL:
         logger.info("only %d photos could be placed; placing all at once (--mapper global)", _placed(models))
-        whole = map_photos(job, "Placing all", job.work / "models_global", SIMPLE_MODEL, mapper=GLOBAL)
+        whole = _mapped(job, "Placing all", "models_global", SIMPLE_MODEL, GLOBAL)
         return whole if _placed(whole) > _placed(models) else models
     if models is not again:
         logger.warning(
@@ -62,6 +67,41 @@ def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -
             *(_placed(again), _placed(models), doubt),
         )
     return models
+
+
+def _mapped(
+    job: Job, title: str, folder: str, lens: str | None = None, mapper: str | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Return the models of one attempt, the one with most photos first, without photos whose place is arbitrary."""
+    models = map_photos(job, title, job.work / folder, lens, mapper)
+    if (mapper or job.settings.mapper) == GLOBAL:
+        for model in models:
+            remove_unlinked(model)
+        models.sort(key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
+    return models
+
+
+def remove_unlinked(model: pycolmap.Reconstruction) -> None:
+    """Leave only the largest group of photos that are linked by shared points.
+
+    COLMAP's global mapper places photos by their rotations even if no points confirm it.
+    """
+    placed = sorted(key for key, image in model.images.items() if image.has_pose)
+    seen = [
+        (row, np.searchsorted(placed, each.image_id))
+        for row, point in enumerate(model.points3D.values())
+        for each in point.track.elements
+    ]
+    rows, columns = np.array(seen, dtype=np.int64).reshape(-1, 2).T  # (n), (n)
+    sees = coo_array((np.ones(len(rows), np.int64), (rows, columns)), (model.num_points3D(), len(placed))).tocsr()
+    shared = (sees.T @ sees).tocoo()  # (photos, photos)
+    links = coo_array(((shared.data >= LINKED), (shared.row, shared.col)), shared.shape).tocsr()
+    links.eliminate_zeros()
+    _, groups = connected_components(links, directed=False)
+    largest = np.bincount(groups).argmax()
+    for key, group in zip(placed, groups, strict=True):
+        if group != largest:
+            model.deregister_frame(model.images[key].frame_id)
 
 
 def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:

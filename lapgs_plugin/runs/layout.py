@@ -1,0 +1,125 @@
+"""Name the files of run folders, and tell and clear such folders.
+
+    RUN/manifest.json              everything needed to render the run again
+    RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
+    RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
+    RUN/level_<l>/exposure.json    colour transforms of the training photos after that level, if exposure is compensated
+    RUN/level_<l>/poses.json       corrections of the training photos' poses after that level, if these are refined
+    RUN/checkpoint.pt              state of an unfinished stage, the latest
+    RUN/history.jsonl              one JSON object a logging tick
+    RUN/preview.jpg                an image that the viewer shows until it can render
+    RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   results of other commands
+
+Every file but the history is written under a temporary name and renamed, and the manifest lists a level only after its
+PLY is on the disk. So a run that is killed at any moment still opens, with the levels that were finished.
+
+Joint training of level k also changes the finished fields. Their new versions are first written beside the old ones, to
+point_cloud.with_level_<k>.ply. They count from the moment that the manifest lists level k; then they are renamed, by
+the next process that opens the run for writing if this one is killed before. If level k is not listed they are removed.
+
+Extending a finished run replaces files in the same way: new ones are written beside the old ones, to extended_<i>.NAME,
+where i is the new number of iterations, and count from the moment that the manifest has this number.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.files import LOCK, MANIFEST, PREVIEW, TEMPORARY_PATTERN, one_line_errors
+from lapgs_plugin.untrusted import read_json
+
+HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
+RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
+PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "exposure.json", "poses.json"
+TRAINED_ALONG = "point_cloud.with_level_{}.ply"
+"""The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
+FORGET_EXTENSION = "delete it to extend the run anew"
+EXTENDED = "extended_{}.{}"
+"""A file of a run after its extension to a number of iterations, until it replaces the file of that name."""
+
+
+def require_room(path: Path | str, overwrite: bool = False) -> None:
+    """Check that `RunArchive.create` would accept the folder, before anything expensive is done. Writes nothing.
+
+    Raises:
+        RunFolderError: as `RunArchive.create`, except for problems that only writing shows.
+    """
+    folder = Path(path).absolute()
+    with one_line_errors(folder, "read"):
+        if folder.exists() and not folder.is_dir():
+            raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
+    if is_run(folder):
+        if not overwrite:
+            raise RunFolderError(
+                f"{folder} already holds a run; continue it with --resume (`lapgs train`, `lapgs run`) or replace "
+                "it with --overwrite"
+            )
+        return
+    with one_line_errors(folder, "read"):
+        entries = list(folder.iterdir()) if folder.exists() else []
+    # A run that was killed before its first manifest leaves these two.
+    strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+    if strangers:
+        raise RunFolderError(
+            f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
+        )
+
+
+def exists(path: Path) -> bool:
+    """Return whether there is a file.
+
+    Raises:
+        RunFolderError: its folder cannot be read.
+    """
+    with one_line_errors(path, "read"):
+        return path.exists()
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether any version of this package wrote the manifest; other programs write a manifest.json, too.
+
+    An unreadable one counts as ours if there is a history beside it.
+    """
+    with one_line_errors(folder, "read"):
+        if not (folder / MANIFEST).is_file():
+            return False
+        try:
+            values = read_json(folder / MANIFEST, dict[str, Any])
+        except UserInputError:
+            return (folder / HISTORY).is_file()
+    return "lapgs_plugin" in str(values.get("created_by"))
+
+
+def remove_results(folder: Path) -> None:
+    """Remove the files of a previous run and nothing else."""
+    remove_scratch(folder)
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW):
+        (folder / name).unlink(missing_ok=True)
+    for name in (RENDERS, EXPORT):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
+    for level in folder.glob("level_*/"):
+        (level / PLY).unlink(missing_ok=True)
+        (level / OPTIMIZER).unlink(missing_ok=True)
+        (level / EXPOSURE).unlink(missing_ok=True)
+        (level / POSES).unlink(missing_ok=True)
+        for pattern in (TRAINED_ALONG.format("*"), EXTENDED.format("*", "*")):
+            for waiting in level.glob(pattern):
+                waiting.unlink()
+        if not any(level.iterdir()):
+            level.rmdir()
+
+
+def remove_scratch(folder: Path) -> None:
+    """Remove what a killed run left: temporary files, cached predictions, an incomplete line of history."""
+    for pattern in (TEMPORARY_PATTERN, f"level_*/{TEMPORARY_PATTERN}"):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
+    if (folder / CACHE).is_dir():
+        shutil.rmtree(folder / CACHE)
+    if (folder / HISTORY).exists():
+        with (folder / HISTORY).open("r+b") as stream:
+            stream.truncate(stream.read().rfind(b"\n") + 1)

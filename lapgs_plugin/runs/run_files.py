@@ -1,0 +1,170 @@
+"""Write and read what a run folder has beside its levels: manifest, history, figures, checkpoint."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.files import FolderLock, atomic_write, one_line_errors
+from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
+from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.results import HistoryEntry, Metrics
+from lapgs_plugin.runs.tensors import read_tensors, write_tensors
+from lapgs_plugin.untrusted import read_json, read_json_lines, shortened
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+logger = logging.getLogger(__name__)
+
+
+class RunFiles:
+    """Hold a run folder, its manifest and its lock; `archive.RunArchive` adds the levels."""
+
+    def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None) -> None:
+        """Use `RunArchive.create` or `RunArchive.open`."""
+        self._folder = folder
+        self._manifest = manifest
+        self._lock = lock
+
+    def close(self) -> None:
+        """Release a folder that was locked for writing."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def manifest(self) -> Manifest:
+        return self._manifest
+
+    @property
+    def available_levels(self) -> tuple[int, ...]:
+        """The finished levels, coarsest first."""
+        return tuple(record.level for record in self._manifest.records)
+
+    def path(self, *parts: str) -> Path:
+        """Return the path of the run folder, or of something in it."""
+        return self._folder.joinpath(*parts)
+
+    def append_history(self, entry: dict[str, Any]) -> None:
+        """Append one entry to the history: JSON with finite numbers, with "level" and "iteration"."""
+        self._require_lock()
+        assert {"level", "iteration"} <= entry.keys(), "a history entry says where in the run it belongs"
+        line = json.dumps(entry, allow_nan=False) + "\n"
+        path = self.path(HISTORY)
+        with one_line_errors(path, training=True), path.open("a", encoding="utf-8") as stream:
+            stream.write(line)
+
+    def history(self) -> list[dict[str, Any]]:
+        """Return all entries in the order they were added. A last line that a crash cut short is left out.
+
+        Raises:
+            RunFolderError: another line is damaged.
+        """
+        path = self.path(HISTORY)
+        return read_json_lines(path, HistoryEntry, error=RunFolderError) if exists(path) else []
+
+    def rewind_history(self, level: int, iteration: int) -> None:
+        """Remove the entries after an iteration of a level, which a resumed run adds again.
+
+        Training starts with level L-1, so an entry with a lower level is later.
+        """
+        self._require_lock()
+        kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
+        text = "".join(json.dumps(entry) + "\n" for entry in kept)
+        path = self.path(HISTORY)
+        with one_line_errors(path, training=True), atomic_write(path) as stream:
+            stream.write(text.encode())
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Replace the run's metrics: JSON with finite numbers. Needs no lock."""
+        self._write_json(METRICS, metrics)
+
+    def write_stability(self, figures: dict[str, Any]) -> None:
+        """Replace the run's flicker metrics: JSON with finite numbers. Needs no lock."""
+        self._write_json(STABILITY, figures)
+
+    def metrics(self) -> dict[str, Any] | None:
+        """Read the run's metrics; None if they were never measured.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        path = self.path(METRICS)
+        advice = "write it again with `lapgs eval`"
+        return dict(read_json(path, Metrics, error=RunFolderError, advice=advice)) if exists(path) else None
+
+    def save_checkpoint(self, state: dict[str, Any], extends_to: int | None = None) -> None:
+        """Replace the checkpoint of the level in training.
+
+        Args:
+            state: as `tensors.write_tensors` takes it.
+            extends_to: of a finished run that is trained further, the number of iterations that it will have.
+        """
+        self._require_lock()
+        level = self._manifest.next_level
+        of = {"level": 0, "extends_to": extends_to} if level is None else {"level": level}
+        write_tensors(self.path(CHECKPOINT), {**of, "state": state})
+
+    @property
+    def extends_to(self) -> int | None:
+        """Iterations to which an interrupted extension was to train the finished run; None if there is none.
+
+        Raises:
+            RunFolderError: the checkpoint cannot be read.
+        """
+        path = self.path(CHECKPOINT)
+        if not self._manifest.complete or not exists(path):
+            return None
+        found = read_tensors(path, FORGET_EXTENSION).get("extends_to")
+        return found if type(found) is int and found > int(self._manifest.settings.get("iterations", 0)) else None
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """Read the checkpoint of the next level to train, its tensors on the CPU; None if there is none.
+
+        That of a finished run is of its interrupted extension.
+
+        Raises:
+            RunFolderError: it cannot be read, or its level is neither finished nor the next.
+        """
+        path = self.path(CHECKPOINT)
+        if not exists(path):
+            return None
+        advice = "delete it to continue from the last finished level"
+        saved = read_tensors(path, advice)
+        level, state = saved.get("level"), saved.get("state")
+        if type(level) is not int or not isinstance(state, dict):
+            found = f"level {shortened(level)} and a state that is a {type(state).__name__}"
+            raise RunFolderError(f"{path} holds {found}, expected a number and a dictionary; {advice}")
+        if level == self._manifest.next_level or (level == 0 and self.extends_to is not None):
+            return state
+        if level not in self.available_levels:
+            raise RunFolderError(f"{path} is of level {level}, expected {self._manifest.next_level}; {advice}")
+        # A run killed right after finishing a level leaves the checkpoint of that level.
+        logger.warning("%s is of level %d, which is finished: it is not used", path, level)
+        return None
+
+    def _write_json(self, name: str, values: dict[str, Any], training: bool = False) -> None:
+        text = json.dumps(values, indent=2, allow_nan=False) + "\n"
+        with one_line_errors(self.path(name), training=training), atomic_write(self.path(name)) as stream:
+            stream.write(text.encode())
+
+    def _remove(self, *names: str) -> None:
+        with one_line_errors(self._folder):
+            for name in names:
+                self.path(name).unlink(missing_ok=True)
+
+    def _require_lock(self) -> None:
+        assert self._lock is not None, "open the run with resume=True to write to it"
