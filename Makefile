@@ -5,9 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
 SMOKE := runs/smoke
+KERNELS := runs/kernels
 DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
-.PHONY: demo test smoke portability check clean
+.PHONY: demo test kernels smoke portability check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lapgs sample $(DEMO)/scene --overwrite
@@ -18,13 +19,16 @@ demo: $(VENV)/.installed
 	$(BIN)/lapgs render $(DEMO)/hierarchy
 	$(BIN)/lapgs report $(DEMO)/hierarchy --baseline $(DEMO)/baseline
 
-# The smoke benchmark compiles the CPU kernels that the tests use, while mypy takes the other core. Two processes of one
-# thread each take half the time of one process of two: most tests start others or hardly compute. A browser that draws in
-# software needs the machine for itself.
+# Kernels that most tests use are compiled once, beside mypy, instead of by both test processes. Processes of one thread
+# each take less time than one process of two: most tests start others, wait for them or hardly compute. Files are tested in
+# the order of tests/conftest.py, so that none of the long ones is left to one process at the end.
 test: $(VENV)/.installed
-	$(MAKE) -j2 --output-sync=target check smoke
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m 'not slow and not browser'
-	$(BIN)/pytest -m 'browser and not slow'
+	$(MAKE) -j2 --output-sync=target check kernels
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+kernels: $(VENV)/.installed
+	$(BIN)/lapgs sample $(KERNELS)/scene --size 64x48 --views 3 --points 50 --overwrite
+	$(BIN)/lapgs train $(KERNELS)/scene -o $(KERNELS)/run --iterations 4 --eval --rasterizer cpu --overwrite
 
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)
@@ -40,10 +44,11 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Python compiles each module when it is imported first. pip would compile all, most of which nothing imports.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(DEMO) $(SMOKE) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(DEMO) $(SMOKE) $(KERNELS) .mypy_cache .pytest_cache .ruff_cache

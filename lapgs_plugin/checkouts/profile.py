@@ -9,7 +9,7 @@ import ast
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import FunctionType, ModuleType
 from typing import Any
@@ -97,6 +97,10 @@ class Profile:
     def holders(self, value: Any) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name, that hold an object."""
         return [(module, name) for module in self.modules for name, held in vars(module).items() if held is value]
+
+    def named(self, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
+        """Return modules of the checkout, each with a name of these that it holds."""
+        return [(module, name) for name in names for module in self.modules if name in vars(module)]
 
     def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
@@ -74,6 +72,9 @@ def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         cameras: at least one; the path has the size and lens of the median one.
         frames: number of frames.
     """
+    from scipy.interpolate import CubicSpline  # a third of a second, which commands without such a path need not wait
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     keys = [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, MAX_KEYS).round().astype(int))]
     lens = _median_lens(cameras)
     positions = camera_positions(keys)

@@ -10,7 +10,8 @@ term a gradient of one, as if the loop had added it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -41,6 +42,7 @@ class HookCaller:
         self._rendering: StageRendering | None = None
         self._iteration = 0
         self._context: StageContext | None = None
+        self._paused = False
 
     def __bool__(self) -> bool:
         return self._hooks is not None
@@ -60,6 +62,23 @@ class HookCaller:
         """Note the number of the iteration."""
         self._iteration = iteration
 
+    def pausing(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function during which no hook is called for an image.
+
+        Scores of density control may be gradients of images. These are no iterations, and a hook's term is no part of
+        a score.
+        """
+
+        @wraps(original)
+        def score(*args: Any, **kwargs: Any) -> Any:
+            self._paused = True
+            try:
+                return original(*args, **kwargs)
+            finally:
+                self._paused = False
+
+        return score
+
     def on_image(self, key: str, image: Tensor, below: Tensor | None) -> Tensor:
         """Call `before_render`, `compose` and `loss`, and return the image (3, h, w) for the loop.
 
@@ -69,6 +88,8 @@ class HookCaller:
             below: (3, h, w) upsampled prediction in the image; None if the image is not composed.
         """
         assert self._hooks is not None
+        if self._paused:
+            return image
         context = self._context = self._make_context(key, below)
         # Hooks get composed images, even where the loop's loss is about the residual alone.
         added = context.accumulated if below is None else None

@@ -55,7 +55,7 @@ class IterationParts:
         """Return replacements in the training loop, whose time includes that of all others: they come last."""
         if not self._measures:
             return []
-        scores = [(module, name) for name in info.density_scores for module in profile.modules if name in vars(module)]
+        scores = profile.named(info.density_scores)
         control = [(profile.model, name) for name in profile.density_control]
         consumer = "training() when it densifies and prunes"
         return [

@@ -57,6 +57,7 @@ class StageReplacements:
             *self._in_rendering(profile),
             *self._in_model(profile),
             *adapter.replacements(self._window),
+            *self._in_scores(profile),
             *parts.replacements(profile, adapter.info),
         ]
 
@@ -105,6 +106,13 @@ class StageReplacements:
             *of_class(profile.model, "training_setup", self._make_training_setup, "training()"),
             *(each for name, make in control.items() for each in of_class(profile.model, name, make, "training()")),
         ]
+
+    def _in_scores(self, profile: Profile) -> list[Replacement]:
+        """Return replacements of score functions, after the adapter's of the same functions."""
+        hooks, names = self._context.hooks, self._context.adapter.info.density_scores
+        consumer = "training() when it densifies and prunes"
+        found = profile.named(names) if hooks else []
+        return [Replacement(owner, name, hooks.pausing, None, consumer) for owner, name in found]
 
     def _make_training(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)

@@ -17,8 +17,14 @@ from lapgs_plugin.environment.probes import Probe
 from tests.contract.stub_runs import CHECKOUTS
 
 probed = lru_cache(probes.run_probe)
+"""Run each probe once for all tests: it is a process that imports PyTorch."""
 app = typer.Typer()
 app.command()(doctor)
+
+
+@pytest.fixture(autouse=True)
+def _probed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "run_probe", probed)
 
 
 def test_json_names_every_section_and_this_machine_can_train() -> None:

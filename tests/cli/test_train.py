@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -31,12 +33,31 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def lapgs(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+@dataclass(frozen=True)
+class Ended:
+    """Hold the exit code and the messages of a command."""
+
+    returncode: int
+    stderr: str
 
 
-def test_a_run_trains_and_a_second_one_into_it_is_refused(scene: Path, tmp_path: Path) -> None:
+Lapgs = Callable[..., Ended]
+
+
+@pytest.fixture
+def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Lapgs:
+    """Return a function that runs a command in this process: importing torch takes longer than most of them."""
+
+    def call(*words: object) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            app.run()
+        return Ended(int(ended.value.code or 0), capsys.readouterr().err)
+
+    return call
+
+
+def test_a_run_trains_and_a_second_one_into_it_is_refused(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
     done = lapgs("train", scene, "-o", tmp_path / "run", "--eval", "--views-per-step", "3", *SHORT)
     assert done.returncode == 0, done.stderr
     archive = RunArchive.open(tmp_path / "run")
@@ -100,28 +121,18 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(
-    scene: Path,
-    tmp_path: Path,
-    options: tuple[str, ...],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    lapgs: Lapgs, scene: Path, tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
-    """In this process, because importing torch takes longer than the test."""
-    words = ("train", scene, "-o", tmp_path / "run", "--iterations", 40, *options)
-    monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        app.run()
-    assert ended.value.code == 2
-    errors = capsys.readouterr().err
-    last = errors.strip().splitlines()[-1]
+    ended = lapgs("train", scene, "-o", tmp_path / "run", "--iterations", 40, *options)
+    assert ended.returncode == 2
+    last = ended.stderr.strip().splitlines()[-1]
     assert last.startswith("lapgs: ")
     assert message in last
-    assert "Traceback" not in errors
+    assert "Traceback" not in ended.stderr
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
-def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(tmp_path: Path) -> None:
+def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(lapgs: Lapgs, tmp_path: Path) -> None:
     scene, other = write_scene(tmp_path / "scene"), write_scene(tmp_path / "other")
     run = write_run(tmp_path / "run", scene, finished=1)
     files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != LOCK}
@@ -135,7 +146,7 @@ def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(tmp_path:
     assert {path: path.read_bytes() for path in files} == files
 
 
-def test_residuals_are_trained_on_request(scene: Path, tmp_path: Path) -> None:
+def test_residuals_are_trained_on_request(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
     options = (*RESIDUALS, "--joint", "0.25", "--inherit", "xyz:0.5", "--supervision", "reconstructed")
     done = lapgs("train", scene, "-o", tmp_path / "run", *options, *SHORT)
     assert done.returncode == 0, done.stderr
@@ -145,7 +156,7 @@ def test_residuals_are_trained_on_request(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_runs_from_before_nesting_continue_with_residuals(tmp_path: Path) -> None:
+def test_runs_from_before_nesting_continue_with_residuals(lapgs: Lapgs, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), finished=1)
     manifest = json.loads((run / MANIFEST).read_text())
     assert manifest["settings"].pop("hierarchy") == "laplacian"
@@ -163,8 +174,8 @@ def test_runs_from_before_nesting_continue_with_residuals(tmp_path: Path) -> Non
     assert [record.signed for record in RunArchive.open(run).manifest.records] == [False, True]
 
 
-def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bits(scene: Path, tmp_path: Path) -> None:
-    options = (scene, "--iterations", "400", "--sh-degree", "1", "--densify-every", "50")
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bits(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
+    options = (scene, "--iterations", "300", "--sh-degree", "1", "--densify-every", "50")
     assert lapgs("train", *options, "-o", tmp_path / "whole").returncode == 0
     command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "train", *map(str, options)]
     with subprocess.Popen([*command, "-o", tmp_path / "parts"], stderr=subprocess.PIPE, text=True) as process:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
-from tests.contract.stub_runs import NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
+from tests.contract.stub_runs import FORKS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
 
 # Two stages of 3 and 6 iterations that densify at 2, and at 2 and 4.
 TINY = ("--iterations", 9, "--densify_from_iter", 0, "--densification_interval", 2, "--densify_until_iter", 8)
@@ -71,11 +71,13 @@ def test_the_order_of_calls(scene: Path, tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["fastgs", "taming"])
+@pytest.mark.parametrize("name", ["fastgs", "taming", "speedy"])
 def test_renders_for_scores_are_no_iterations(name: str, scene: Path, tmp_path: Path) -> None:
     hook = Recording()
     more = ("--iterations", 18, *TINY[2:-1], 12)
-    run_residuals(STUBS[name], scene, tmp_path / "run", *more, hooks=(hook,), split="1/2,1/2")
+    if name == "speedy":  # its scores are gradients
+        more += ("--prune_from_iter", 4, "--prune_interval", 4, "--densify_prune_ratio", 0.1)
+    run_residuals((STUBS | FORKS)[name], scene, tmp_path / "run", *more, hooks=(hook,), split="1/2,1/2")
     calls = [call for call in hook.calls if not call.startswith("densify")]
     expected = []
     for level in (1, 0):

@@ -28,6 +28,7 @@ from lapgs_plugin.runner.installed_rasterizer import explain_import_error
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
+from lapgs_plugin.viewer.preview import read_preview
 from tests.contract.stub_runs import (
     CHECKOUTS,
     NAMES,
@@ -362,6 +363,7 @@ def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "Training complete." in done.stdout
     assert RunArchive.open(tmp_path / "run").manifest.complete
+    assert read_preview(tmp_path / "run") is not None, "the picture that `lapgs view` shows first"
 
 
 @pytest.fixture

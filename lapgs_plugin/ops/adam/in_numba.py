@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
@@ -111,6 +112,10 @@ class FieldAdam(torch.optim.Optimizer):
                 "views": 1,
             },
         )
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add a group as torch's optimizers do, without importing torch's compiler, which would take a second."""
+        inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # as torch's own
