@@ -30,7 +30,7 @@ from torch.utils.checkpoint import checkpoint
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
@@ -110,9 +110,7 @@ class OracleRasterizer:
         Raises:
             UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
         """
-        degree = field.sh_degree if sh_degree is None else sh_degree
-        if not 0 <= degree <= field.sh_degree:
-            raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
+        degree = degree_to_evaluate(field, sh_degree)
         if background.shape != (3,):
             raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
         camera = camera.to(field.means.device, field.means.dtype)
