@@ -204,7 +204,7 @@ def _shapes(
     Args:
         relative: (v,) relative error of the Jacobians.
     """
-    jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
+    jacobians = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov)  # (v, 2, 3)
     to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
     covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
     xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
