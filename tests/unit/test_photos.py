@@ -258,7 +258,7 @@ def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
         ("auto", (1090, 8), 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
         ("auto", (1090, 8), 5, "first", "with a simpler lens only 5 of 8 photos could be placed"),
         ("auto", (1000, 2), 8, "second", "only 2 of 8 photos could be placed; placing the cameras again"),
-        ("auto", (1000, 2), 3, "global", "only 3 photos could be placed; placing all at once"),
+        ("auto", (1000, 2), 3, "incremental", "only 3 photos could be placed; looking for more matches"),
         ("auto", (1000, 7), 8, "first", ""),
         ("OPENCV", (1090, 8), 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
     ],
@@ -274,14 +274,17 @@ def test_doubtful_lenses_are_told_and_tried_again(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     models = {"first": _model(first[0], 1000, first[1]), "second": _model(1000, 1000, again)}
-    models["global"] = _model(1000, 1000, 8)
+    models["incremental"] = models["global"] = _model(1000, 1000, 8)
 
-    def mapped(job: object, title: str, folder: Path, model: str | None, mapper: str | None) -> list[object]:
+    def mapped(
+        job: object, title: str, folder: Path, model: str | None, mapper: str | None, database: Path | None
+    ) -> list[object]:
         assert model in (None, "SIMPLE_RADIAL")
         return [models[mapper or ("first" if model is None else "second")]]
 
     monkeypatch.setattr(placement, "map_photos", mapped)
     monkeypatch.setattr(placement, "remove_unlinked", lambda model: None)
+    monkeypatch.setattr(placement, "match_more", lambda job: tmp_path)
     found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
     job = Job(tmp_path, found, PrepareSettings(camera_model=asked), False)
     with caplog.at_level(logging.INFO):

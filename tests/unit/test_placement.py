@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import pycolmap
 import pytest
 
 from lapgs_plugin.scenes.prepare import placement
+from lapgs_plugin.scenes.prepare.colmap import MOST_GUIDED, match_more
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import Photos
-from lapgs_plugin.scenes.prepare.settings import GLOBAL, PrepareSettings
+from lapgs_plugin.scenes.prepare.settings import GLOBAL, INCREMENTAL, PrepareSettings
 
-PHOTOS = 8
+PHOTOS, SIMPLE = 8, "SIMPLE_RADIAL"
 
 
 def model(*tracks: tuple[int, Sequence[int]], photos: int = PHOTOS) -> pycolmap.Reconstruction:
@@ -50,28 +52,45 @@ def test_photos_that_points_do_not_link_are_removed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "simple", "whole", "attempts", "kept"),
+    ("placed_by", "attempts", "kept"),
     [
-        (6, 8, 8, 1, 6),  # enough are placed: three quarters
-        (5, 6, 8, 2, 6),  # the simple lens suffices
-        (5, 4, 8, 3, 8),
-        (5, 4, 4, 3, 5),  # never fewer than the first attempt
-        (5, 5, 5, 3, 5),
+        ((6, 8, 8, 8), 1, 6),  # enough are placed: three quarters
+        ((5, 6, 8, 8), 2, 6),  # a simpler lens suffices
+        ((5, 4, 6, 8), 3, 6),  # more matches suffice
+        ((5, 4, 5, 8), 4, 8),
+        ((5, 4, 4, 4), 4, 5),  # never fewer than the first attempt
     ],
 )
 def test_the_attempt_that_places_most_photos_is_kept(
-    first: int, simple: int, whole: int, attempts: int, kept: int, monkeypatch: pytest.MonkeyPatch
+    placed_by: tuple[int, ...], attempts: int, kept: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    asked: list[tuple[str | None, str | None, Path | None]] = []
 
-    def mapped(_: Job, __: str, ___: Path, lens: str | None, mapper: str | None) -> list[pycolmap.Reconstruction]:
-        asked.append((lens, mapper))
-        count = whole if mapper == GLOBAL else first if lens is None else simple
+    def mapped(
+        _: Job, __: str, ___: Path, lens: str | None, mapper: str | None, database: Path | None
+    ) -> list[pycolmap.Reconstruction]:
+        asked.append((lens, mapper, database))
+        photos = placed_by[len(asked) - 1]
         # The global mapper gives every photo a place; only some are linked.
-        photos = PHOTOS if mapper == GLOBAL else count
-        return [model((20, range(1, count + 1)), photos=photos)]
+        return [model((20, range(1, photos + 1)), photos=PHOTOS if mapper == GLOBAL else photos)]
 
     monkeypatch.setattr(placement, "map_photos", mapped)
+    monkeypatch.setattr(placement, "match_more", lambda job: job.work / "more.db")
     found = Photos(Path("photos"), {f"{number}.jpg": Path() for number in range(1, PHOTOS + 1)})
     models = placement.place_cameras(Job(Path("work"), found, PrepareSettings(), progress=False))
-    assert (len(asked), models[0].num_reg_images()) == (attempts, kept)
+    more = Path("work", "more.db")
+    expected = [(None, None, None), (SIMPLE, None, None), (SIMPLE, INCREMENTAL, more), (SIMPLE, GLOBAL, more)]
+    assert asked == expected[:attempts]
+    assert models[0].num_reg_images() == kept
+
+
+@pytest.mark.parametrize("pairs", [0, MOST_GUIDED + 1])
+def test_no_more_matches_without_pairs_or_with_too_many(pairs: int, tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "database.db") as database:
+        database.execute("CREATE TABLE two_view_geometries (pair_id INTEGER, rows INTEGER)")
+        database.executemany(
+            "INSERT INTO two_view_geometries VALUES (?, ?)", [(0, 14), *((0, 15) for _ in range(pairs))]
+        )
+    database.close()
+    assert match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False)) is None
+    assert [file.name for file in tmp_path.iterdir()] == ["database.db"]

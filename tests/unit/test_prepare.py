@@ -294,6 +294,10 @@ def test_photos_that_do_not_fit_are_named(few: Path, tmp_path: Path, caplog: pyt
         result = prepare_scene(mixed, tmp_path / "scene", progress=False)
     assert result.left_out == ("fog.png", "more/fog.jpg")
     assert len(result.registered) == 4
+    assert [title for title in result.seconds if title.startswith(("Matching", "Placing"))] == [
+        *("Matching pairs", "Placing cameras", "Placing again", "Matching more", "Placing (incremental)"),
+        *(["Placing (global)"] if colmap.HAS_GLOBAL else []),
+    ]
     assert "2 of 6 photos could not be placed: fog.png, more/fog.jpg" in caplog.text
     assert len(list((tmp_path / "scene" / "images").rglob("*.*"))) == 4
 

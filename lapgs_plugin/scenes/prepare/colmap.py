@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,10 @@ from lapgs_plugin.scenes.output import check_written
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRIEVAL, SEQUENTIAL, PrepareSettings
 
+VERIFIED = 15
+"""Fewest matches that agree on a geometry for two photos to count as showing the same, as in COLMAP's mapper."""
+MOST_GUIDED = 500
+"""Most pairs that are matched again, guided by their geometry, which takes seconds a pair on a processor."""
 MOST_EXHAUSTIVE = 500
 """Most photos of which all pairs are compared, unless a matcher was chosen; of more, those that look alike."""
 SIMILAR = 40
@@ -68,25 +72,73 @@ def find_features(job: Job, single_camera: bool) -> None:
         "max_size": job.settings.max_size,
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
-    _run_step(job, "Finding features", "photos", len(job.names), "features", options, lambda: _rows(job, "descriptors"))
+    _run_step(
+        job,
+        "Finding features",
+        "photos",
+        len(job.names),
+        "features",
+        options,
+        lambda: _rows(job.database, "descriptors"),
+    )
 
 
 def match_pairs(job: Job) -> None:
     """Match the features of those pairs of photos that the matcher chooses."""
-    count, matcher = len(job.names), chosen_matcher(job)
-    loops = -(-count // LOOP_EVERY) if count >= LOOP_FROM and HAS_VOCABULARY else 0
+    count, loops = len(job.names), _loops(job)
     total = {
         EXHAUSTIVE: count * (count - 1) // 2,
         SEQUENTIAL: _neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
         RETRIEVAL: count * min(SIMILAR, count - 1),  # at most: many pairs are found from both sides
-    }[matcher]
-    options = {
+    }[chosen_matcher(job)]
+    _run_step(
+        *(job, "Matching pairs", "pairs", total, "pairs", _pairing(job)),
+        lambda: _rows(job.database, "two_view_geometries"),
+    )
+
+
+def match_more(job: Job) -> Path | None:
+    """Match more features of the pairs with a known geometry, guided by it, and return a database with these matches.
+
+    Returns:
+        The database; None if there are no such pairs, or more than `MOST_GUIDED`.
+    """
+    found = job.work / "guided.db"
+    with closing(sqlite3.connect(job.database)) as connection:
+        known = "FROM two_view_geometries WHERE rows >= ?"
+        (total,) = connection.execute(f"SELECT COUNT(*) {known}", (VERIFIED,)).fetchone()
+    if not 0 < total <= MOST_GUIDED:
+        return None
+    if not found.is_file():
+        partial = found.with_suffix(".partial")
+        shutil.copyfile(job.database, partial)
+        with closing(sqlite3.connect(partial)) as connection, connection:
+            # COLMAP matches pairs without a geometry again.
+            connection.execute(f"DELETE {known}", (VERIFIED,))
+        before = _rows(partial, "two_view_geometries")
+        options = {**_pairing(job), "database": str(partial.absolute()), "guided": True}
+        _run_step(
+            *(job, "Matching more", "pairs", total, "pairs", options),
+            lambda: _rows(partial, "two_view_geometries") - before,
+        )
+        partial.rename(found)
+    return found
+
+
+def _pairing(job: Job) -> dict[str, Any]:
+    """Return the options of the step that matches pairs."""
+    matcher = chosen_matcher(job)
+    return {
         "matcher": matcher,
         "similar": SIMILAR if matcher == RETRIEVAL else LOOP_SIMILAR,
-        "every": LOOP_EVERY if loops else 0,
+        "every": LOOP_EVERY if _loops(job) else 0,
         "tree": str((job.work / "tree.bin").absolute()),
     }
-    _run_step(job, "Matching pairs", "pairs", total, "pairs", options, lambda: _rows(job, "two_view_geometries"))
+
+
+def _loops(job: Job) -> int:
+    """Return how many photos sequential matching also compares with those that look most like them."""
+    return -(-len(job.names) // LOOP_EVERY) if len(job.names) >= LOOP_FROM and HAS_VOCABULARY else 0
 
 
 def _neighbour_pairs(count: int) -> int:
@@ -95,7 +147,12 @@ def _neighbour_pairs(count: int) -> int:
 
 
 def map_photos(
-    job: Job, title: str, folder: Path, model: str | None = None, mapper: str | None = None
+    job: Job,
+    title: str,
+    folder: Path,
+    model: str | None = None,
+    mapper: str | None = None,
+    database: Path | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Recover models into a folder, unless it is there, and return them.
 
@@ -103,7 +160,7 @@ def map_photos(
         job: the job.
         title: of the progress bar.
         folder: of the models.
-        model, mapper: replace the job's.
+        model, mapper, database: replace the job's.
     """
     if not folder.is_dir():
         unfinished, placed = folder.with_suffix(".partial"), job.work / "placed"
@@ -118,7 +175,7 @@ def map_photos(
         }
         if model is not None:
             other = job.work / "simple.db"
-            shutil.copyfile(job.database, other)
+            shutil.copyfile(database or job.database, other)
             options |= {"database": str(other.absolute()), "camera_model": model}
         _run_step(job, title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
         for written in unfinished.iterdir():
@@ -129,10 +186,10 @@ def map_photos(
     return models
 
 
-def _rows(job: Job, table: str) -> int:
+def _rows(database: Path, table: str) -> int:
     """Return the number of rows in a table of COLMAP's database, also while COLMAP writes it; 0 before it exists."""
     try:
-        connection = sqlite3.connect(f"{job.database.absolute().as_uri()}?mode=ro", uri=True, timeout=POLL_SECONDS)
+        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=POLL_SECONDS)
         try:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
         finally:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pycolmap
 
+from lapgs_plugin.scenes.prepare.colmap import VERIFIED
+
 FEW_FEATURES = 100
 """Photos with fewer features are too plain, dark or blurred to be placed."""
-VERIFIED = 15
-"""Fewest matches that agree on a geometry for two photos to count as showing the same, as in COLMAP's mapper."""
 
 BLURRED = f"fewer than {FEW_FEATURES} features: blurred, dark or of a plain surface; take them sharp and in more light"
 APART = "a group of their own that nothing connects to the scene; take photos on the way from one to the other"

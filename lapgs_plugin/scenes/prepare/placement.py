@@ -1,9 +1,10 @@
-"""Place the cameras, judge the result, and place them again with a simpler lens or all at once if it is doubtful."""
+"""Place the cameras, judge the result, and place them again with a simpler lens or more matches if it is doubtful."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -11,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lapgs_plugin.errors import SceneError
-from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, map_photos
+from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, map_photos, match_more
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, GLOBAL, INCREMENTAL
 
@@ -51,15 +52,13 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
 
 
 def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
-    """Return the best models of doubtful ones, those of a simpler lens, and if few are placed, of the other mapper."""
+    """Return the best of doubtful models, those of a simpler lens, and if few are placed, of further attempts."""
     logger.info("%s; placing the cameras again with a simpler lens", doubt)
     again = _mapped(job, "Placing again", "models_simple", SIMPLE_MODEL)
     if _placed(again) >= _placed(models):
         models = again
-    if _placed(models) < FEW * len(job.names) and job.settings.mapper == INCREMENTAL and HAS_GLOBAL:
-        logger.info("only %d photos could be placed; placing all at once (--mapper global)", _placed(models))
-        whole = _mapped(job, "Placing all", "models_global", SIMPLE_MODEL, GLOBAL)
-        return whole if _placed(whole) > _placed(models) else models
+    if _few(job, models) and job.settings.mapper == INCREMENTAL:
+        return _with_more_matches(job, models)
     if models is not again:
         logger.warning(
             "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or take more "
@@ -69,22 +68,38 @@ def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -
     return models
 
 
+def _with_more_matches(job: Job, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """Return the best of these models and those with more matches, by the incremental and then the global mapper."""
+    logger.info("only %d photos could be placed; looking for more matches", _placed(models))
+    database = match_more(job)
+    mappers = [*([INCREMENTAL] if database is not None else []), *([GLOBAL] if HAS_GLOBAL else [])]
+    for mapper in mappers:
+        if _few(job, models):
+            found = _mapped(job, f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database)
+            models = found if _placed(found) > _placed(models) else models
+    return models
+
+
 def _mapped(
-    job: Job, title: str, folder: str, lens: str | None = None, mapper: str | None = None
+    job: Job,
+    title: str,
+    folder: str,
+    lens: str | None = None,
+    mapper: str | None = None,
+    database: Path | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Return the models of one attempt, the one with most photos first, without photos whose place is arbitrary."""
-    models = map_photos(job, title, job.work / folder, lens, mapper)
-    if (mapper or job.settings.mapper) == GLOBAL:
-        for model in models:
-            remove_unlinked(model)
-        models.sort(key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
-    return models
+    models = map_photos(job, title, job.work / folder, lens, mapper, database)
+    for model in models:
+        remove_unlinked(model)
+    return sorted(models, key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
 
 
 def remove_unlinked(model: pycolmap.Reconstruction) -> None:
     """Leave only the largest group of photos that are linked by shared points.
 
-    COLMAP's global mapper places photos by their rotations even if no points confirm it.
+    COLMAP's global mapper places photos by their rotations even if no points confirm it, and its incremental mapper
+    places some by a few wrong points.
     """
     placed = sorted(key for key, image in model.images.items() if image.has_pose)
     seen = [
@@ -104,6 +119,11 @@ def remove_unlinked(model: pycolmap.Reconstruction) -> None:
             model.deregister_frame(model.images[key].frame_id)
 
 
+def _few(job: Job, models: Sequence[pycolmap.Reconstruction]) -> bool:
+    """Return whether so few photos are placed that another attempt may place more."""
+    return _placed(models) < FEW * len(job.names)
+
+
 def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:
     """Return the number of photos in the largest model."""
     return models[0].num_reg_images() if models else 0
@@ -111,7 +131,7 @@ def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:
 
 def _doubt(job: Job, models: Sequence[pycolmap.Reconstruction]) -> str | None:
     """Return why the models may be wrong because the lens was not found; None if nothing says so."""
-    if _placed(models) < FEW * len(job.names):
+    if _few(job, models):
         return f"only {_placed(models)} of {len(job.names)} photos could be placed"
     if (apart := _focal_difference(models[0])) > SQUARE:
         return f"the focal lengths along x and y differ by {apart:.0%}, which no usual lens does"

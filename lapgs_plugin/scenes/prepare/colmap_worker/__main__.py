@@ -65,9 +65,10 @@ def _match_pairs(job: dict[str, Any]) -> None:
     """Match features.
 
     Keys: database, matcher, similar (photos to compare with by looks), every (distance of photos that sequential
-    matching compares so, 0 for none), tree (a file to write).
+    matching compares so, 0 for none), tree (a file to write), guided (match more features of pairs with a geometry; may
+    be missing). Pairs that the database has a geometry of are left alone.
     """
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda)
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda, guided_matching=job.get("guided", False))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     if job["matcher"] == "exhaustive":
