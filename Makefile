@@ -8,9 +8,6 @@ SMOKE := runs/smoke
 KERNELS := runs/kernels
 DEMO_OPTIONS := --iterations 1000 --densify-every 50 --test-every 100 --eval --overwrite
 
-# Hundreds of processes import the package and the tests' libraries; without this each would compile them again.
-unexport PYTHONDONTWRITEBYTECODE
-
 .PHONY: demo test kernels smoke portability check clean
 
 demo: $(VENV)/.installed
@@ -47,11 +44,12 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# pip would compile modules in one process. A few files are for other versions of Python and do not compile.
+# pip would compile modules in one process, and where PYTHONDONTWRITEBYTECODE is set each of the hundreds of processes that
+# tests start would compile the package's. A few files of libraries are for other versions of Python and do not compile.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null || true
+	$(BIN)/python -m compileall -q -j 0 $(VENV)/lib lapgs_plugin >/dev/null || true
 	touch $@
 
 clean:
