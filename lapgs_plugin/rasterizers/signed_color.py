@@ -21,7 +21,7 @@ from torch import Tensor
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.patching import State, Target, find_targets, status
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
@@ -108,7 +108,7 @@ class SignedColorRasterizer:
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
         """Render `field`; see `fields.rasterizer.Rasterizer`."""
-        degree = field.sh_degree if sh_degree is None else sh_degree
+        degree = degree_to_evaluate(field, sh_degree)
         colors = None
         if field.signed:
             if self.path is ColorPath.NATIVE:

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster import pipeline
@@ -50,8 +50,8 @@ class CpuRasterizer:
             UserInputError: the field has no such `sh_degree`, `background` is not a colour, or a tensor is not on the
                 CPU or not of the field's precision.
         """
-        degree = field.sh_degree if sh_degree is None else sh_degree
-        _check(field, background, degree)
+        degree = degree_to_evaluate(field, sh_degree)
+        _check(field, background)
         kind = field.means.dtype
         view = _view(camera, kind)
         background = background.to(kind)
@@ -75,7 +75,7 @@ class CpuRasterizer:
         Raises:
             UserInputError: as `__call__`.
         """
-        _check(field, background, field.sh_degree)
+        _check(field, background)
         kind = field.means.dtype
         gaussians = _gaussians(list(field.parameters.values()), field.signed, field.sh_degree)
         color = background.to(kind).contiguous().numpy()
@@ -163,10 +163,8 @@ def _numpy_type(kind: torch.dtype) -> type[np.floating[Any]]:
     return np.float32 if kind == torch.float32 else np.float64
 
 
-def _check(field: GaussianField, background: Tensor, degree: int) -> None:
+def _check(field: GaussianField, background: Tensor) -> None:
     kind = field.means.dtype
-    if not 0 <= degree <= field.sh_degree:
-        raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
     if background.shape != (3,):
         raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
     if kind not in (torch.float32, torch.float64):
