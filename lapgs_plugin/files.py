@@ -87,6 +87,16 @@ def one_line_errors(path: Path, action: str = "written", *, training: bool = Fal
         raise RunFolderError(f"{path} cannot be {action}: {error.strerror or error}; {advice}") from error
 
 
+def write_file(path: Path, content: str | bytes, *, training: bool = False) -> None:
+    """Replace a file, whole or not at all; `training` as in `one_line_errors`.
+
+    Raises:
+        RunFolderError: it cannot be written.
+    """
+    with one_line_errors(path, training=training), atomic_write(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
 def require_manifest(folder: Path) -> None:
     """Check that a folder holds a run, without reading it or importing anything heavy.
 

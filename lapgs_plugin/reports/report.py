@@ -11,7 +11,7 @@ import jinja2
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import write_file
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -139,8 +139,7 @@ def write_page(path: Path, page: str) -> Path:
     Raises:
         RunFolderError: it cannot be written.
     """
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(page.encode())
+    write_file(path, page)
     return path
 
 
