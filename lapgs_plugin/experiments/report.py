@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 
 from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
@@ -46,8 +46,8 @@ COUNTS = {
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
 
-NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
-"""Columns with text and with numbers that every row has."""
+FIGURES = ("train_seconds", "gaussians")
+"""Columns with numbers that every row has."""
 
 Row = Mapping[str, Any]
 
@@ -111,7 +111,6 @@ class Results:
                         f"{path}: {shortened(name)} is {shortened(value)}, expected a number; write it again with "
                         "`lapgs bench` and --tables-only"
                     )
-        rows = [{**row, **{name: str(row[name]) for name in NAMES}} for row in rows]
         return cls(folder, rows)
 
     @property
