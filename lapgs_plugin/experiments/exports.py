@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import MissingExtraError, RunFolderError, UserInputError
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import atomic_write, one_line_errors, write_text
 from lapgs_plugin.untrusted import parse_json, shortened
 
 CSV, PARQUET, MARKDOWN, LATEX = "results.csv", "results.parquet", "tables.md", "tables.tex"
@@ -29,7 +29,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    _write(path, text.getvalue().encode())
+    write_text(path, text.getvalue())
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
@@ -55,15 +55,6 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         ) from error
     with one_line_errors(path), atomic_write(path) as stream:
         pyarrow.parquet.write_table(table, stream)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file.
-
-    Raises:
-        RunFolderError: it cannot be written.
-    """
-    _write(path, text.encode())
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
@@ -97,8 +88,3 @@ def _value(text: str) -> Any:
     except UserInputError:
         return text
     return value if isinstance(value, (int, float)) else text
-
-
-def _write(path: Path, data: bytes) -> None:
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(data)

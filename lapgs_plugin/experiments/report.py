@@ -17,6 +17,7 @@ from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
 from lapgs_plugin.experiments.runner import RUNS
+from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
 from lapgs_plugin.reports.pictures import Strip
@@ -29,7 +30,6 @@ from lapgs_plugin.reports.report import (
     training_charts,
     view_strips,
     view_table,
-    write_page,
 )
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import REPORT
@@ -168,7 +168,8 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
         machines=_machines(results),
     )
-    return write_page(folder / REPORT, page)
+    write_text(folder / REPORT, page)
+    return folder / REPORT
 
 
 def _tables(path: Path) -> tuple[str, str]:
