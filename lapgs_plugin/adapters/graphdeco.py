@@ -61,12 +61,12 @@ class Adapter(generic.Adapter):
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        from lapgs_plugin.reference_raster.standins import VARIANTS, variant_for
+        from lapgs_plugin.reference_raster.standins import FORKS, variant_for
 
         renderer = checkout / "gaussian_renderer" / "__init__.py"
         newer = "antialiasing" in renderer.read_text(encoding="utf-8", errors="replace")
         found = variant_for(checkout)
-        if found is not None and (VARIANTS[found].binding or VARIANTS[found].functions):
-            return found  # of a fork with a rasterizer of its own
+        if found in FORKS:
+            return found
         wants_sparse_adam = any(argument.rpartition("=")[2] == "sparse_adam" for argument in arguments)
         return "graphdeco" if not newer else "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in

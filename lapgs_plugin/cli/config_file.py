@@ -13,11 +13,10 @@ import typer
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import write_text
+from lapgs_plugin.runs.layout import RUN_CONFIG
 from lapgs_plugin.training.strategies import AUTO, GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_toml
 
-RUN_CONFIG = "run.toml"
-"""File of a run folder with the options that made the run."""
 OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
 """Parameters that say where a run goes and how it is started, not what it is."""
 

@@ -38,6 +38,14 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
+def is_installed(module: str) -> bool:
+    """Return whether a module can be found; of a dotted name, the outer packages are imported."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
 def processor_name() -> str:
     """Return the processor's model name, or its architecture."""
     try:

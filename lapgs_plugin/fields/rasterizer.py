@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 
@@ -77,6 +78,9 @@ class Rasterizer(Protocol):
             camera: size, intrinsics and pose.
             background: (3,) colour behind everything; zero for residual fields.
             sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
+
+        Raises:
+            UserInputError: the field has no such `sh_degree`.
         """
         ...
 
@@ -161,6 +165,18 @@ class PlainRasterizer(Protocol):
     ) -> Tensor:
         """Return `RenderResult.image` of the same call, (3, height, width), with its gradients."""
         ...
+
+
+def degree_to_evaluate(field: GaussianField, sh_degree: int | None) -> int:
+    """Return the highest SH degree that a call of a `Rasterizer` evaluates.
+
+    Raises:
+        UserInputError: the field has no coefficients of that degree, which CUDA code would read out of bounds.
+    """
+    degree = field.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= field.sh_degree:
+        raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
+    return degree
 
 
 def render_image(

@@ -14,6 +14,7 @@ from torch import Tensor
 MAX_SH_DEGREE = 3
 
 SH_C0 = math.sqrt(1 / (4 * math.pi))
+"""The constant function: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every direction."""
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi))
 _C3 = (

@@ -12,10 +12,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.settings import parse_inheritance
-
-SH_C0 = 0.5 / math.sqrt(math.pi)
-"""The constant spherical harmonic: a coefficient of (rgb - 0.5) / SH_C0 is the colour rgb from every direction."""
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3

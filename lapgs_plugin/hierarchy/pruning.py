@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from lapgs_plugin.hierarchy.inheritance import SH_C0
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 
 
 def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:

@@ -293,9 +293,11 @@ def parse_split(text: str) -> tuple[Fraction, ...]:
     """Parse shares such as "1/3,2/3" or "0.25,0.75".
 
     Raises:
-        UserInputError: a share is not a number.
+        UserInputError: a share is not a number, or has an exponent: 1e99999999 would take hours.
     """
     try:
+        if "e" in text.lower():
+            raise ValueError("an exponent")
         return tuple(Fraction(part.strip()) for part in text.split(","))
     except (ValueError, ZeroDivisionError) as error:
         raise UserInputError(f"--split {text!r}: expected fractions separated by commas, such as 1/3,2/3") from error

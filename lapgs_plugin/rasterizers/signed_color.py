@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -21,9 +20,10 @@ from torch import Tensor
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.patching import State, Target, find_targets, status
+from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
 logger = logging.getLogger(__name__)
@@ -42,34 +42,6 @@ class ColorPath(Enum):
     PRECOMPUTED = "precomputed"
 
 
-class Extension(Protocol):
-    """A wrapped rasterizer that has to be told how to render signed colour."""
-
-    @property
-    def name(self) -> str:
-        """Name of its Python module."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Device of fields."""
-        ...
-
-    def render(
-        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
-    ) -> RenderResult:
-        """Render without regard to `field.signed`.
-
-        Args:
-            field: n Gaussians on `device`.
-            camera: the view.
-            background: (3,) colour behind everything.
-            sh_degree: passed on unchanged, with the flag.
-            colors: (n, 3) the Gaussians' colours; SH and `sh_degree` are then ignored.
-        """
-        ...
-
-
 def signed_degree(degree: int) -> int:
     """Return the `sh_degree` that asks for signed colour of an SH degree, 0 to 3."""
     return degree | SIGNED_COLOR_BIT
@@ -82,13 +54,11 @@ class SignedColorRasterizer:
         extension: that renders.
         path: for signed fields; None tests the extension at the first signed field, and logs advice once if it needs
             the slow path.
-        checkout: folder with the extension's sources, for that advice.
     """
 
-    def __init__(self, extension: Extension, *, path: ColorPath | None = None, checkout: Path | None = None) -> None:
+    def __init__(self, extension: CudaExtension, *, path: ColorPath | None = None) -> None:
         self._extension = extension
         self._forced = path
-        self._checkout = checkout
 
     @property
     def name(self) -> str:
@@ -101,14 +71,14 @@ class SignedColorRasterizer:
             return self._forced
         if has_signed_color(self._extension):
             return ColorPath.NATIVE
-        logger.warning("%s", explain_fallback(self.name, self._checkout or Path.cwd()))
+        logger.warning("%s", explain_fallback(self.name, Path.cwd()))
         return ColorPath.PRECOMPUTED
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
         """Render `field`; see `fields.rasterizer.Rasterizer`."""
-        degree = field.sh_degree if sh_degree is None else sh_degree
+        degree = degree_to_evaluate(field, sh_degree)
         colors = None
         if field.signed:
             if self.path is ColorPath.NATIVE:
@@ -131,7 +101,7 @@ def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Ten
     return sh_to_color(field.sh, directions, degree, signed=field.signed)
 
 
-def has_signed_color(extension: Extension) -> bool:
+def has_signed_color(extension: CudaExtension) -> bool:
     """Test whether the installed extension renders and differentiates signed colour."""
     field, camera, degree = _probe_scene(extension.device)
     expected = precomputed_colors(field, camera, degree)[0]  # (3,) of both signs

@@ -30,7 +30,7 @@ from torch.utils.checkpoint import checkpoint
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
@@ -110,9 +110,7 @@ class OracleRasterizer:
         Raises:
             UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
         """
-        degree = field.sh_degree if sh_degree is None else sh_degree
-        if not 0 <= degree <= field.sh_degree:
-            raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
+        degree = degree_to_evaluate(field, sh_degree)
         if background.shape != (3,):
             raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
         camera = camera.to(field.means.device, field.means.dtype)
@@ -172,7 +170,7 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
     )  # (v, 2)
 
     covariances3d = world_covariances(field.quaternions[ids], field.log_scales[ids])  # (v, 3, 3)
-    to_screen = projection_jacobians(points, camera) @ rotation  # (v, 2, 3)
+    to_screen = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov) @ rotation  # (v, 2, 3)
     covariances2d = to_screen @ covariances3d @ to_screen.mT  # (v, 2, 2)
     xx = covariances2d[:, 0, 0] + PIXEL_VARIANCE  # (v,)
     xy = covariances2d[:, 0, 1]  # (v,)
@@ -187,6 +185,19 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
     return Projection(ids, depths, means2d, determinants, conics, radii, rectangles)
 
 
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """Return the matrices (n, 3, 3) of quaternions (n, 4), wxyz, as they are: rotations if their length is 1."""
+    w, x, y, z = quaternions.unbind(-1)  # (n,) each
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        dim=-1,
+    ).reshape(-1, 3, 3)  # fmt: skip
+
+
 def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
     """Compute Sigma = R S S^T R^T.
 
@@ -197,30 +208,24 @@ def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
     Returns:
         (n, 3, 3) covariances in world coordinates.
     """
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # (n,) each
-    rotations = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        dim=-1,
-    ).reshape(-1, 3, 3)  # fmt: skip
+    rotations = rotation_matrices(torch.nn.functional.normalize(quaternions, dim=-1))  # (n, 3, 3)
     axes = rotations * torch.exp(log_scales)[:, None, :]  # (n, 3, 3) R S
     return axes @ axes.mT
 
 
-def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
+def projection_jacobians(points: Tensor, focal: tuple[float, float], tan_half_fov: tuple[float, float]) -> Tensor:
     """Compute the derivative of pixel coordinates by camera-space points, which are clamped to near the frustum.
 
     Args:
         points: (n, 3) in camera coordinates, in front of the camera.
+        focal: in pixels, x and y.
+        tan_half_fov: of a `Camera`.
 
     Returns:
         (n, 2, 3) Jacobians.
     """
     x, y, depth = points.unbind(-1)  # (n,) each
-    limit_x, limit_y = (JACOBIAN_LIMIT * tangent for tangent in camera.tan_half_fov)
+    limit_x, limit_y = (JACOBIAN_LIMIT * tangent for tangent in tan_half_fov)
     # DEPARTURE: a clamped coordinate is limit * depth, but the CUDA code differentiates the Jacobian as if it were a
     # constant: its backward pass zeroes the derivative by x and keeps that by the depth as for a free x.
     x = torch.where((x / depth).abs() > limit_x, (limit_x * depth * x.sign()).detach(), x)
@@ -228,8 +233,8 @@ def projection_jacobians(points: Tensor, camera: Camera) -> Tensor:
     zero = torch.zeros_like(depth)
     return torch.stack(
         [
-            camera.fx / depth, zero, -camera.fx * x / (depth * depth),
-            zero, camera.fy / depth, -camera.fy * y / (depth * depth),
+            focal[0] / depth, zero, -focal[0] * x / (depth * depth),
+            zero, focal[1] / depth, -focal[1] * y / (depth * depth),
         ],
         dim=-1,
     ).reshape(-1, 2, 3)  # fmt: skip

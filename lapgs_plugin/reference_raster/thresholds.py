@@ -30,6 +30,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_basis
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
@@ -43,7 +44,13 @@ from lapgs_plugin.reference_raster.layout import (
     RADIUS_SIGMAS,
     TILE,
 )
-from lapgs_plugin.reference_raster.oracle import projection_jacobians, tile_lists, tile_rectangles, world_covariances
+from lapgs_plugin.reference_raster.oracle import (
+    inverse_covariances,
+    projection_jacobians,
+    tile_lists,
+    tile_rectangles,
+    world_covariances,
+)
 
 ROUNDINGS = 8
 """Default tolerance in units of the float type's epsilon, for the longest dot products of the projection."""
@@ -118,7 +125,7 @@ def threshold_mask(
     if tolerance is None:
         tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
     field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
-    degree = field.sh_degree if sh_degree is None else sh_degree
+    degree = degree_to_evaluate(field, sh_degree)
     bounded = _project(field, camera, degree, tolerance, three_sigma_cut)
     radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
     radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
@@ -197,7 +204,7 @@ def _shapes(
     Args:
         relative: (v,) relative error of the Jacobians.
     """
-    jacobians = projection_jacobians(points, camera)  # (v, 2, 3)
+    jacobians = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov)  # (v, 2, 3)
     to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
     covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
     xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
@@ -217,7 +224,7 @@ def _shapes(
     radii = RADIUS_SIGMAS * largest.sqrt()  # (v,) before they are rounded up
     radius_errors = RADIUS_SIGMAS * (errors + root_errors) / largest.sqrt() + tolerance * radii  # (v,)
     return _Shapes(
-        conics=torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None],
+        conics=inverse_covariances(xx, xy, yy, determinants),
         conic_errors=2 * errors / smallest + determinant_errors / determinants.abs(),
         smallest_radii=torch.ceil(radii - radius_errors).clamp(max=MAX_RADIUS),
         largest_radii=torch.ceil(radii + radius_errors).clamp(max=MAX_RADIUS),

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.hierarchy.inheritance import SH_C0
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField

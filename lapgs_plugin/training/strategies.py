@@ -31,7 +31,7 @@ ABSGRAD_THRESHOLD = 8e-4
 
 PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
 """Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
-LONG_RUN = 7_000
+LONG_RUN = 5_000
 """Iterations from which MCMC is better than 3DGS's heuristics: it starts from tiny Gaussians, and short runs end before
 they have grown."""
 

@@ -249,12 +249,6 @@ def test_blending_ends_before_the_transmittance_falls_under_its_limit() -> None:
 # ------------------------------------------------------------------------------------------------- bad input
 
 
-def test_refuses_a_degree_the_field_does_not_have() -> None:
-    case = replace(scenes.one_gaussian(), sh_degree=4)
-    with pytest.raises(UserInputError, match="sh_degree 4: expected 0 to 3"):
-        case.render(ORACLE)
-
-
 def test_refuses_a_background_that_is_no_color() -> None:
     case = scenes.one_gaussian()
     with pytest.raises(UserInputError, match=r"background has shape \(1,\), expected \(3,\)"):

@@ -12,6 +12,7 @@ from gsplat.strategy import DefaultStrategy
 
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
+from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
@@ -94,3 +95,10 @@ def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, o
         (gradient,) = torch.autograd.grad(term, field.opacity_logits)
         expected = opacity * opacities * (1 - opacities) / len(field)
         np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-5)
+
+
+def test_statistics_of_no_gaussians_are_empty() -> None:
+    add_statistics(
+        torch.zeros(2, 0, 2), torch.zeros(2, 0).int(), (8, 6), norms := torch.zeros(0), counts := torch.zeros(0)
+    )
+    assert len(norms) == len(counts) == 0

@@ -112,7 +112,7 @@ def test_gaps_are_refused() -> None:
 def test_parse_split() -> None:
     assert parse_split("1/3, 2/3") == (Fraction(1, 3), Fraction(2, 3))
     assert parse_split("0.25,0.75") == (Fraction(1, 4), Fraction(3, 4))
-    for text in ("", "a,b", "1/0", "1/3;2/3"):
+    for text in ("", "a,b", "1/0", "1/3;2/3", "1e999999999,1/2", "1E-999999999"):
         with pytest.raises(UserInputError, match="--split"):
             parse_split(text)
 

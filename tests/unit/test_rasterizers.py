@@ -24,7 +24,7 @@ from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
-from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.reference_raster.standins import install, stand_ins
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 
@@ -338,6 +338,20 @@ def test_gsplat_is_the_oracle_where_their_semantics_agree(signed: bool, without_
         assert (their_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
     assert theirs.absgrad2d is not None
     torch.testing.assert_close(theirs.absgrad2d, theirs.means2d.grad.abs())
+
+
+@pytest.mark.parametrize("degree", [-1, 2])
+def test_a_degree_that_the_field_lacks_is_refused_before_anything_is_rendered(
+    degree: int, without_cuda: WithoutCuda
+) -> None:
+    case = random_case(20, 20, 20, seed=3, sh_degree=1).to(torch.float32)
+    with install("graphdeco"):
+        extension = SignedColorRasterizer(CudaExtension(GRAPHDECO, "cpu"))
+        rasterizers = CpuRasterizer(), OracleRasterizer(), extension, GsplatRasterizer("cpu")
+        for rasterizer in rasterizers:
+            with pytest.raises(UserInputError, match=f"sh_degree {degree}: expected 0 to 1"):
+                rasterizer(case.field, case.camera, background=torch.zeros(3), sh_degree=degree)
+    assert without_cuda.asked == {}
 
 
 def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: WithoutCuda) -> None:

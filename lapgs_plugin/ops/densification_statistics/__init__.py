@@ -18,6 +18,8 @@ def add_statistics(gradient: Tensor, radii: Tensor, size: tuple[int, int], norms
         size: (width, height) of the image.
         norms, counts: (n,) sums so far.
     """
+    if len(norms) == 0:
+        return
     if triton_works(gradient):
         from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics_triton
 

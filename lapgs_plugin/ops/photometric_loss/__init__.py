@@ -9,7 +9,12 @@ from importlib import import_module
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, as_batch, photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import (
+    DEFAULT_SSIM_WEIGHT,
+    as_batch,
+    photometric_loss_torch,
+    require_one_shape,
+)
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
@@ -26,18 +31,20 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
 
     Returns:
         The loss, a scalar; the mean over several views.
+
+    Raises:
+        UserInputError: the images differ in shape, or on a CPU are neither float32 nor float64.
     """
+    require_one_shape(prediction, target)
     if triton_works(prediction):
         from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 
-        return photometric_loss_triton(prediction, target, ssim_weight)
+        with torch.cuda.device(prediction.device):  # Triton launches on the current one
+            return photometric_loss_triton(prediction, target, ssim_weight)
     target = decoded(target).to(prediction.dtype)
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
-        if prediction.ndim == 4:
-            each = zip(prediction.unbind(), target.unbind(), strict=True)
-            return torch.stack([photometric_loss_cpu(*pair, ssim_weight) for pair in each]).mean()
         return photometric_loss_cpu(prediction, target, ssim_weight)
     fused = fused_ssim()
     if fused is None or prediction.dtype != torch.float32:

@@ -25,7 +25,7 @@ from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, absolute, fetch_add, fma, load, select, splat, store
 from lapgs_plugin.jit.threads import parallel
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA, require_one_shape
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C2 as C2
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_RADIUS as RADIUS
@@ -240,11 +240,7 @@ def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
 
 
 def _check(prediction: Tensor, target: Tensor) -> None:
-    if prediction.ndim != 3 or prediction.shape != target.shape or prediction.numel() == 0:
-        raise UserInputError(
-            f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
-            "(channels, height, width); resize the target to the level that is rendered"
-        )
+    require_one_shape(prediction, target)
     if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
         raise UserInputError(
             f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
@@ -283,8 +279,8 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
     """Return (1 - w) mean |p - t| + w (1 - mean SSIM), differentiable once by the prediction.
 
     Args:
-        prediction: (c, h, w) image of any size and any value range, float32 or float64, on the CPU.
-        target: (c, h, w) image of the same type, a constant.
+        prediction: (c, h, w) or (b, c, h, w) of any size and any value range, float32 or float64, on the CPU.
+        target: of the same shape and type, a constant.
         ssim_weight: w, in [0, 1]; 3DGS trains with 0.2.
 
     Returns:
@@ -298,5 +294,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
         raise UserInputError("the target requires a gradient, expected a constant image; pass target.detach()")
     if not 0 <= ssim_weight <= 1:
         raise UserInputError(f"ssim_weight {ssim_weight}: expected a number from 0 to 1, such as 0.2")
-    loss: Tensor = _PhotometricLoss.apply(prediction, target, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
+    # SSIM is computed channel by channel: several images are one of more channels.
+    planes = prediction.flatten(0, -3), target.flatten(0, -3)
+    loss: Tensor = _PhotometricLoss.apply(*planes, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss

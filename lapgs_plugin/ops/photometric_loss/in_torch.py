@@ -5,6 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lapgs_plugin.errors import UserInputError
+
 DEFAULT_SSIM_WEIGHT = 0.2
 """Lambda of 3DGS's loss (1 - lambda) L1 + lambda (1 - SSIM)."""
 
@@ -38,6 +40,15 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     # kornia mirrors images at their borders; 3DGS pads them with zeros.
     border, width = (SSIM_RADIUS,) * 4, 2 * SSIM_RADIUS + 1
     return kornia_ssim(pad(prediction, border), pad(target, border), width, eps=0.0, padding="valid")
+
+
+def require_one_shape(prediction: Tensor, target: Tensor) -> None:
+    """Raise a UserInputError unless both are images (c, h, w), or batches (b, c, h, w), of one shape."""
+    if prediction.ndim not in (3, 4) or prediction.shape != target.shape or prediction.numel() == 0:
+        raise UserInputError(
+            f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
+            "(channels, height, width); resize the target to the level that is rendered"
+        )
 
 
 def as_batch(image: Tensor) -> Tensor:

@@ -18,9 +18,8 @@ from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster.standins import fused_ssim, simple_knn
-from lapgs_plugin.reference_raster.standins.binding import rasterizer_module
 from lapgs_plugin.reference_raster.standins.choice import variant_for
-from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS
+from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 
 __all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "variant_for"]
 

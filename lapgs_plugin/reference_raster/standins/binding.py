@@ -1,19 +1,17 @@
-"""Build the Python side of the CUDA rasterizers: settings, module, argument checks, the sparse Adam."""
+"""Bind the engine as graphdeco's CUDA rasterizers are bound: `forward`, argument checks, the sparse Adam."""
 
 from __future__ import annotations
 
-from collections import namedtuple
-from functools import lru_cache
-from importlib import import_module
-from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster.standins.engine import Inputs, Settings, mark_visible, rasterize
-from lapgs_plugin.reference_raster.standins.variants import VARIANTS, Variant
+
+if TYPE_CHECKING:
+    from lapgs_plugin.reference_raster.standins.variants import Variant
 
 
 class Rasterizer(nn.Module):
@@ -73,40 +71,6 @@ class DcApart(Rasterizer):
         return self._render(
             gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
         )
-
-
-@lru_cache
-def rasterizer_module(name: str) -> dict[str, Any]:
-    """Return the public names of the stand-in for a variant's module; always the same classes."""
-    variant = VARIANTS[name]
-    found: dict[str, Any] = {"__doc__": variant.description}
-    found |= {function: vars(_forks())[function] for function in variant.functions}
-    if not variant.settings:
-        return found
-    found |= {
-        "GaussianRasterizationSettings": namedtuple("GaussianRasterizationSettings", variant.settings),
-        "GaussianRasterizer": type(
-            "GaussianRasterizer",
-            (_binding(variant),),
-            {"variant": variant, "__doc__": Rasterizer.__doc__},
-        ),
-    }
-    if variant.sparse_adam:
-        found["SparseGaussianAdam"] = SparseGaussianAdam
-    return found
-
-
-def _forks() -> ModuleType:
-    """Return the module of forks' own bindings, which imports this one."""
-    return import_module("lapgs_plugin.reference_raster.standins.forks")
-
-
-def _binding(variant: Variant) -> type[Rasterizer]:
-    """Return the class that takes the arguments of a variant's `forward`."""
-    if variant.binding:
-        found: type[Rasterizer] = vars(_forks())[variant.binding]
-        return found
-    return DcApart if variant.dc_apart else WholeSh
 
 
 def gather(

@@ -100,20 +100,6 @@ class Blending:
                 np.exp2(found[:, LOG2_OPACITY]),
             )
 
-    def shares(self) -> NDArray[np.float64]:
-        """Return the sum over all pixels of each Gaussian's share, (n,)."""
-        total = np.zeros(self.n)
-        for tile in self.tiles:
-            np.add.at(total, tile.members, tile.weights.sum(1))
-        return total
-
-    def counts(self) -> NDArray[np.int32]:
-        """Return the number of pixels in which each Gaussian is blended, (n,)."""
-        total = np.zeros(self.n, np.int32)
-        for tile in self.tiles:
-            np.add.at(total, tile.members, (tile.alpha > 0).sum(1).astype(np.int32))
-        return total
-
     def leaders(self, ranks: int = 1) -> NDArray[np.int64]:
         """Return the Gaussians with the largest shares of each pixel, (ranks, height * width); -1 where are fewer."""
         found = np.full((ranks, self.view.width * self.view.height), -1, np.int64)

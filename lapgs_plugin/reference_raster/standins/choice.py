@@ -8,8 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lapgs_plugin.reference_raster.standins.binding import rasterizer_module
-from lapgs_plugin.reference_raster.standins.variants import VARIANTS, Variant
+from lapgs_plugin.reference_raster.standins.variants import VARIANTS, Variant, rasterizer_module
 
 IGNORED_FOLDERS = {"submodules", "SIBR_viewers", "site-packages"}
 """Folders of checkouts that hold other people's sources."""

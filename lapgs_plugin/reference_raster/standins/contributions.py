@@ -44,8 +44,7 @@ from lapgs_plugin.reference_raster.layout import (
     TILE_PIXELS,
 )
 from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
-
-_FINAL = 2 * TILE_PIXELS  # `tile_kernels.FINAL`: the kernel cache notices changes of `layout` and of this file only
+from lapgs_plugin.reference_raster.tile_kernels import FINAL
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ def _accumulate(
     offsets: Floats,  # see `tile_kernels.pixel_offsets`
     hits: NDArray[np.uint16],  # (pairs,)
     reached: NDArray[np.int64],  # (tiles,)
-    final: Floats,  # (tiles * _FINAL,)
+    final: Floats,  # (tiles * FINAL,)
     weights: Floats,  # (height * width,)
     slots: Floats,  # (pairs * SLOT,) filled: sums of weights, of 1, of shares, of distances
 ) -> None:
@@ -129,7 +128,7 @@ def _accumulate(
                 v = dy * broadcast(splats, s + FACTOR_YY)
                 exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
                 alpha = minimum(exp2(exponent), MAX_ALPHA)
-                last = load(final, tile * _FINAL + (2 * block + 1) * WIDTH)
+                last = load(final, tile * FINAL + (2 * block + 1) * WIDTH)
                 blended = (exponent >= LOG2_MIN_ALPHA) & (last >= position)
                 t = load(transmittance, block * WIDTH)
                 store(transmittance, block * WIDTH, select(blended, fma(-alpha, t, t), t))

@@ -23,8 +23,6 @@ from lapgs_plugin.reference_raster.layout import (
     FACTOR_YY,
     FOCAL_X,
     FOCAL_Y,
-    LIMIT_X,
-    LIMIT_Y,
     NEAR_DEPTH,
     PIXEL_VARIANCE,
     ROTATION,
@@ -35,6 +33,7 @@ from lapgs_plugin.reference_raster.layout import (
     SUM_VV,
     TRANSLATION,
 )
+from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
 from lapgs_plugin.reference_raster.pipeline import Kept, View
 
 MIN_SHARE = 2.5e-5
@@ -60,13 +59,7 @@ def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
 
 def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
     """Return covariances (n, 6) from standard deviations (n, 3) and quaternions (n, 4), used as they are."""
-    w, x, y, z = quats.unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    root = torch.stack(rows, 1).reshape(-1, 3, 3) * scales[:, None, :]
+    root = rotation_matrices(quats) * scales[:, None, :]
     return (root @ root.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
 
 
@@ -81,20 +74,12 @@ def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor
     """
     camera = torch.from_numpy(view.camera).to(means)
     rotation = camera[ROTATION : ROTATION + 9].reshape(3, 3)
-    x, y, depth = (means @ rotation.T + camera[TRANSLATION : TRANSLATION + 3]).unbind(1)
-    depth = torch.where(depth > NEAR_DEPTH, depth, 1.0)
-    # DEPARTURE: where x / z or y / z is clamped, the clamped coordinate counts as a constant, although it depends on z.
-    x, y = (_clamped(t, depth, float(view.camera[limit])) for t, limit in ((x, LIMIT_X), (y, LIMIT_Y)))
-    none = torch.zeros_like(depth)
-    x_scale, y_scale = camera[FOCAL_X] / depth, camera[FOCAL_Y] / depth
-    jacobian = torch.stack([x_scale, none, -x_scale * x / depth, none, y_scale, -y_scale * y / depth], 1)
-    root = jacobian.reshape(-1, 2, 3) @ rotation  # (n, 2, 3)
+    points = means @ rotation.T + camera[TRANSLATION : TRANSLATION + 3]
+    points = torch.where(points[:, 2:] > NEAR_DEPTH, points, 1.0)
+    focal_x, focal_y = float(view.camera[FOCAL_X]), float(view.camera[FOCAL_Y])
+    tangents = view.width / (2 * focal_x), view.height / (2 * focal_y)
+    root = projection_jacobians(points, (focal_x, focal_y), tangents) @ rotation  # (n, 2, 3)
     return (root @ matrices(covariances) @ root.mT).reshape(-1, 4)[:, [0, 1, 3]]
-
-
-def _clamped(value: Tensor, depth: Tensor, limit: float) -> Tensor:
-    bounded = (value / depth).clamp(-limit, limit) * depth
-    return torch.where((value / depth).abs() > limit, bounded.detach(), value)
 
 
 class _Antialiasing(torch.autograd.Function):

@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.oracle import rotation_matrices
 from lapgs_plugin.reference_raster.standins.binding import Rasterizer, WholeSh, gather
 from lapgs_plugin.reference_raster.standins.blending import Blending
 from lapgs_plugin.reference_raster.standins.covariance import covariances_of, matrices
@@ -112,7 +113,8 @@ class MiniSplatting2(MiniSplatting):
         arguments = ("dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
         opacities = torch.where(culling[:, None], 0.0, opacities)
         inputs = gather(means3D, means2D, opacities, *(more.get(name) for name in arguments))
-        return with_shares(self.raster_settings, rasterize(self.raster_settings, inputs, Options(blending=True)))
+        settings = self.raster_settings
+        return with_shares(settings, rasterize(settings, inputs, summing(settings, blending=True)))
 
     def render_depth(  # type: ignore[override]  # as the CUDA binding
         self, means3D: Tensor, means2D: Tensor, opacities: Tensor, culling: Tensor, **more: Tensor | None
@@ -120,11 +122,17 @@ class MiniSplatting2(MiniSplatting):
         return super().render_depth(means3D, means2D, torch.where(culling[:, None], 0.0, opacities), **more)
 
 
+def summing(settings: Any, blending: bool = False) -> Options:
+    """Ask for sums over all pixels."""
+    return Options(pixel_weights=torch.ones(settings.image_height * settings.image_width), blending=blending)
+
+
 def with_shares(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return image, radii, and each Gaussian's shares, pixels, and pixels that it has the largest share of."""
-    blending = output.blending
+    sums, blending = output.contributions, output.blending
+    assert sums is not None
     assert blending is not None
-    shares, counts = torch.from_numpy(blending.shares()).float(), torch.from_numpy(blending.counts())
+    shares, counts = torch.from_numpy(sums.blending).float(), torch.from_numpy(sums.counts)
     return output.image, output.radii, shares, counts, _pixels_led(blending)
 
 
@@ -293,13 +301,12 @@ class Surfels(WholeSh):
         settings = self.raster_settings
         assert inputs.scales is not None, "2DGS without precomputed transformations"
         assert inputs.quats is not None
-        w, x, y, z = inputs.quats.unbind(1)
+        rotations = rotation_matrices(inputs.quats)
         third = inputs.scales.detach().max(1, keepdim=True).values * THIN
         inputs = replace(inputs, scales=torch.cat([inputs.scales, third], 1))
         output = rasterize(settings, inputs, Options())
         depths = inputs.means @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
-        normals = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
-        normals = normals @ settings.viewmatrix[:3, :3]
+        normals = rotations[:, :, 2] @ settings.viewmatrix[:3, :3]
         centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
         normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
         black = settings._replace(bg=torch.zeros(3))

@@ -14,8 +14,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.hierarchy.inheritance import SH_C0
+from lapgs_plugin.fields.spherical_harmonics import SH_C0, sh_to_color
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
 from lapgs_plugin.reference_raster.layout import TILE
 

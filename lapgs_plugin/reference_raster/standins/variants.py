@@ -16,13 +16,17 @@ Matrices are transposed, as in the CUDA bindings. Settings beside those of the v
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin.reference_raster.standins import forks
+from lapgs_plugin.reference_raster.standins.binding import DcApart, Rasterizer, SparseGaussianAdam, WholeSh
 from lapgs_plugin.reference_raster.standins.engine import Options, Output
 
 _VIEW = (
@@ -41,11 +45,10 @@ class Variant:
         options: from the settings of a call to what it asks of the engine.
         outputs: from these settings and the engine's output to what `forward` returns.
         module: name that checkouts import.
-        dc_apart: whether `forward` takes the first SH coefficient as an argument of its own.
+        binding: `GaussianRasterizer` without its `variant`; its `forward` has the arguments of the CUDA module's.
         sparse_adam: whether the module has `SparseGaussianAdam`.
         fused_ssim: whether its binding `_C` has SSIM.
-        binding: class in `forks` with its `forward`, if that differs from graphdeco's.
-        functions: functions in `forks` that its module has besides the rasterizer.
+        functions: what its module has besides the rasterizer.
         beside: variants of other modules that the same checkouts import.
         needs_logs: whether these checkouts cannot do without TensorBoard.
     """
@@ -55,11 +58,10 @@ class Variant:
     options: Callable[[Any], Options]
     outputs: Callable[[Any, Output], tuple[Tensor, ...]]
     module: str = "diff_gaussian_rasterization"
-    dc_apart: bool = False
+    binding: type[Rasterizer] = WholeSh
     sparse_adam: bool = False
     fused_ssim: bool = False
-    binding: str = ""
-    functions: tuple[str, ...] = ()
+    functions: tuple[Any, ...] = ()
     beside: tuple[str, ...] = ()
     needs_logs: bool = False
 
@@ -107,13 +109,6 @@ def _with_sums(settings: Any, output: Output) -> tuple[Tensor, ...]:
     return output.image, output.radii, counts, *lists, output.centres, output.depths, output.radii.clone(), *sums
 
 
-def _with_shares(settings: Any, output: Output) -> tuple[Tensor, ...]:
-    """Return the image, the radii, and of each Gaussian the sum of shares, its pixels, and those it leads."""
-    from lapgs_plugin.reference_raster.standins.forks import with_shares
-
-    return with_shares(settings, output)
-
-
 def _with_total_share(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and the sum of each Gaussian's shares (n,)."""
     assert output.contributions is not None
@@ -130,11 +125,6 @@ def _with_pixels(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and the number of pixels in which each Gaussian is blended, (n, 1) float32."""
     assert output.contributions is not None
     return output.image, output.radii, torch.from_numpy(output.contributions.counts).float()[:, None]
-
-
-def _summing(settings: Any) -> Options:
-    """Ask for sums over all pixels."""
-    return Options(pixel_weights=torch.ones(settings.image_height * settings.image_width))
 
 
 def _weight_rows(settings: Any) -> int:
@@ -161,7 +151,7 @@ BACKBONES = {
         (*_VIEW, "prefiltered", "debug", "antialiasing"),
         lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
         _with_inverse_depths,
-        dc_apart=True,
+        binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
     ),
@@ -171,7 +161,7 @@ BACKBONES = {
         # The CUDA code looks at the number of rows, not of pixels.
         lambda settings: Options(pixel_weights=settings.pixel_weights if _weight_rows(settings) > 1 else None),
         _with_sums,
-        dc_apart=True,
+        binding=DcApart,
         sparse_adam=True,
     ),
     "taming-rasterizer": Variant(
@@ -179,7 +169,7 @@ BACKBONES = {
         (*_VIEW, "prefiltered", "debug"),
         lambda settings: Options(),
         _image_and_radii,
-        dc_apart=True,
+        binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
     ),
@@ -191,7 +181,7 @@ BACKBONES = {
         ),
         _with_marked_pixels,
         module="diff_gaussian_rasterization_fastgs",
-        dc_apart=True,
+        binding=DcApart,
         sparse_adam=True,
     ),
 }
@@ -203,40 +193,39 @@ FORKS = {
         (*_VIEW, "prefiltered", "debug"),
         lambda settings: Options(),
         _image_and_radii,
-        binding="SpeedySplat",
+        binding=forks.SpeedySplat,
     ),
     "mini-splatting": Variant(
         "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
         (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(blending=True),
-        _with_shares,
+        partial(forks.summing, blending=True),
+        forks.with_shares,
         module="diff_gaussian_rasterization_ms",
-        binding="MiniSplatting",
+        binding=forks.MiniSplatting,
         beside=("graphdeco",),
     ),
     "mini-splatting2": Variant(
         "Stand in for the rasterizer of Mini-Splatting2: as Mini-Splatting's, with culling.",
         (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(blending=True),
-        _with_shares,
+        partial(forks.summing, blending=True),
+        forks.with_shares,
         module="diff_gaussian_rasterization_ms",
-        dc_apart=True,
         sparse_adam=True,
         fused_ssim=True,
-        binding="MiniSplatting2",
+        binding=forks.MiniSplatting2,
         beside=("graphdeco",),
     ),
     "3dgs-mcmc": Variant(
         "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",
         (*_VIEW, "prefiltered", "debug"),
-        _summing,
+        forks.summing,
         _with_blended,
-        functions=("compute_relocation",),
+        functions=(forks.compute_relocation,),
     ),
     "absgs": Variant(
         "Stand in for the rasterizer of AbsGS: with absolute gradients and the sum of shares.",
         (*_VIEW, "prefiltered", "debug"),
-        _summing,
+        forks.summing,
         _with_total_share,
         module="diff_gaussian_rasterization_abs",
     ),
@@ -245,22 +234,22 @@ FORKS = {
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
         lambda settings: Options(antialiasing=True),
         _image_and_radii,
-        binding="MipSplatting",
+        binding=forks.MipSplatting,
     ),
     "efficientgs": Variant(
         "Stand in for the rasterizer of EfficientGS: with the largest shares, and SH degrees of each Gaussian.",
         (*_VIEW, "prefiltered", "debug", "use_train_speedup", "ignored_rate", "lambda_dssim", "use_hwc"),
         lambda settings: Options(),
         _image_and_radii,
-        binding="EfficientGS",
+        binding=forks.EfficientGS,
         needs_logs=True,
     ),
     "pixel-gs": Variant(
         "Stand in for the rasterizer of Pixel-GS: with the pixels of each Gaussian, and gradients scaled by depth.",
         (*_VIEW[:6], "depth_threshold", *_VIEW[6:], "prefiltered", "debug"),
-        _summing,
+        forks.summing,
         _with_pixels,
-        binding="PixelGS",
+        binding=forks.PixelGS,
     ),
     "2dgs": Variant(
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
@@ -268,7 +257,7 @@ FORKS = {
         lambda settings: Options(),
         _image_and_radii,
         module="diff_surfel_rasterization",
-        binding="Surfels",
+        binding=forks.Surfels,
     ),
     "faster-gs": Variant(
         "Stand in for the rasterizer of Faster-GS: a function of raw parameters, and its Adam.",
@@ -276,7 +265,7 @@ FORKS = {
         lambda settings: Options(),
         _image_and_radii,
         module="FasterGSCudaBackend.torch_bindings",
-        functions=("diff_rasterize", "RasterizerSettings", "FusedAdam"),
+        functions=(forks.diff_rasterize, forks.RasterizerSettings, forks.FusedAdam),
         beside=("graphdeco-aa",),
     ),
 }
@@ -284,3 +273,22 @@ FORKS = {
 
 VARIANTS = {**BACKBONES, **FORKS}
 """All variants by name."""
+
+
+@lru_cache
+def rasterizer_module(name: str) -> dict[str, Any]:
+    """Return the public names of the stand-in for a variant's module; always the same classes."""
+    variant = VARIANTS[name]
+    found: dict[str, Any] = {"__doc__": variant.description}
+    found |= {each.__name__: each for each in variant.functions}
+    if not variant.settings:
+        return found
+    found |= {
+        "GaussianRasterizationSettings": namedtuple("GaussianRasterizationSettings", variant.settings),
+        "GaussianRasterizer": type(
+            "GaussianRasterizer", (variant.binding,), {"variant": variant, "__doc__": Rasterizer.__doc__}
+        ),
+    }
+    if variant.sparse_adam:
+        found["SparseGaussianAdam"] = SparseGaussianAdam
+    return found
