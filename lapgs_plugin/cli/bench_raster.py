@@ -65,14 +65,13 @@ def raster(
     import torch
 
     from lapgs_plugin.evaluation import bench_raster
-    from lapgs_plugin.files import atomic_write
+    from lapgs_plugin.files import write_text
 
     precision: torch.dtype = getattr(torch, dtype)
     results = _measure(bench_raster.parse_cases(sizes), repeats, precision)
     _print_results(results)
     if json_file is not None:
-        with atomic_write(json_file) as stream:
-            stream.write(json.dumps(bench_raster.report(results, precision), indent=2).encode())
+        write_text(json_file, json.dumps(bench_raster.report(results, precision), indent=2))
     if check and any(result.missed for result in results):
         raise typer.Exit(1)
 

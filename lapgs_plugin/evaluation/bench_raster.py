@@ -7,7 +7,6 @@ turns, so that a change in the machine's load affects all of them. Ratios are of
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -15,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -24,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.environment import versions
+from lapgs_plugin.environment import installed_version, usable_processors, versions
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
@@ -177,12 +175,10 @@ def report(results: Sequence[CaseResult], dtype: torch.dtype) -> dict[str, Any]:
 
 def machine() -> dict[str, str | int]:
     """Describe the processor, the cores that this process may use, threads, and versions."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    installed = importlib.util.find_spec("gsplat") is not None
     return {
         **versions(),
-        "gsplat": metadata.version("gsplat") if installed else "not installed",
-        "cores": cores,
+        "gsplat": installed_version("gsplat") or "not installed",
+        "cores": usable_processors(),
         "threads": torch.get_num_threads(),
     }
 

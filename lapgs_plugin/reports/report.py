@@ -11,7 +11,7 @@ import jinja2
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -118,7 +118,9 @@ def write_report(
         view_rows=view_rows,
         settings=_settings(run),
     )
-    return write_page(run.archive.path(REPORT), page)
+    path = run.archive.path(REPORT)
+    write_text(path, page)
+    return path
 
 
 def render_page(template: str, **values: Any) -> str:
@@ -131,17 +133,6 @@ def render_page(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(values, inset_at=INSET_AT)
-
-
-def write_page(path: Path, page: str) -> Path:
-    """Write a page, whole or not at all.
-
-    Raises:
-        RunFolderError: it cannot be written.
-    """
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(page.encode())
-    return path
 
 
 # Charts of training.

@@ -81,7 +81,7 @@ class InitialView:
         """Begin in front of a field with unknown cameras, with the up direction of COLMAP's images."""
         means = field.means.detach().cpu().double().numpy()
         centre = np.median(means, axis=0)
-        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.8))
+        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.8)) or 1.0  # all at one place
         position = centre - np.array([0.0, 0.0, 2.5 * radius])
         return cls(position, centre, np.array([0.0, -1.0, 0.0]), math.radians(50.0))
 

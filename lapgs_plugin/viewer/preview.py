@@ -60,7 +60,8 @@ def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> No
         start: the initial view.
     """
     with _logged(archive.path()):
-        from lapgs_plugin.viewer.pictures import PictureSettings, as_bytes, draw
+        from lapgs_plugin.rendering.images import as_bytes
+        from lapgs_plugin.viewer.pictures import PictureSettings, draw
 
         picture = draw(shown, None, start.camera(*SIZE), PictureSettings(), distance=1.0, zoom=1.0)
         manifest = archive.manifest

@@ -16,10 +16,11 @@ import viser
 from numpy.typing import NDArray
 
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.rendering.images import as_bytes
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.viewer.controls import Controls
 from lapgs_plugin.viewer.pacing import TARGET_SECONDS, Pacing
-from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw
 from lapgs_plugin.viewer.poses import InitialView, Pose, orbit_distance
 
 MAX_SIDE = 2048

@@ -130,7 +130,7 @@ coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 def test_arrows_begin_and_point_where_the_axes_say(
     ends: list[tuple[tuple[float, float], tuple[float, float]]],
 ) -> None:
-    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr, head=4.0)
+    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr)
     right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
     top = float(chart.y_ticks[-1].label)
     for arrow, (start, end) in zip(chart.arrows, ends, strict=True):
