@@ -226,7 +226,7 @@ class CudaExtension:
 
 
 class _ScreenPoints(torch.autograd.Function):
-    """(n, 2) centres in pixels -> (n, columns) zeros for the extension's screen-space points.
+    """Map (n, 2) centres in pixels to (n, columns) zeros for the extension's screen-space points.
 
     Their gradient is by normalised device coordinates, in which the image is 2 wide and high.
     """

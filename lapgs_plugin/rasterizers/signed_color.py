@@ -36,7 +36,7 @@ PROBE_TOLERANCE = 1e-3
 
 
 class ColorPath(Enum):
-    """How the colours of a signed field are computed: by the extension, or by PyTorch before it."""
+    """Say what computes the colours of a signed field: the extension, or PyTorch before it."""
 
     NATIVE = "native"
     PRECOMPUTED = "precomputed"
