@@ -87,14 +87,14 @@ def one_line_errors(path: Path, action: str = "written", *, training: bool = Fal
         raise RunFolderError(f"{path} cannot be {action}: {error.strerror or error}; {advice}") from error
 
 
-def write_file(path: Path, content: str | bytes, *, training: bool = False) -> None:
-    """Replace a file, whole or not at all; `training` as in `one_line_errors`.
+def write_text(path: Path, text: str, *, training: bool = False) -> None:
+    """Write a text file, whole or not at all.
 
     Raises:
-        RunFolderError: it cannot be written.
+        RunFolderError: see `one_line_errors`.
     """
     with one_line_errors(path, training=training), atomic_write(path) as stream:
-        stream.write(content.encode() if isinstance(content, str) else content)
+        stream.write(text.encode())
 
 
 def require_manifest(folder: Path) -> None:

@@ -12,7 +12,7 @@ import typer
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.files import write_file
+from lapgs_plugin.files import write_text
 from lapgs_plugin.runs.layout import RUN_CONFIG
 from lapgs_plugin.training.strategies import AUTO, GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_toml
@@ -87,7 +87,7 @@ def extend_config(path: Path, iterations: int, extended: int, strategy: str) -> 
         line = f"iterations = {iterations}  # the last {extended} extended the finished run"
         text = re.sub(r"(?m)^iterations = .*$", line, path.read_text(encoding="utf-8"))
         text = re.sub(r'(?m)^strategy = "auto"$', f"strategy = {json.dumps(strategy)}", text)
-        write_file(path, text)
+        write_text(path, text)
 
 
 def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
@@ -109,4 +109,4 @@ def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
             continue
         text = json.dumps(str(value.absolute()) if isinstance(value, Path) else value, ensure_ascii=False)
         lines.append(f"{name.replace('_', '-')} = {text}")
-    write_file(path, "\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")

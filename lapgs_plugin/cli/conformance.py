@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -50,7 +51,7 @@ def conformance(
     found = {subject.name: list(check(subject, cases)) for subject in subjects}
     failed = any(outcome.problems for outcomes in found.values() for outcome in outcomes)
     if as_json:
-        print(json.dumps({name: [item.as_dict() for item in outcomes] for name, outcomes in found.items()}, indent=1))
+        print(json.dumps({name: [asdict(item) for item in outcomes] for name, outcomes in found.items()}, indent=1))
     else:
         for subject in subjects:
             _print(subject, found[subject.name])

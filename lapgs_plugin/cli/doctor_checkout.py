@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
+from lapgs_plugin.environment import is_installed
 from lapgs_plugin.environment.findings import Finding
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
@@ -80,7 +80,7 @@ def _others(path: Path, scripts: list[str]) -> list[Finding]:
 def _rasterizer(use: RasterizerUse) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
-    if _installed(use.module):
+    if is_installed(use.module):
         return Finding(use.module, "ok", detail)
     return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
 
@@ -93,7 +93,7 @@ def _packages(source: CheckoutSource) -> list[Finding]:
     """Return packages that the script cannot do without and that are not installed."""
     needed = {one.name.partition(".")[0]: one for one in reversed(source.externals) if not one.optional}
     known = sys.stdlib_module_names | {module.partition(".")[0] for module in source.rasterizer_modules}
-    missing = {name: one for name, one in needed.items() if name not in known and not _installed(name)}
+    missing = {name: one for name, one in needed.items() if name not in known and not is_installed(name)}
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
     return [Finding(name, "absent", f"{one.where} imports it; not installed") for name, one in sorted(missing.items())]
@@ -131,10 +131,3 @@ def _stand_in(source: CheckoutSource) -> Finding:
         return Finding("--device cpu", "ok", f"stand-in {adapter_class(source.root).stand_in_for(source.root, ())}")
     except MissingExtraError as error:
         return Finding("--device cpu", "absent", str(error))
-
-
-def _installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):
-        return False

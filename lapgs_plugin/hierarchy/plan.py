@@ -40,7 +40,7 @@ more time than it gains, in a short run it is needed."""
 
 
 class Hierarchy(str, Enum):
-    """What the field of each level but the coarsest represents."""
+    """Say what the field of each level but the coarsest represents."""
 
     NESTED = "nested"
     """The whole image: the coarser level's field, trained further at the finer size."""
@@ -66,7 +66,7 @@ def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: which level is trained, at what size, for how long.
+    """Describe one stage: which level is trained, at what size, for how long.
 
     Attributes:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
@@ -83,7 +83,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """The stages of a run in training order, coarsest first.
+    """List the stages of a run in training order, coarsest first.
 
     Attributes:
         stages: one per level.

@@ -24,7 +24,7 @@ from lapgs_plugin.checkouts.attachment import Attachment, Replacement, of_class
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.files import BARE_RECORD, write_file
+from lapgs_plugin.files import BARE_RECORD, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_rendering import StageRendering
@@ -71,7 +71,7 @@ class BareRunRecorder:
         if self._call is None or self._began is None:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
         path = Path(self._call.dataset.model_path) / BARE_RECORD
-        write_file(path, json.dumps(self._record(), indent=2) + "\n")
+        write_text(path, json.dumps(self._record(), indent=2) + "\n")
         logger.info("recorded: %s", path)
 
     def _replacements(self) -> list[Replacement]:

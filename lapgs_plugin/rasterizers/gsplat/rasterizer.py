@@ -117,7 +117,7 @@ class GsplatRasterizer:
             raise UserInputError(
                 f"means is {means.dtype} on {means.device}, expected float32 on {self._device}; use .to()"
             )
-        return self._render(field, [camera], background, sh_degree, self._absgrad)
+        return self._render(field, [camera], background, sh_degree)
 
     @property
     def can_batch(self) -> bool:
@@ -135,7 +135,7 @@ class GsplatRasterizer:
     ) -> RenderResult:
         """Render several cameras in one set of launches; see `fields.rasterizer.BatchRasterizer`."""
         if describes:
-            return self._render(field, cameras, background, sh_degree, self._absgrad)
+            return self._render(field, cameras, background, sh_degree)
         image = self._images(field, cameras, background, sh_degree)
         centres = field.means.new_zeros(len(cameras), 0, 2)
         return RenderResult(image, None, centres[..., 0].int(), centres)
@@ -172,10 +172,10 @@ class GsplatRasterizer:
         return self._may_be_direct and (self._must_be_direct or direct_works())
 
     def _render(
-        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None, absgrad: bool
+        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
     ) -> RenderResult:
         """Render cameras of one size with radii and centres."""
-        degree = degree_to_evaluate(field, sh_degree)
+        degree, absgrad = degree_to_evaluate(field, sh_degree), self._absgrad
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad)
         if self._direct:
@@ -201,11 +201,8 @@ def _without_gaussians(
     field: GaussianField, cameras: Sequence[Camera], background: Tensor, absgrad: bool
 ) -> RenderResult:
     """Return the result for a field of no Gaussians: the background."""
-    leading, size, means = (
-        (len(cameras),) if len(cameras) > 1 else (),
-        (cameras[0].height, cameras[0].width),
-        field.means,
-    )
+    leading, means = (len(cameras),) if len(cameras) > 1 else (), field.means
+    size = cameras[0].height, cameras[0].width
     means2d = means.new_zeros(*leading, 0, 2).requires_grad_(is_differentiated(field))
     absgrad2d = means.new_zeros(*leading, 0, 2) if means2d.requires_grad and absgrad else None
     # Zero, but in the graph: a loss of the image can be differentiated by the empty parameters.
