@@ -52,7 +52,7 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
     photos, masks = tmp_path / "photos", tmp_path / "masks"
     photos.mkdir()
     hidden = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    hidden[:, 120:] = 1
+    hidden[:, SIZE[0] // 3 :] = 1
     for index in range(4):
         picture, mask = Image.fromarray(_pixels(index)), hidden
         if index == 1:
@@ -71,7 +71,7 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
     result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
     assert len(result.registered) == 4
     model = pycolmap.Reconstruction(out / "sparse" / "0")
-    assert _centre_errors(model).max() < 0.02  # seen 4.4e-3
+    assert _centre_errors(model).max() < 0.02  # seen 7.4e-4
     scene = load_scene(out, progress=False)
     by_name = {view.name: view for view in scene.train}
     assert sorted(by_name) == ["00.png", "01.jpg", "02.jpg", "03.png"]
