@@ -77,31 +77,16 @@ def raster(
 
 
 def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> list[CaseResult]:
-    """Measure all cases, with a progress bar of estimated time."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    """Measure all cases, with a progress bar."""
+    from lapgs_plugin.evaluation.bench_raster import contender_names, planned_turns, run_case
+    from lapgs_plugin.progress import item_progress
 
-    from lapgs_plugin.evaluation.bench_raster import planned_cost, run_case
+    turns = sum(len(planned_turns(case, repeats, contender_names(dtype))) for case in cases)
+    with item_progress("turns") as progress:
+        task = progress.add_task("preparing", total=turns)
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("preparing", total=sum(planned_cost(case, repeats, dtype) for case in cases))
-
-        def advance(name: str, cost: float) -> None:
-            progress.update(task, description=f"{case.name} {name}", advance=cost)
+        def advance(name: str) -> None:
+            progress.update(task, description=f"{case.name} {name}", advance=1)
 
         results = []
         for case in cases:

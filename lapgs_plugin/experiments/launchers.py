@@ -236,7 +236,7 @@ _KINDS: dict[str, type[Launcher]] = {"local": LocalLauncher, "slurm": SlurmLaunc
 
 def _slots(order: WorkOrder) -> list[Slot]:
     """Divide this machine among the workers."""
-    gpus = visible_gpus() if order.settings.gpus is None else order.settings.gpus.split(",")
+    gpus = visible_gpus() if order.settings.gpus is None else _names(order.settings.gpus)
     count = order.settings.workers or max(1, len(gpus))
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [tuple(cores[i * len(cores) // count : (i + 1) * len(cores) // count]) for i in range(count)]
@@ -247,7 +247,12 @@ def visible_gpus() -> list[str]:
     """Return a value of CUDA_VISIBLE_DEVICES for each of this machine's GPUs."""
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:
-        return [name for name in chosen.split(",") if name.strip()]
+        return _names(chosen)
     listed, _ = run_program(["nvidia-smi", "-L"])
     lines = [line for line in listed.splitlines() if line.startswith("GPU ")]
     return [str(number) for number in range(len(lines))]
+
+
+def _names(text: str) -> list[str]:
+    """Return the names in a list such as "0, 1"."""
+    return [name.strip() for name in text.split(",") if name.strip()]

@@ -25,6 +25,7 @@ from lapgs_plugin.reports.report import (
     MeasuredRun,
     ViewRow,
     count_text,
+    number_text,
     render_page,
     seconds_text,
     training_charts,
@@ -225,7 +226,7 @@ def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
 def _breakdown(results: Results) -> BarChart | None:
     """Draw milliseconds an iteration by part, means over scenes and seeds."""
     names = {f"{part}_ms": part for part in PARTS}
-    return _bars(results, "An iteration", names, lambda value: f"{value:.3g} ms")
+    return _bars(results, "An iteration", names, lambda value: f"{number_text(value)} ms")
 
 
 def _overhead(results: Results) -> BarChart | None:

@@ -50,7 +50,7 @@ def starts(tmp_path: Path) -> Counter[str]:
 
 def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
     code = COPY.replace(START, NOTE_ENVIRONMENT)
-    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus="3,5")
+    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus="3, 5")
     outcomes = run_all(work_order, lambda: launch(work_order))
     assert [outcome.state for outcome in outcomes] == [DONE] * 6
     assert set((tmp_path / "started-gpus").read_text().split()) == {"3", "5"}

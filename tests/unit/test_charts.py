@@ -22,6 +22,7 @@ from lapgs_plugin.reports.charts import (
     draw_bars,
     draw_lines,
 )
+from lapgs_plugin.reports.report import number_text
 
 LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
 WIDTH, HEIGHT = WHOLE.width, WHOLE.height
@@ -120,6 +121,14 @@ def test_nothing_runs_behind_an_inset(curves: list[list[tuple[float, float]]]) -
             for share in (0.0, 0.25, 0.5, 0.75, 1.0):
                 x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
                 assert x < INSET_AT[0] - 0.1 or y < INSET_AT[1]  # y counts downwards
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, "0"), (0.01234, "0.0123"), (12.34, "12.3"), (999.4, "999"), (999.7, "1,000"), (1234.5, "1,234")],
+)
+def test_numbers_have_three_digits_or_all_before_the_point(value: float, expected: str) -> None:
+    assert number_text(value) == expected
 
 
 coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
