@@ -87,6 +87,16 @@ def one_line_errors(path: Path, action: str = "written", *, training: bool = Fal
         raise RunFolderError(f"{path} cannot be {action}: {error.strerror or error}; {advice}") from error
 
 
+def write_text(path: Path, text: str, *, training: bool = False) -> None:
+    """Write a text file, whole or not at all.
+
+    Raises:
+        RunFolderError: see `one_line_errors`.
+    """
+    with one_line_errors(path, training=training), atomic_write(path) as stream:
+        stream.write(text.encode())
+
+
 def require_manifest(folder: Path) -> None:
     """Check that a folder holds a run, without reading it or importing anything heavy.
 

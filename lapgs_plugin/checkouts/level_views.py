@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, cast
 
 import numpy as np
 import torch
@@ -213,9 +213,9 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
         return None if opaque else _shrunk(value, size)  # without a mask loops save a pass over the image
     if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
         return type(value)(size if tuple(value) == full else size[::-1])
-    if isinstance(value, (int, float)) and name.lower() in SCALED:
-        axis = SCALED[name.lower()]
-        return type(value)(value * size[axis] / full[axis]) if value != full[axis] else size[axis]
+    if isinstance(value, (int, float, np.number)) and name.lower() in SCALED:
+        axis, kind = SCALED[name.lower()], cast("Any", type(value))
+        return kind(float(value) * size[axis] / full[axis]) if value != full[axis] else size[axis]
     return value
 
 

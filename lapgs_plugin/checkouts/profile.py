@@ -81,9 +81,9 @@ class Profile:
         self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
         self.renderers = tuple(self._find_renderers())
         self.density_control = tuple(sorted(_changing(self.model)))
-        self._model_call = self._first_call(self._script_names(self.model))
-        self._scene_call = self._first_call(self._script_names(self.scene))
-        self._loop_call = self._first_call({n for f in self.renderers for n in (*self._script_names(f), f.__name__)})
+        self._model_call = self._first_call(self.script_names(self.model))
+        self._scene_call = self._first_call(self.script_names(self.scene))
+        self._loop_call = self._first_call({n for f in self.renderers for n in (*self.script_names(f), f.__name__)})
         self.loop_renderer = self._find_loop_renderer()
         self.rasterizers = tuple(self._find_rasterizers())
 
@@ -101,6 +101,10 @@ class Profile:
     def named(self, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name of these that it holds."""
         return [(module, name) for name in names for module in self.modules if name in vars(module)]
+
+    def script_names(self, value: Any) -> set[str]:
+        """Return the names by which the script knows an object."""
+        return {name for name, held in vars(self.script.module).items() if held is value}
 
     def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
@@ -240,10 +244,6 @@ class Profile:
                 if isinstance(value, type) and value.__module__ in names and id(value) not in seen:
                     seen.add(id(value))
                     yield value
-
-    def _script_names(self, value: Any) -> set[str]:
-        """Return the names by which the script knows an object."""
-        return {name for name, held in vars(self.script.module).items() if held is value}
 
     def _first_call(self, names: Container[str]) -> ast.Call | None:
         """Return the training function's first call of one of these names, if possible one that gradients come from.

@@ -44,11 +44,20 @@ class TrainingCall:
         """Return the call `function(*args, **kwargs)`, defaults included.
 
         Raises:
-            UserInputError: no argument says which scene, or for how many iterations.
+            UserInputError: no argument says which scene, or for how many iterations; or there are some without a name.
         """
-        bound = inspect.signature(function).bind(*args, **kwargs)
+        signature = inspect.signature(function)
+        bound = signature.bind(*args, **kwargs)
         bound.apply_defaults()
         values = dict(bound.arguments)
+        for name, parameter in signature.parameters.items():
+            if parameter.kind is parameter.VAR_KEYWORD:
+                values |= values.pop(name)
+            elif parameter.kind is parameter.VAR_POSITIONAL and (unnamed := values.pop(name)):
+                raise UserInputError(
+                    f"{function.__name__}() of the script got {len(unnamed)} argument(s) in *{name}, expected all by "
+                    "name; `lapgs run --off` runs the script as it is"
+                )
         found = {
             role: next((name for name, value in values.items() if any(hasattr(value, a) for a in attributes)), None)
             for role, attributes in ROLES.items()

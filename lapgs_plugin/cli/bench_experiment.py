@@ -223,6 +223,7 @@ def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Folder
     from lapgs_plugin.experiments.aggregate import make_table
     from lapgs_plugin.experiments.store import FAILED, ResultStore
     from lapgs_plugin.experiments.tables import latex, markdown
+    from lapgs_plugin.files import write_text
 
     store = ResultStore(folder.store)
     outcomes = {o.run_id: o for o in store.outcomes({run.spec.run_id for run in planned})}
@@ -232,8 +233,8 @@ def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Folder
     except RunFolderError as error:
         raise RunFolderError(f"{folder.store}: {error}") from None
     text = markdown(table)
-    exports.write_text(folder.path / exports.MARKDOWN, text)
-    exports.write_text(folder.path / exports.LATEX, latex(table))
+    write_text(folder.path / exports.MARKDOWN, text)
+    write_text(folder.path / exports.LATEX, latex(table))
     _write_rows(experiment, planned, records, folder.path)
     console = make_console()
     console.print(Markdown(text)) if console.is_terminal else print(text)

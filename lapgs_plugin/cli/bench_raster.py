@@ -65,44 +65,28 @@ def raster(
     import torch
 
     from lapgs_plugin.evaluation import bench_raster
-    from lapgs_plugin.files import atomic_write
+    from lapgs_plugin.files import write_text
 
     precision: torch.dtype = getattr(torch, dtype)
     results = _measure(bench_raster.parse_cases(sizes), repeats, precision)
     _print_results(results)
     if json_file is not None:
-        with atomic_write(json_file) as stream:
-            stream.write(json.dumps(bench_raster.report(results, precision), indent=2).encode())
+        write_text(json_file, json.dumps(bench_raster.report(results, precision), indent=2))
     if check and any(result.missed for result in results):
         raise typer.Exit(1)
 
 
 def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> list[CaseResult]:
-    """Measure all cases, with a progress bar of estimated time."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    """Measure all cases, with a progress bar."""
+    from lapgs_plugin.evaluation.bench_raster import contender_names, planned_turns, run_case
+    from lapgs_plugin.progress import item_progress
 
-    from lapgs_plugin.evaluation.bench_raster import planned_cost, run_case
+    turns = sum(len(planned_turns(case, repeats, contender_names(dtype))) for case in cases)
+    with item_progress("turns") as progress:
+        task = progress.add_task("preparing", total=turns)
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("preparing", total=sum(planned_cost(case, repeats, dtype) for case in cases))
-
-        def advance(name: str, cost: float) -> None:
-            progress.update(task, description=f"{case.name} {name}", advance=cost)
+        def advance(name: str) -> None:
+            progress.update(task, description=f"{case.name} {name}", advance=1)
 
         results = []
         for case in cases:

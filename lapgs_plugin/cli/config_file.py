@@ -12,12 +12,11 @@ import typer
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import write_text
+from lapgs_plugin.runs.layout import RUN_CONFIG
 from lapgs_plugin.training.strategies import AUTO, GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_toml
 
-RUN_CONFIG = "run.toml"
-"""File of a run folder with the options that made the run."""
 OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
 """Parameters that say where a run goes and how it is started, not what it is."""
 
@@ -88,8 +87,7 @@ def extend_config(path: Path, iterations: int, extended: int, strategy: str) -> 
         line = f"iterations = {iterations}  # the last {extended} extended the finished run"
         text = re.sub(r"(?m)^iterations = .*$", line, path.read_text(encoding="utf-8"))
         text = re.sub(r'(?m)^strategy = "auto"$', f"strategy = {json.dumps(strategy)}", text)
-        with one_line_errors(path), atomic_write(path) as file:
-            file.write(text.encode())
+        write_text(path, text)
 
 
 def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
@@ -111,5 +109,4 @@ def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
             continue
         text = json.dumps(str(value.absolute()) if isinstance(value, Path) else value, ensure_ascii=False)
         lines.append(f"{name.replace('_', '-')} = {text}")
-    with atomic_write(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    write_text(path, "\n".join(lines) + "\n")

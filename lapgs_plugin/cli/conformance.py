@@ -42,6 +42,7 @@ def conformance(
     gsplat compiles its CUDA code at first use, which takes minutes. The exit code is 1 if a check fails.
     """
     import json
+    from dataclasses import asdict
 
     from lapgs_plugin.evaluation.conformance import check, conformance_cases
 
@@ -50,7 +51,7 @@ def conformance(
     found = {subject.name: list(check(subject, cases)) for subject in subjects}
     failed = any(outcome.problems for outcomes in found.values() for outcome in outcomes)
     if as_json:
-        print(json.dumps({name: [item.as_dict() for item in outcomes] for name, outcomes in found.items()}, indent=1))
+        print(json.dumps({name: [asdict(item) for item in outcomes] for name, outcomes in found.items()}, indent=1))
     else:
         for subject in subjects:
             _print(subject, found[subject.name])

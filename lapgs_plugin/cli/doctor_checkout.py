@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lapgs_plugin.environment import is_installed
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _rasterizer(use: RasterizerUse) -> Finding:
 
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
-    if _installed(use.module):
+    if is_installed(use.module):
         return Finding(use.module, "ok", detail)
     return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
 
@@ -108,7 +108,7 @@ def _packages(source: CheckoutSource) -> list[Finding]:
 
     needed = {one.name.partition(".")[0]: one for one in reversed(source.externals) if not one.optional}
     known = sys.stdlib_module_names | {module.partition(".")[0] for module in source.rasterizer_modules}
-    missing = {name: one for name, one in needed.items() if name not in known and not _installed(name)}
+    missing = {name: one for name, one in needed.items() if name not in known and not is_installed(name)}
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
     return [Finding(name, "absent", f"{one.where} imports it; not installed") for name, one in sorted(missing.items())]
@@ -155,10 +155,3 @@ def _stand_in(source: CheckoutSource) -> Finding:
         return Finding("--device cpu", "ok", f"stand-in {adapter_class(source.root).stand_in_for(source.root, ())}")
     except MissingExtraError as error:
         return Finding("--device cpu", "absent", str(error))
-
-
-def _installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):
-        return False

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
-from lapgs_plugin.cli.config_file import RUN_CONFIG, ConfigOption, extend_config, write_config
+from lapgs_plugin.cli.config_file import ConfigOption, extend_config, write_config
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option, option_values
+from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
@@ -307,7 +308,7 @@ def _run(
         monitor: Monitor = opened.enter_context(ProgressMonitor(console, manifest.levels))
         if control.log is not None:
             plan = make_plan(scene.smallest_size, settings, len(scene.train))
-            monitor = opened.enter_context(TensorboardMonitor(archive.path("tensorboard"), plan, monitor))
+            monitor = opened.enter_context(TensorboardMonitor(archive.path(TENSORBOARD), plan, monitor))
         trainer = Trainer(
             scene=scene,
             settings=settings,

@@ -38,6 +38,14 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
+def is_installed(module: str) -> bool:
+    """Return whether a module can be found; of a dotted name, the outer packages are imported."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
 def processor_name() -> str:
     """Return the processor's model name, or its architecture."""
     try:
@@ -46,6 +54,11 @@ def processor_name() -> str:
         return platform.processor() or platform.machine()
     model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
     return model[1] if model else platform.machine()
+
+
+def usable_processors() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpus_are_hidden() -> bool:

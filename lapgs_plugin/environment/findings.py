@@ -16,7 +16,14 @@ from pathlib import Path
 import packaging.requirements
 from packaging.version import Version
 
-from lapgs_plugin.environment import PACKAGE, gsplat_built, installed_version, processor_name, run_program
+from lapgs_plugin.environment import (
+    PACKAGE,
+    gsplat_built,
+    installed_version,
+    processor_name,
+    run_program,
+    usable_processors,
+)
 from lapgs_plugin.environment.probes import Probe, first_line, run_probe
 
 OLDEST_PYTHON = (3, 10)
@@ -78,7 +85,7 @@ def system_findings() -> list[Finding]:
         f"use Python {wanted} or newer" if old else "",
     )
     memory = _memory_gib()
-    machine = f"{processor_name()}, {_usable_processors()} cores usable"
+    machine = f"{processor_name()}, {usable_processors()} cores usable"
     return [
         python,
         Finding("System", "ok", platform.platform(terse=True)),
@@ -256,10 +263,6 @@ def _package_finding(requirement: Requirement) -> Finding:
 def _own(requirement: packaging.requirements.Requirement, extra: str) -> Requirement:
     minimum = next((bound.version for bound in requirement.specifier if bound.operator == ">="), "")
     return Requirement(requirement.name, f"{requirement.name}{requirement.specifier}", minimum, extra)
-
-
-def _usable_processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _memory_gib() -> float | None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +19,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import blend_gradients, direct
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blended, Gradients, ToBlend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape
@@ -75,32 +76,22 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
 def random_views(width: int, height: int, gaussians: int, views: int) -> tuple[GaussianField, list[Camera]]:
     """Return the random field of `lapgs bench raster`, and cameras that each see it from a little aside."""
     scene = make_scene(width, height, gaussians, torch.float32)
-    cameras = []
-    for view in range(views):
-        pose = torch.eye(4)
+    poses = [torch.eye(4) for _ in range(views)]
+    for view, pose in enumerate(poses):
         pose[0, 3] = 0.02 * view
-        focal = scene.camera.fx
-        cameras.append(Camera(width, height, focal, focal, width / 2, height / 2, pose))
-    return scene.field, cameras
+    return scene.field, [replace(scene.camera, world_to_camera=pose) for pose in poses]
 
 
 def views_around(field: GaussianField, width: int, height: int, views: int) -> list[Camera]:
     """Return cameras on a circle around the middle of a field that look at it from the median distance."""
-    middle = field.means.median(0).values
-    distance = float((field.means - middle).norm(dim=-1).median())
-    cameras = []
-    for view in range(views):
-        angle = 2 * math.pi * view / views
-        forward = torch.tensor([-math.sin(angle), 0.3, math.cos(angle)])
-        forward = forward / forward.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-        right = right / right.norm()
-        pose = torch.eye(4)
-        pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ (middle - distance * forward)
-        focal = 0.9 * max(width, height)
-        cameras.append(Camera(width, height, focal, focal, width / 2, height / 2, pose))
-    return cameras
+    means = field.means.double().numpy()
+    middle = np.median(means, axis=0)
+    distance = float(np.median(np.linalg.norm(means - middle, axis=1)))
+    focal = 0.9 * max(width, height)
+    lens = Camera(width, height, focal, focal, width / 2, height / 2, torch.eye(4))
+    angles = 2 * np.pi * np.arange(views) / views
+    ahead = [unit(np.array([-np.sin(angle), 0.3, np.cos(angle)])) for angle in angles]
+    return [looking(lens, middle - distance * each, middle, np.array([0.0, -1.0, 0.0])) for each in ahead]
 
 
 @torch.no_grad()

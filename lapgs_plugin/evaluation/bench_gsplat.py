@@ -52,14 +52,18 @@ class GsplatTorchRasterizer:
         assert not field.signed
         degree = field.sh_degree if sh_degree is None else sh_degree
         size = camera.width, camera.height
-        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]  # (1, 3, 3)
         directions = field.means - camera.position  # (n, 3)
         colors = _torch_impl._spherical_harmonics(degree, directions, field.sh)  # (n, 3)
         covariances, _ = _torch_impl._quat_scale_to_covar_preci(
             field.quaternions, field.log_scales.exp(), compute_preci=False
         )  # (n, 3, 3)
         radii, means2d, depths, conics, _ = _torch_impl._fully_fused_projection(
-            field.means, covariances, camera.world_to_camera[None], intrinsics, *size, near_plane=NEAR_DEPTH
+            field.means,
+            covariances,
+            camera.world_to_camera[None],
+            camera.intrinsics[None],
+            *size,
+            near_plane=NEAR_DEPTH,
         )  # (1, n, 2), (1, n, 2), (1, n), (1, n, 3)
         screen = means2d[0]  # (n, 2)
         if screen.requires_grad:

@@ -7,7 +7,6 @@ turns, so that a change in the machine's load affects all of them. Ratios are of
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -15,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -24,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.environment import versions
+from lapgs_plugin.environment import installed_version, usable_processors, versions
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
@@ -46,8 +44,6 @@ MAX_MEMORY = 1.5e9
 FAST_ITERATIONS = 3
 """Timed iterations of the fast contender in each turn; an untimed one before them fills the caches."""
 LEARNING_RATE = 1e-6  # so small that the scene keeps its statistics
-RELATIVE_COST = {FAST: 1.0 + FAST_ITERATIONS, ORACLE: 27.0, GSPLAT: 80.0}
-"""Approximate length of a turn in iterations of the fast contender, for the progress bar."""
 GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
 """Slow contenders take part in as many turns as add up to this many Gaussians, at least in one."""
 
@@ -177,12 +173,10 @@ def report(results: Sequence[CaseResult], dtype: torch.dtype) -> dict[str, Any]:
 
 def machine() -> dict[str, str | int]:
     """Describe the processor, the cores that this process may use, threads, and versions."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    installed = importlib.util.find_spec("gsplat") is not None
     return {
         **versions(),
-        "gsplat": metadata.version("gsplat") if installed else "not installed",
-        "cores": cores,
+        "gsplat": installed_version("gsplat") or "not installed",
+        "cores": usable_processors(),
         "threads": torch.get_num_threads(),
     }
 
@@ -243,14 +237,20 @@ def _fast(scene: BenchScene) -> _Contender:
     )
 
 
+def contender_names(dtype: torch.dtype) -> list[str]:
+    """Return the contenders that can run here, the fast one first."""
+    has_gsplat = importlib.util.find_spec("gsplat") is not None and dtype == torch.float32
+    return [FAST, ORACLE, *([GSPLAT] if has_gsplat else [])]
+
+
 def _contenders(scene: BenchScene) -> dict[str, _Contender]:
-    """Make all contenders that can run here, the fast one first."""
+    """Make the contenders of `contender_names`."""
 
     def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
         return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=ADAM_EPS)
 
     found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
-    if importlib.util.find_spec("gsplat") is not None and scene.target.dtype == torch.float32:
+    if GSPLAT in contender_names(scene.target.dtype):
         from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
 
         found[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
@@ -273,13 +273,13 @@ def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> lis
 
 
 def run_case(
-    case: BenchCase, turns: int, dtype: torch.dtype, advance: Callable[[str, float], None] = lambda name, cost: None
+    case: BenchCase, turns: int, dtype: torch.dtype, advance: Callable[[str], None] = lambda name: None
 ) -> CaseResult:
     """Measure one case.
 
     Args:
         turns: of the fast contender, each with `FAST_ITERATIONS` timed iterations; slow ones get fewer in large cases.
-        advance: called after each turn with the contender's name and its cost, see `planned_cost`.
+        advance: called after each turn with the contender's name.
     """
     scene = make_scene(case.width, case.height, case.gaussians, dtype)
     contenders = _contenders(scene)
@@ -293,7 +293,7 @@ def run_case(
         timed[name] += [contender.iteration() for _ in range(FAST_ITERATIONS if name == FAST else 1)]
         if name == GSPLAT:
             tile_loops.append(contender.rasterizer.tile_loop_seconds)
-        advance(name, RELATIVE_COST[name] * case.gaussians)
+        advance(name)
     totals = {name: median(sum(parts.values()) for parts in runs) for name, runs in timed.items()}
     loss = median(parts["loss"] for parts in timed[FAST])
     return CaseResult(
@@ -306,14 +306,6 @@ def run_case(
         gsplat_tile_loop=1e3 * median(tile_loops) if tile_loops else None,
         peak_memory=peak_memory(case, dtype),
     )
-
-
-def planned_cost(case: BenchCase, turns: int, dtype: torch.dtype) -> float:
-    """Return the sum of the costs that `run_case` will report to `advance`."""
-    names = [FAST, ORACLE]
-    if importlib.util.find_spec("gsplat") is not None and dtype == torch.float32:
-        names.append(GSPLAT)
-    return sum(RELATIVE_COST[name] * case.gaussians for name in planned_turns(case, turns, names))
 
 
 def _parts(fast: _Contender, repeats: int) -> dict[str, float]:

@@ -9,8 +9,7 @@ rasterizer differs by design is all band.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -129,9 +128,6 @@ class Outcome:
     band_error: float = 0.0
     band_gaussians: int = 0
     problems: tuple[str, ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,11 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         mask: (1, h, w) bool or weights in [0, 1] of the pixels; None counts all.
     """
     squares = (image.detach().clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).double().square()
-    mse = float(squares.mean() if mask is None else (squares * mask).sum() / (len(squares) * mask.sum()))
+    return psnr_of(float(squares.mean() if mask is None else (squares * mask).sum() / (len(squares) * mask.sum())))
+
+
+def psnr_of(mse: float) -> float:
+    """Return the peak signal-to-noise ratio in dB of a mean squared error of intensities in [0, 1], at most 100."""
     return -10.0 * math.log10(max(mse, SMALLEST_MSE))
 
 

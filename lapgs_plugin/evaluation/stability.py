@@ -8,7 +8,6 @@ compare fields of one scene along one path, followed by the same depth.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import require_complete
-from lapgs_plugin.evaluation.metrics import SMALLEST_MSE
+from lapgs_plugin.evaluation.metrics import psnr_of
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.composition import to_full_size
@@ -79,7 +78,7 @@ class Flicker:
     @property
     def psnr(self) -> float:
         """PSNR in dB of all differences together, at most 100."""
-        return -10.0 * math.log10(max(self.squared / max(self.values, 1), SMALLEST_MSE))
+        return psnr_of(self.squared / max(self.values, 1))
 
 
 def measure_flicker(frames: Iterable[Frame]) -> tuple[dict[str, Flicker], float]:

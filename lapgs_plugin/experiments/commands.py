@@ -135,15 +135,13 @@ def run_steps(
     """
     if checkout is None:
         steps = [Step(_train(spec, scene, folder), str(folder.parent))]
-        measured = folder
     else:
         bare = spec.method == "bare"
         steps = [Step((*_lapgs_run(spec, bare), *_script(spec, scene, checkout, folder)), str(checkout))]
-        measured = folder / IMPORTED if bare else folder
         if bare and evaluate is not None:
             steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))
     if evaluate is not None:
-        steps.append(Step((*LAPGS, "eval", str(measured), *evaluate), str(folder.parent)))
+        steps.append(Step((*LAPGS, "eval", str(measured_folder(spec, folder)), *evaluate), str(folder.parent)))
     return steps
 
 
@@ -221,10 +219,10 @@ def _import(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[s
 def _raster_options(arguments: Sequence[str]) -> list[str]:
     """Return the script's arguments that affect how a saved field is rendered, the last of each kind."""
     values: dict[str, str] = {}
-    for word, following in zip(arguments, [*arguments[1:], "--"], strict=True):
-        name = word.removeprefix("--")
+    for word, following in zip(arguments, [*arguments[1:], "-"], strict=True):
+        name, assigned, value = word.removeprefix("--").partition("=")
         if word.startswith("--") and name in RASTER_OPTIONS:
-            values[name] = "true" if following.startswith("--") else following
+            values[name] = value if assigned else "true" if following.startswith("-") else following
     return [text for name, value in values.items() for text in ("--set", f"{name}={value}")]
 
 

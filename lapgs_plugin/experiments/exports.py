@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import MissingExtraError, RunFolderError, UserInputError
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import atomic_write, one_line_errors, write_text
 from lapgs_plugin.untrusted import parse_json, shortened
 
 CSV, PARQUET, MARKDOWN, LATEX = "results.csv", "results.parquet", "tables.md", "tables.tex"
+NAMES = ("variant", "baseline", "run", "scene", "backbone")
+"""Columns of names, which every row has; one such as 0.50 is no number."""
 
 Row = Mapping[str, Any]
 
@@ -27,7 +29,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    _write(path, text.getvalue().encode())
+    write_text(path, text.getvalue())
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
@@ -55,22 +57,13 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         pyarrow.parquet.write_table(table, stream)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file.
-
-    Raises:
-        RunFolderError: it cannot be written.
-    """
-    _write(path, text.encode())
-
-
 def columns_of(rows: Sequence[Row]) -> list[str]:
     """Return the columns of all rows, in the order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 def read_csv(path: Path) -> list[dict[str, Any]]:
-    """Read the rows of results.csv, with numbers as numbers and without empty values.
+    """Read the rows of results.csv, with numbers as numbers, names as text, and without empty values.
 
     Raises:
         OSError: the file cannot be read.
@@ -86,7 +79,7 @@ def read_csv(path: Path) -> list[dict[str, Any]]:
     for number, row in enumerate(rows, start=1):
         if row.keys() != expected or None in row.values():
             raise ValueError(f"row {number} has more or fewer cells than the {len(expected)} of the first line")
-    return [{name: _value(text) for name, text in row.items() if text != ""} for row in rows]
+    return [{name: text if name in NAMES else _value(text) for name, text in row.items() if text != ""} for row in rows]
 
 
 def _value(text: str) -> Any:
@@ -95,8 +88,3 @@ def _value(text: str) -> Any:
     except UserInputError:
         return text
     return value if isinstance(value, (int, float)) else text
-
-
-def _write(path: Path, data: bytes) -> None:
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(data)

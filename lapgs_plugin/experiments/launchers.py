@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import subprocess
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from lapgs_plugin.environment import run_program
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.worker import Slot, work
@@ -156,7 +156,6 @@ class SlurmLauncher(Launcher):
             executor.update_parameters(**{"timeout_min": 24 * 60, "name": "lapgs-bench", **options})
         except (NameError, TypeError, ValueError, RuntimeError, AssertionError) as error:
             raise UserInputError(f"--launcher-option: {error}") from error
-        self._failed: list[str] = []
         self._jobs = [
             executor.submit(work, order.store, list(order.run_ids)) for _ in range(order.settings.workers or 1)
         ]
@@ -206,7 +205,9 @@ class RayLauncher(Launcher):
         resources = ray.cluster_resources()
         gpus = float(options.get("num_gpus", 1 if resources.get("GPU") else 0))
         cpus = float(options.get("num_cpus", 1))
-        count = order.settings.workers or max(1, int(resources["GPU"] / gpus if gpus else resources["CPU"] / cpus))
+        count = order.settings.workers or max(
+            1, int(resources.get("GPU", 0) / gpus if gpus else resources["CPU"] / cpus)
+        )
         task = ray.remote(num_gpus=gpus, num_cpus=cpus, max_retries=3)(work)
         self._tasks = [task.remote(order.store, list(order.run_ids)) for _ in range(count)]
 
@@ -235,7 +236,7 @@ _KINDS: dict[str, type[Launcher]] = {"local": LocalLauncher, "slurm": SlurmLaunc
 
 def _slots(order: WorkOrder) -> list[Slot]:
     """Divide this machine among the workers."""
-    gpus = visible_gpus() if order.settings.gpus is None else order.settings.gpus.split(",")
+    gpus = visible_gpus() if order.settings.gpus is None else _names(order.settings.gpus)
     count = order.settings.workers or max(1, len(gpus))
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [tuple(cores[i * len(cores) // count : (i + 1) * len(cores) // count]) for i in range(count)]
@@ -246,9 +247,12 @@ def visible_gpus() -> list[str]:
     """Return a value of CUDA_VISIBLE_DEVICES for each of this machine's GPUs."""
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:
-        return [name for name in chosen.split(",") if name.strip()]
-    if shutil.which("nvidia-smi") is None:
-        return []
-    answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False, timeout=60)
-    lines = [line for line in answer.stdout.splitlines() if line.startswith("GPU ")]
+        return _names(chosen)
+    listed, _ = run_program(["nvidia-smi", "-L"])
+    lines = [line for line in listed.splitlines() if line.startswith("GPU ")]
     return [str(number) for number in range(len(lines))]
+
+
+def _names(text: str) -> list[str]:
+    """Return the names in a list such as "0, 1"."""
+    return [name.strip() for name in text.split(",") if name.strip()]

@@ -15,8 +15,9 @@ from markdown_it import MarkdownIt
 
 from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, read_csv
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
 from lapgs_plugin.experiments.runner import RUNS
+from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
 from lapgs_plugin.reports.pictures import Strip
@@ -24,12 +25,12 @@ from lapgs_plugin.reports.report import (
     MeasuredRun,
     ViewRow,
     count_text,
+    number_text,
     render_page,
     seconds_text,
     training_charts,
     view_strips,
     view_table,
-    write_page,
 )
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import REPORT
@@ -46,8 +47,8 @@ COUNTS = {
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
 
-NAMES, FIGURES = ("variant", "baseline", "run", "scene", "backbone"), ("train_seconds", "gaussians")
-"""Columns with text and with numbers that every row has."""
+FIGURES = ("train_seconds", "gaussians")
+"""Columns with numbers that every row has."""
 
 Row = Mapping[str, Any]
 
@@ -111,7 +112,6 @@ class Results:
                         f"{path}: {shortened(name)} is {shortened(value)}, expected a number; write it again with "
                         "`lapgs bench` and --tables-only"
                     )
-        rows = [{**row, **{name: str(row[name]) for name in NAMES}} for row in rows]
         return cls(folder, rows)
 
     @property
@@ -169,7 +169,8 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
         machines=_machines(results),
     )
-    return write_page(folder / REPORT, page)
+    write_text(folder / REPORT, page)
+    return folder / REPORT
 
 
 def _tables(path: Path) -> tuple[str, str]:
@@ -225,7 +226,7 @@ def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
 def _breakdown(results: Results) -> BarChart | None:
     """Draw milliseconds an iteration by part, means over scenes and seeds."""
     names = {f"{part}_ms": part for part in PARTS}
-    return _bars(results, "An iteration", names, lambda value: f"{value:.3g} ms")
+    return _bars(results, "An iteration", names, lambda value: f"{number_text(value)} ms")
 
 
 def _overhead(results: Results) -> BarChart | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 from lapgs_plugin.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
@@ -10,6 +11,11 @@ GROUPS_BESIDE = 3
 """Data sets or scenes side by side in a LaTeX table, as in the paper."""
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
+TEX = {
+    **{"N_GS": r"$N_{\mathrm{GS}}$", "rho": r"$\rho$"},
+    **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"},
+}
+"""Words and characters in LaTeX, besides the characters that a backslash escapes."""
 SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
 NO_VALUE = "-"
 PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 2K and 4K"
@@ -176,7 +182,4 @@ def _latex_marked(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    text = text.replace("N_GS", "@")
-    for special in "&%#_":
-        text = text.replace(special, f"\\{special}")
-    return text.replace("@", r"$N_{\mathrm{GS}}$").replace("rho", r"$\rho$")
+    return re.sub(r"N_GS|\brho\b|[&%#_${}~^\\]", lambda found: TEX.get(found[0], f"\\{found[0]}"), text)

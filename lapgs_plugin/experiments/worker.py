@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import shutil
 import socket
 import subprocess
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from lapgs_plugin import __version__
-from lapgs_plugin.environment import versions
+from lapgs_plugin.environment import run_program, versions
 from lapgs_plugin.errors import LapgsError, printable
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
@@ -110,7 +109,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
         "wall_seconds": time.perf_counter() - clock,
         "lapgs_version": __version__,
         "torch": versions()["torch"],
-        "gpu": gpu_name(slot.gpu),
+        "gpu": gpu_name(slot),
         "processor": versions()["processor"],
         "host": socket.gethostname(),
         "python": platform.python_version(),
@@ -166,15 +165,14 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
 def last_lines(log: Path) -> str:
     """Return the end of a log without progress bars."""
     text = log.read_text(encoding="utf-8", errors="replace")
-    lines = [line.rsplit("\r", 1)[-1].rstrip() for line in re.split(r"\n", text)]
+    lines = [line.rsplit("\r", 1)[-1].rstrip() for line in text.split("\n")]
     return "\n".join([line for line in lines if line][-LAST_LINES:])
 
 
-def gpu_name(index: str | None) -> str:
-    """Return the name of a slot's GPU, "" without one."""
-    if shutil.which("nvidia-smi") is None:
+def gpu_name(slot: Slot) -> str:
+    """Return the name of the GPU that a slot's runs use, "" without one."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "0") if slot.gpu is None else slot.gpu
+    if not visible:  # all GPUs are hidden
         return ""
-    chosen = index or os.environ.get("CUDA_VISIBLE_DEVICES") or "0"
-    command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", "-i", chosen.split(",")[0]]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    return answer.stdout.strip() if answer.returncode == 0 else ""
+    name, error = run_program(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", "-i", visible.split(",")[0]])
+    return "" if error else name.strip()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion, in OpenCV/COLMAP axes (x right, y down, z forward).
+    """Describe a pinhole camera without distortion, in OpenCV/COLMAP axes (x right, y down, z forward).
 
     Pixel (i, j) covers [j, j+1) x [i, i+1) of the image plane, so its centre is at (j + 0.5, i + 0.5) and a centred
     principal point is (width / 2, height / 2), as in COLMAP.

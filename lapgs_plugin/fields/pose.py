@@ -59,7 +59,7 @@ def with_pose_gradient(field: GaussianField, movement: Tensor, centre: Tensor, u
 
 
 class _PassOn(torch.autograd.Function):
-    """(movement, centre, unit, means, quaternions, sh) -> the last three as they are."""
+    """Map (movement, centre, unit, means, quaternions, sh) to the last three as they are."""
 
     @staticmethod
     def forward(

@@ -16,7 +16,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 
 @dataclass(frozen=True)
 class RenderResult:
-    """The result of rendering one view.
+    """Hold the result of rendering one view.
 
     Attributes:
         image: (3, height, width) colour, background blended in, not clamped.
@@ -39,7 +39,7 @@ class RenderResult:
 
 @dataclass(frozen=True)
 class Semantics:
-    """Legitimate differences of a rasterizer from `reference_raster.oracle`, by design.
+    """List legitimate differences of a rasterizer from `reference_raster.oracle`, by design.
 
     Attributes:
         three_sigma_cut: False if a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one that
@@ -87,7 +87,7 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class ImageRasterizer(Protocol):
-    """A rasterizer that can render images alone, without radii and centres, and several views together.
+    """Render images alone, without radii and centres, and several views together.
 
     On a GPU all its work goes to PyTorch's current stream, so that fields can be rendered concurrently.
     """
@@ -98,7 +98,7 @@ class ImageRasterizer(Protocol):
 
 
 class FieldStack(Protocol):
-    """Finished fields on a device, to be rendered together; see `StackingRasterizer`."""
+    """Hold finished fields on a device, to render them together; see `StackingRasterizer`."""
 
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         """Render the first fields, each from its own camera.
@@ -116,7 +116,7 @@ class FieldStack(Protocol):
 
 @runtime_checkable
 class StackingRasterizer(Protocol):
-    """A rasterizer that may render several fields together, with hardly more launches than one field takes."""
+    """Render several fields together, with hardly more launches than one field takes."""
 
     @property
     def can_stack(self) -> bool:
@@ -130,7 +130,7 @@ class StackingRasterizer(Protocol):
 
 @runtime_checkable
 class BatchRasterizer(Protocol):
-    """A rasterizer that may train on several views of one size with as many launches as one view takes."""
+    """Render several views of one size differentiably with as many launches as one view takes."""
 
     @property
     def can_batch(self) -> bool:
@@ -158,7 +158,7 @@ class BatchRasterizer(Protocol):
 
 @runtime_checkable
 class PlainRasterizer(Protocol):
-    """A rasterizer that is faster without radii and centres."""
+    """Render faster without radii and centres."""
 
     def render_image(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None

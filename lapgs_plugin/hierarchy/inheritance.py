@@ -22,7 +22,7 @@ SMALLEST_SQUARED_DISTANCE = 1e-7
 
 
 class Inherited(NamedTuple):
-    """A new field, and which Gaussians of the old field it came from.
+    """Hold a new field, and which Gaussians of the old field it came from.
 
     Attributes:
         field: the field to train.

@@ -40,7 +40,7 @@ more time than it gains, in a short run it is needed."""
 
 
 class Hierarchy(str, Enum):
-    """What the field of each level but the coarsest represents."""
+    """Say what the field of each level but the coarsest represents."""
 
     NESTED = "nested"
     """The whole image: the coarser level's field, trained further at the finer size."""
@@ -66,7 +66,7 @@ def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: which level is trained, at what size, for how long.
+    """Describe one stage: which level is trained, at what size, for how long.
 
     Attributes:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
@@ -83,7 +83,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """The stages of a run in training order, coarsest first.
+    """List the stages of a run in training order, coarsest first.
 
     Attributes:
         stages: one per level.
@@ -131,7 +131,13 @@ class StagePlan:
         return iter(self.stages)
 
     def __getitem__(self, level: int) -> Stage:
-        """Return the stage that trains `level`."""
+        """Return the stage that trains `level`.
+
+        Raises:
+            IndexError: there is none; a negative level does not count from the end.
+        """
+        if not 0 <= level < self.levels:
+            raise IndexError(f"level {level}, expected 0 to {self.levels - 1}")
         return self.stages[self.levels - 1 - level]
 
     @classmethod

@@ -58,10 +58,6 @@ class SelfCheck:
             return False
         return True
 
-    def forget(self) -> None:
-        """Compare again at the next call."""
-        self._passed = None
-
 
 def _in_one_line(error: BaseException) -> str:
     """Return what went wrong first; Triton's errors show source code before they say it."""

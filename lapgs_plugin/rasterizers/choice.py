@@ -27,7 +27,7 @@ RASTER_SETTINGS = "raster"
 
 @dataclass(frozen=True)
 class PlacedRasterizer:
-    """A rasterizer and the device of its fields.
+    """Hold a rasterizer and the device of its fields.
 
     Attributes:
         rasterizer: renders the run.

@@ -7,7 +7,6 @@ settings' fields and its rasterizer's arguments, never from a version, because s
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.adapters.registry import rasterizer_owners
+from lapgs_plugin.environment import is_installed
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -71,11 +71,11 @@ POINT_DIMMING = 0.005
 
 def installed_extensions() -> list[str]:
     """Return the modules of the backbones' rasterizers that can be imported, without importing them."""
-    return [name for name in rasterizer_owners() if importlib.util.find_spec(name) is not None]
+    return [name for name in rasterizer_owners() if is_installed(name)]
 
 
 class CudaExtension:
-    """Render with an installed extension; see `signed_color.Extension`.
+    """Render with an installed extension, which `signed_color.SignedColorRasterizer` tells how to render signed colour.
 
     Args:
         name: of its module, a rasterizer of a registered backbone.
@@ -110,8 +110,6 @@ class CudaExtension:
         arguments = inspect.signature(module.GaussianRasterizer.forward).parameters
         self._takes_dc = "dc" in arguments
         self._others = {name: make for name, make in OTHER_INPUTS.items() if name in arguments}
-        # Rasterizers that take SH of degree 0 separately also blend a tile's Gaussians in buckets of 32.
-        self._in_buckets = self._takes_dc
         # Rasterizers with this setting return absolute gradients after the ordinary ones.
         self._absolute = "metric_map" in self._settings
         self._module = module
@@ -133,7 +131,14 @@ class CudaExtension:
     def render(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
     ) -> RenderResult:
-        """Render without regard to `field.signed`; see `signed_color.Extension`. The result has no transmittance.
+        """Render without regard to `field.signed`. The result has no transmittance.
+
+        Args:
+            field: n Gaussians on `device`.
+            camera: the view.
+            background: (3,) colour behind everything.
+            sh_degree: passed on unchanged, with the flag of `signed_color.signed_degree`.
+            colors: (n, 3) the Gaussians' colours; SH and `sh_degree` are then ignored.
 
         Raises:
             UserInputError: a tensor is not float32, or not on `device`.
@@ -169,10 +174,11 @@ class CudaExtension:
             "rotations": torch.nn.functional.normalize(field.quaternions, dim=-1),  # the kernels expect it
             **(self._sh_inputs(field.sh) if colors is None else {"colors_precomp": colors}),
         }
-        # Without Gaussians the kernels render no background. With none in any tile, those that blend in buckets write
-        # out of bounds, or launch an empty grid in the backward pass.
+        # Without Gaussians the kernels render no background. Those that take SH of degree 0 separately also blend a
+        # tile's Gaussians in buckets of 32: with none in any tile they write out of bounds, or launch an empty grid in
+        # the backward pass.
         antialiasing = "antialiasing" in self._settings and bool(self._constants["antialiasing"])
-        if n == 0 or (self._in_buckets and (antialiasing or not _surely_blends(field, camera))):
+        if n == 0 or (self._takes_dc and (antialiasing or not _surely_blends(field, camera))):
             inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
         rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
         others = {name: make(inputs["means3D"]) for name, make in self._others.items()}
@@ -220,7 +226,7 @@ class CudaExtension:
 
 
 class _ScreenPoints(torch.autograd.Function):
-    """(n, 2) centres in pixels -> (n, columns) zeros for the extension's screen-space points.
+    """Map (n, 2) centres in pixels to (n, columns) zeros for the extension's screen-space points.
 
     Their gradient is by normalised device coordinates, in which the image is 2 wide and high.
     """

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -24,6 +23,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.patching import State, Target, find_targets, status
+from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
 logger = logging.getLogger(__name__)
@@ -36,38 +36,10 @@ PROBE_TOLERANCE = 1e-3
 
 
 class ColorPath(Enum):
-    """How the colours of a signed field are computed: by the extension, or by PyTorch before it."""
+    """Say what computes the colours of a signed field: the extension, or PyTorch before it."""
 
     NATIVE = "native"
     PRECOMPUTED = "precomputed"
-
-
-class Extension(Protocol):
-    """A wrapped rasterizer that has to be told how to render signed colour."""
-
-    @property
-    def name(self) -> str:
-        """Name of its Python module."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Device of fields."""
-        ...
-
-    def render(
-        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int, colors: Tensor | None = None
-    ) -> RenderResult:
-        """Render without regard to `field.signed`.
-
-        Args:
-            field: n Gaussians on `device`.
-            camera: the view.
-            background: (3,) colour behind everything.
-            sh_degree: passed on unchanged, with the flag.
-            colors: (n, 3) the Gaussians' colours; SH and `sh_degree` are then ignored.
-        """
-        ...
 
 
 def signed_degree(degree: int) -> int:
@@ -82,13 +54,11 @@ class SignedColorRasterizer:
         extension: that renders.
         path: for signed fields; None tests the extension at the first signed field, and logs advice once if it needs
             the slow path.
-        checkout: folder with the extension's sources, for that advice.
     """
 
-    def __init__(self, extension: Extension, *, path: ColorPath | None = None, checkout: Path | None = None) -> None:
+    def __init__(self, extension: CudaExtension, *, path: ColorPath | None = None) -> None:
         self._extension = extension
         self._forced = path
-        self._checkout = checkout
 
     @property
     def name(self) -> str:
@@ -101,7 +71,7 @@ class SignedColorRasterizer:
             return self._forced
         if has_signed_color(self._extension):
             return ColorPath.NATIVE
-        logger.warning("%s", explain_fallback(self.name, self._checkout or Path.cwd()))
+        logger.warning("%s", explain_fallback(self.name, Path.cwd()))
         return ColorPath.PRECOMPUTED
 
     def __call__(
@@ -131,7 +101,7 @@ def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Ten
     return sh_to_color(field.sh, directions, degree, signed=field.signed)
 
 
-def has_signed_color(extension: Extension) -> bool:
+def has_signed_color(extension: CudaExtension) -> bool:
     """Test whether the installed extension renders and differentiates signed colour."""
     field, camera, degree = _probe_scene(extension.device)
     expected = precomputed_colors(field, camera, degree)[0]  # (3,) of both signs

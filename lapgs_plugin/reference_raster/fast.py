@@ -16,7 +16,6 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
 from lapgs_plugin.jit.buffers import empty
-from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
 
@@ -60,7 +59,7 @@ class CpuRasterizer:
         parameters = list(field.parameters.values())
         differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in (*parameters, background))
         # NumPy, because PyTorch fills large tensors on several threads, which then spin; see `jit.threads`.
-        means2d, absgrad2d = (torch.from_numpy(_zeros(n, 2, _numpy_type(kind))) for _ in range(2))
+        means2d, absgrad2d = (_zeros(n, 2, view.camera.dtype) for _ in range(2))
         call = _Call(view, field.signed, degree, differentiable, means2d.detach(), absgrad2d)
         means2d.requires_grad_(differentiable)
         image, transmittance, radii = _Rasterize.apply(  # type: ignore[no-untyped-call]  # torch leaves it without types
@@ -99,10 +98,6 @@ class _Call:
     means2d: Tensor
     absgrad2d: Tensor
 
-    def gaussians(self, parameters: Sequence[Tensor]) -> Gaussians:
-        """Return the field's parameters, in its order, as arrays."""
-        return _gaussians(parameters, self.signed, self.sh_degree)
-
 
 class _Rasterize(torch.autograd.Function):
     """Map (call, background, means2d, *parameters of the field) to image, transmittance, radii."""
@@ -112,7 +107,8 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, call: _Call, background: Tensor, means2d: Tensor, *parameters: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         color = background.detach().contiguous().numpy()
-        rendering = pipeline.render(call.gaussians(parameters), call.view, color, keep=call.keep)
+        gaussians = _gaussians(parameters, call.signed, call.sh_degree)
+        rendering = pipeline.render(gaussians, call.view, color, keep=call.keep)
         np.copyto(call.means2d.numpy(), rendering.centres)
         image, transmittance, radii = (
             torch.from_numpy(array) for array in (rendering.image, rendering.transmittance, rendering.radii)
@@ -132,7 +128,7 @@ class _Rasterize(torch.autograd.Function):
         grad_image, grad_transmittance = (None if g is None else g.contiguous().numpy() for g in from_above[:2])
         if grad_image is None:
             grad_image = np.zeros_like(rendering.image)
-        gaussians = call.gaussians(ctx.saved_tensors)
+        gaussians = _gaussians(ctx.saved_tensors, call.signed, call.sh_degree)
         found = pipeline.gradients(gaussians, call.view, rendering, grad_image, grad_transmittance)
         np.copyto(call.absgrad2d.numpy(), found.absolute_centres)
         by_background = None
@@ -149,18 +145,15 @@ def _view(camera: Camera, kind: torch.dtype) -> View:
 
 
 def _gaussians(parameters: Sequence[Tensor], signed: bool, sh_degree: int) -> Gaussians:
+    """Return a field's parameters, in its order, as arrays."""
     means, quats, log_scales, logits, sh = (p.detach().contiguous().numpy() for p in parameters)
     return Gaussians(means, quats, log_scales, logits, sh, None, True, signed, sh_degree)
 
 
-def _zeros(rows: int, columns: int, kind: type[np.floating[Any]]) -> Floats:
+def _zeros(rows: int, columns: int, kind: np.dtype[Any]) -> Tensor:
     array = empty(rows * columns, kind).reshape(rows, columns)
     array.fill(0)
-    return array
-
-
-def _numpy_type(kind: torch.dtype) -> type[np.floating[Any]]:
-    return np.float32 if kind == torch.float32 else np.float64
+    return torch.from_numpy(array)
 
 
 def _check(field: GaussianField, background: Tensor) -> None:

@@ -80,8 +80,7 @@ class _Bounded:
         means: (v, 3) centres in world coordinates.
         depths, depth_errors: (v,) camera-space z; the error is 0 where every implementation computes the same bits.
         means2d, mean_errors: (v, 2) centres in pixels.
-        conics: (v, 3) xx, xy, yy of the inverse covariance.
-        conic_errors: (v,) relative error of the quadratic form with this conic.
+        shapes: their footprints.
         opacities, opacity_errors: (v,) the error is relative.
         surely: (v, 4) tiles the Gaussian touches with any rounding: x0, y0, x1, y1; empty if it may be culled.
         possibly: (v, 4) tiles it touches with some rounding.
@@ -94,8 +93,7 @@ class _Bounded:
     depth_errors: Tensor
     means2d: Tensor
     mean_errors: Tensor
-    conics: Tensor
-    conic_errors: Tensor
+    shapes: _Shapes
     opacities: Tensor
     opacity_errors: Tensor
     surely: Tensor
@@ -167,8 +165,7 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
         depth_errors=torch.zeros_like(depths) if axis_aligned else errors[:, 2],
         means2d=means2d,
         mean_errors=mean_errors,
-        conics=shapes.conics,
-        conic_errors=shapes.conic_errors,
+        shapes=shapes,
         opacities=torch.sigmoid(logits),
         opacity_errors=tolerance * (1 + logits.abs()),
         surely=surely,
@@ -317,12 +314,12 @@ def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixel
 def _alphas(bounded: _Bounded, members: Tensor, pixels: Tensor, tolerance: float) -> tuple[Tensor, ...]:
     """Return lower bound, value and upper bound of o exp(-q) before the cap; (p, k) each."""
     dx, dy = (bounded.means2d[members] - pixels[:, None]).unbind(-1)  # (p, k) each
-    xx, xy, yy = bounded.conics[members].unbind(-1)  # (k,) each
+    xx, xy, yy = bounded.shapes.conics[members].unbind(-1)  # (k,) each
     q = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy  # (p, k)
     terms = 0.5 * (xx * dx * dx + yy * dy * dy) + (xy * dx * dy).abs()  # (p, k)
     shift_x, shift_y = bounded.mean_errors[members].unbind(-1)  # (k,) each
     shifted = (xx * dx + xy * dy).abs() * shift_x + (xy * dx + yy * dy).abs() * shift_y  # (p, k) |grad q| . error
-    q_errors = q * bounded.conic_errors[members] + tolerance * (1 + terms) + shifted  # (p, k)
+    q_errors = q * bounded.shapes.conic_errors[members] + tolerance * (1 + terms) + shifted  # (p, k)
     opacities, relative = bounded.opacities[members], bounded.opacity_errors[members]  # (k,) each
     low = opacities * (1 - relative) * torch.exp(-q - q_errors)  # (p, k)
     high = opacities * (1 + relative) * torch.exp((q_errors - q).clamp(max=0))  # (p, k)

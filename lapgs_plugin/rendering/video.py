@@ -7,31 +7,22 @@ licence, and its crash is an error that we can report. gsplat and nerfstudio use
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Protocol
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError
+from lapgs_plugin.rendering.images import as_bytes
 
 QUALITY = 8
 """Quality from 0 to 10 for imageio-ffmpeg, at a variable bit rate."""
 
 
-class FrameSink(Protocol):
-    """Take the frames of a clip, one after the other."""
-
-    def __call__(self, image: Tensor) -> None:
-        """Add a frame.
-
-        Args:
-            image: (3, h, w) in [0, 1]; other values are clamped.
-        """
-        ...
+FrameSink = Callable[[Tensor], None]
+"""Adds a frame to a clip: an image (3, h, w), clamped to [0, 1]."""
 
 
 def require_video() -> None:
@@ -82,8 +73,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
         def add(image: Tensor) -> None:
             nonlocal frames
             frames += 1
-            levels = (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).permute(1, 2, 0)
-            writer.send(levels.contiguous().cpu().numpy())
+            writer.send(as_bytes(image.clamp(0.0, 1.0)))
 
         try:
             yield add

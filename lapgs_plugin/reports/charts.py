@@ -15,6 +15,8 @@ INSET_POINTS = 3
 LEAST_SPAN = 0.02
 """Least span of an axis as a share of its largest value, so that labels of a flat line stay short."""
 BAR_STEP = 30.0
+ARROW_HEAD = 4.0
+"""Length of an arrow's head in chart units; the line ends so far before its point."""
 
 
 @dataclass(frozen=True)
@@ -305,14 +307,12 @@ def draw_arrows(
     *,
     format_x: Callable[[float], str] = "{:g}".format,
     format_y: Callable[[float], str] = "{:g}".format,
-    head: float = 4.0,
 ) -> Chart:
     """Lay out a chart of arrows, with both axes from 0.
 
     Args:
         arrows: at least one.
         format_x, format_y: format a tick's value.
-        head: length of an arrow's head in chart units; the line ends so far before its point.
     """
     points = [point for arrow in arrows for point in (arrow.start, arrow.end)]
     right = max(x for x, _ in points) * HEADROOM or 1.0
@@ -326,7 +326,7 @@ def draw_arrows(
     for arrow in arrows:
         start, end = place(arrow.start), place(arrow.end)
         length = math.dist(start, end)
-        share = max(0.0, 1.0 - head / length) if length else 1.0
+        share = max(0.0, 1.0 - ARROW_HEAD / length) if length else 1.0
         tip = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
         placed.append(PlacedArrow(arrow.kind, arrow.label, start, (round(tip[0], 1), round(tip[1], 1))))
     return Chart(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,7 +13,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
-from lapgs_plugin.scenes.images import resize_image, write_image
+from lapgs_plugin.scenes.images import encode_image, resize_image
 from lapgs_plugin.scenes.scene import View
 
 IMAGE_SIDE = 800
@@ -189,8 +187,5 @@ def _shrink(layer: _Layer) -> Picture:
 
 def _data_uri(image: Tensor, kind: str) -> str:
     """Encode an image (3, h, w) as the data URI of a JPEG or PNG file."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"picture.{kind}"
-        write_image(file, image)
-        data = base64.b64encode(file.read_bytes()).decode()
+    data = base64.b64encode(encode_image(image, f".{kind}")).decode()
     return f"data:image/{'jpeg' if kind == 'jpg' else kind};base64,{data}"

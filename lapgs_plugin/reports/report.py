@@ -11,7 +11,7 @@ import jinja2
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
-from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -118,7 +118,9 @@ def write_report(
         view_rows=view_rows,
         settings=_settings(run),
     )
-    return write_page(run.archive.path(REPORT), page)
+    path = run.archive.path(REPORT)
+    write_text(path, page)
+    return path
 
 
 def render_page(template: str, **values: Any) -> str:
@@ -131,17 +133,6 @@ def render_page(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(values, inset_at=INSET_AT)
-
-
-def write_page(path: Path, page: str) -> Path:
-    """Write a page, whole or not at all.
-
-    Raises:
-        RunFolderError: it cannot be written.
-    """
-    with one_line_errors(path), atomic_write(path) as stream:
-        stream.write(page.encode())
-    return path
 
 
 # Charts of training.
@@ -245,16 +236,21 @@ def count_text(value: float) -> str:
     """Format a number for an axis: 1.5k, 20k, 1.2M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
-            return f"{value / size:.3g}{suffix}"
+            return f"{number_text(value / size)}{suffix}"
     return f"{value:g}"
 
 
 # Time and number of Gaussians.
 
 
+def number_text(value: float) -> str:
+    """Format a number with three digits, or with all that are before its point."""
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
+
+
 def seconds_text(value: float) -> str:
-    """Format seconds with three digits."""
-    return f"{value:.3g} s" if value < 1e3 else f"{value:,.0f} s"
+    """Format seconds."""
+    return f"{number_text(value)} s"
 
 
 def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
@@ -277,7 +273,7 @@ def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
             if record.breakdown_seconds:
                 what = f", level {record.level}" if run.archive.manifest.levels > 1 else ""
                 total = sum(record.breakdown_seconds.values())
-                label = f"{run.name}{what}: {1e3 * total / record.iterations:.3g} ms an iteration"
+                label = f"{run.name}{what}: {number_text(1e3 * total / record.iterations)} ms an iteration"
                 bars.append(Bar(label, list(record.breakdown_seconds.items())))
     return draw_bars("Optimization", bars, format_value=seconds_text) if bars else None
 

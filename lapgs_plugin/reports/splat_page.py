@@ -14,8 +14,9 @@ from markupsafe import Markup
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splat import splat_bytes
+from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.rig import Rig, forward
-from lapgs_plugin.reports.report import render_page, write_page
+from lapgs_plugin.reports.report import render_page
 
 TEMPLATE = "splats.html.jinja"
 NEAREST_TARGET = 0.05
@@ -24,7 +25,7 @@ NEAREST_TARGET = 0.05
 
 def write_splat_page(
     field: GaussianField, path: Path, title: str, cameras: Sequence[Camera], background: tuple[float, float, float]
-) -> Path:
+) -> None:
     """Write the page.
 
     Args:
@@ -41,7 +42,7 @@ def write_splat_page(
     splats = base64.b64encode(splat_bytes(field)).decode()
     start = json.dumps({**_start(cameras), "background": background})
     # Base64 and our own JSON of numbers hold nothing to escape.
-    return write_page(path, render_page(TEMPLATE, title=title, start=Markup(start), splats=Markup(splats)))
+    write_text(path, render_page(TEMPLATE, title=title, start=Markup(start), splats=Markup(splats)))
 
 
 def _start(cameras: Sequence[Camera]) -> dict[str, Any]:

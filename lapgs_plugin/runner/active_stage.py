@@ -68,6 +68,11 @@ class ActiveStage:
         return self._gaussians
 
     @property
+    def iteration(self) -> int:
+        """Running iteration, from 1; 0 before the first."""
+        return self.record.iteration
+
+    @property
     def has_more(self) -> bool:
         """Whether the running call has iterations after this one."""
         return self.record.iteration < self.stage.iterations
@@ -105,8 +110,8 @@ class ActiveStage:
         return scene
 
     def optimizers_made(self, gaussians: Any) -> None:
-        """Give the optimizers that the checkout has just set up inherited state."""
-        self._model.prepare_optimizers(gaussians)
+        """Prepare the optimizers that the checkout has just set up, some in the middle of a stage again."""
+        self._model.prepare_optimizers(gaussians, inherit=self.iteration == 0)
 
     def iteration_begins(self, gaussians: Any) -> None:
         """Do everything that comes before the next iteration, and count it: the stage's first is 1."""

@@ -125,7 +125,7 @@ class DryRun:
         """Run the first iteration of the script's loop."""
 
         def stepped(optimizer: Optimizer, *_: Any) -> None:
-            if stage.record.iteration == 0 and steps_positions(optimizer, stage.gaussians):
+            if stage.iteration == 0 and steps_positions(optimizer, stage.gaussians):
                 raise _Enough  # the loop would run to its end
 
         self._context.wrapper.stage = stage.rendering
@@ -141,7 +141,7 @@ class DryRun:
             self._context.wrapper.stage = None
             self._activate(None)
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)
-        if stage.record.iteration == 0:
+        if stage.iteration == 0:
             raise UserInputError(
                 f"{place}: {stage.call.function.__name__}() began no iteration, expected one call of {CLOCK}, "
                 f"or one step of the positions, an iteration; {OFF}"
@@ -248,10 +248,8 @@ class _Enough(BaseException):
     """Leave the script's loop."""
 
 
-class _DryRecord:
-    """Count the iterations of the dry run."""
-
-    iteration = 0
+class _NoRecord:
+    """Measure nothing."""
 
     def outside(self, purpose: str) -> nullcontext[None]:
         return nullcontext()
@@ -273,7 +271,7 @@ class _DryStage:
     ) -> None:
         self._context, self.call, self._scene, self._view = context, call, scene, view
         self.rendering, self.window, self.keeps_schedule = rendering, window, window is None
-        self.record = _DryRecord()
+        self.record, self.iteration = _NoRecord(), 0
         self.gaussians: Any = None
 
     def scene_for(self, gaussians: Any) -> Any:
@@ -288,9 +286,9 @@ class _DryStage:
     densified = optimizers_made
 
     def iteration_begins(self, gaussians: Any) -> None:
-        if self.record.iteration:
+        if self.iteration:
             raise _Enough
-        self.record.iteration = 1
+        self.iteration = 1
 
 
 class _Nothing:

@@ -71,11 +71,11 @@ class HookCaller:
 
         @wraps(original)
         def score(*args: Any, **kwargs: Any) -> Any:
-            self._paused = True
+            outer, self._paused = self._paused, True
             try:
                 return original(*args, **kwargs)
             finally:
-                self._paused = False
+                self._paused = outer
 
         return score
 

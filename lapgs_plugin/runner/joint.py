@@ -80,7 +80,7 @@ class JointLevels:
             residual_color_rate: factor on its SH learning rates, which a base does not have.
         """
         for leading in self._context.adapter.optimizers(gaussians):
-            names = [group["name"] for group in leading.param_groups]
+            names = [group.get("name") for group in leading.param_groups]
             groups = [
                 {
                     "params": [getattr(one.gaussians, GROUPS[name])],
@@ -89,10 +89,12 @@ class JointLevels:
                 }
                 for one in self._fields
                 for position, name in enumerate(names)
+                if name in GROUPS  # archived fields have none of a fork's other parameters
             ]
-            on_gpu = self._context.device.type == "cuda"
-            following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=on_gpu)
-            leading.register_step_post_hook(_Follow(following))
+            if groups:
+                on_gpu = self._context.device.type == "cuda"
+                following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=on_gpu)
+                leading.register_step_post_hook(_Follow(following))
 
     def prefetch(self, key: str) -> None:
         """Do nothing: predictions are rendered."""

@@ -24,10 +24,11 @@ from lapgs_plugin.checkouts.attachment import Attachment, Replacement, of_class
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.files import BARE_RECORD, atomic_write, one_line_errors
+from lapgs_plugin.files import BARE_RECORD, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 
 logger = logging.getLogger(__name__)
@@ -43,6 +44,9 @@ class BareRunRecorder:
         adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
         gpu_busy: profile some iterations; needs a CUDA device.
+
+    Attributes:
+        iteration: running iteration, from 1; 0 before the first.
     """
 
     def __init__(self, adapter: BackboneAdapter, device: str, gpu_busy: bool = False) -> None:
@@ -52,7 +56,7 @@ class BareRunRecorder:
         self._scene: Any = None
         self._began: float | None = None
         self._seconds = self._saving = self._profiling = 0.0
-        self._iteration = self._peak = self._summed = 0
+        self.iteration = self._peak = self._summed = 0
         self._memory: dict[str, int] = {}
         self._timeline: list[dict[str, float]] = []
 
@@ -62,25 +66,24 @@ class BareRunRecorder:
         Raises:
             UserInputError: the script never trained.
         """
-        with Attachment(self._replacements()):
+        with Attachment(self._replacements()), counting_steps(self._adapter.profile.model, lambda: self):
             self._adapter.script.run_main()
         if self._call is None or self._began is None:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
         path = Path(self._call.dataset.model_path) / BARE_RECORD
-        text = json.dumps(self._record(), indent=2) + "\n"
-        with one_line_errors(path), atomic_write(path) as stream:
-            stream.write(text.encode())
+        write_text(path, json.dumps(self._record(), indent=2) + "\n")
         logger.info("recorded: %s", path)
 
     def _replacements(self) -> list[Replacement]:
         profile = self._adapter.profile
+        if not (scenes := profile.script_names(profile.scene)):
+            raise UserInputError(
+                f"--record: {self._adapter.script.path} makes no {profile.scene.__name__} of its own, whose Gaussians "
+                "would be counted; leave it out"
+            )
         return [
             Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
-            *(
-                Replacement(owner, name, self._make_scene, None, "training()")
-                for owner, name in profile.holders(profile.scene)
-                if owner is profile.script.module
-            ),
+            *(Replacement(profile.script.module, name, self._make_scene, None, "training()") for name in scenes),
             *of_class(profile.model, "update_learning_rate", self._make_update_learning_rate, "every iteration"),
             *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
@@ -109,7 +112,7 @@ class BareRunRecorder:
     def _make_update_learning_rate(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            self._iteration_begins(len(gaussians._xyz))
+            self.iteration_begins(gaussians)
             return original(gaussians, *args, **kwargs)
 
         return update_learning_rate
@@ -125,7 +128,18 @@ class BareRunRecorder:
 
         return save
 
-    def _iteration_begins(self, count: int) -> None:
+    @property
+    def gaussians(self) -> Any:
+        """The checkout's model; None before its scene is made."""
+        return None if self._scene is None else self._scene.gaussians
+
+    @property
+    def has_more(self) -> bool:
+        """Whether training has iterations after this one."""
+        return self._call is not None and self.iteration < self._call.opt.iterations
+
+    def iteration_begins(self, gaussians: Any) -> None:
+        """Count an iteration that is about to begin."""
         if self._began is None:
             self._synchronize()
             if self._device == "cuda":
@@ -134,20 +148,21 @@ class BareRunRecorder:
             if self._profiles and self._call is not None:
                 self._busy = GpuBusy(self._call.opt.iterations)
         self._profile()
-        self._iteration += 1
+        count = len(gaussians._xyz)
+        self.iteration += 1
         self._summed += count
         self._peak = max(self._peak, count)
         assert self._call is not None, "training() makes iterations"
-        if self._iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
+        if self.iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
             elapsed = self._elapsed(self._began)
-            self._timeline.append({"iteration": self._iteration, "elapsed": elapsed, "num_gaussians": count})
+            self._timeline.append({"iteration": self.iteration, "elapsed": elapsed, "num_gaussians": count})
 
     def _profile(self) -> None:
         """Start or end a profile if it is due; its time does not count."""
-        if self._busy.due(self._iteration):
+        if self._busy.due(self.iteration):
             self._synchronize()
             start = time.perf_counter()
-            self._busy.step(self._iteration)
+            self._busy.step(self.iteration)
             self._profiling += time.perf_counter() - start
 
     def _elapsed(self, began: float) -> float:
@@ -155,14 +170,14 @@ class BareRunRecorder:
 
     def _record(self) -> dict[str, Any]:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
-        gaussians = self._scene.gaussians
+        gaussians = self.gaussians
         return {
-            "iterations": self._iteration,
+            "iterations": self.iteration,
             "train_seconds": self._seconds,
             "saving_seconds": self._saving,
             "num_gaussians": len(gaussians._xyz),
             "peak_gaussians": max(self._peak, len(gaussians._xyz)),
-            "mean_gaussians": self._summed / self._iteration,
+            "mean_gaussians": self._summed / self.iteration,
             "memory_bytes": self._memory,
             **({} if (busy := self._busy.seconds()) is None else {"gpu_busy_seconds": busy}),
             **self._held_out(gaussians),

@@ -67,7 +67,7 @@ class StageReplacements:
         return None if stage is None or stage.keeps_schedule else stage.window
 
     def _in_training(self, profile: Profile) -> list[Replacement]:
-        scenes = [name for owner, name in profile.holders(profile.scene) if owner is profile.script.module]
+        scenes = profile.script_names(profile.scene)
         saves = [Replacement(profile.scene, "save", self._make_save, None, "training() at --save_iterations")]
         return [
             Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
@@ -158,8 +158,7 @@ class StageReplacements:
         @wraps(original)
         def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
-            # Some loops set their optimizers up again within a stage: these start anew there, too.
-            if (stage := self._running()) is not None and stage.record.iteration == 0:
+            if (stage := self._running()) is not None:
                 stage.optimizers_made(gaussians)
             return result
 

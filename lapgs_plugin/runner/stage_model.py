@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
@@ -51,13 +52,18 @@ class StageModel:
         for name, value in self._before.carried.items():
             setattr(gaussians, name, value)
 
-    def prepare_optimizers(self, gaussians: Any) -> None:
-        """Give the checkout's new optimizers inherited state and the rate of SH, and fuse their steps on a GPU."""
-        optimizers = list(self._adapter.optimizers(gaussians))
+    def prepare_optimizers(self, gaussians: Any, inherit: bool) -> None:
+        """Set the rate of SH in the checkout's new optimizers, fuse their steps on a GPU, and let them inherit state.
+
+        Args:
+            gaussians: the checkout's model.
+            inherit: whether the stage begins; optimizers that a loop makes later start anew in the checkout, too.
+        """
+        optimizers = self._adapter.optimizers(gaussians)
         if self._options.sh_rate != 1.0:
             _scale_sh_rate(optimizers, self._options.sh_rate)
         for optimizer in optimizers:
-            if self._before is not None:
+            if inherit and self._before is not None:
                 self._inherit_moments(optimizer, self._before.moments)
             if self._options.fused_adam and self._device.type == "cuda":
                 _fuse_steps(optimizer)
@@ -73,7 +79,7 @@ class StageModel:
             return {}
         state = {}
         for optimizer in self._adapter.optimizers(gaussians):
-            for group in optimizer.param_groups:
+            for group in _of_gaussians(optimizer):
                 values = optimizer.state.get(group["params"][0], {})
                 state[group["name"]] = {n: torch.as_tensor(v).detach().cpu().clone() for n, v in values.items()}
         return state
@@ -100,11 +106,16 @@ class StageModel:
         return carried, stored["moments"]
 
     def _inherit_moments(self, optimizer: torch.optim.Optimizer, moments: Mapping[str, dict[str, Tensor]]) -> None:
-        for group in optimizer.param_groups:
+        for group in _of_gaussians(optimizer):
             if state := moments.get(group["name"]):
                 optimizer.state[group["params"][0]] = {
                     name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
                 }
+
+
+def _of_gaussians(optimizer: torch.optim.Optimizer) -> list[dict[str, Any]]:
+    """Return the parameter groups that inherit: a fork's own may have another row than one a Gaussian, or no name."""
+    return [group for group in optimizer.param_groups if group.get("name") in GROUPS]
 
 
 def _scale_sh_rate(optimizers: Sequence[torch.optim.Optimizer], factor: float) -> None:

@@ -85,10 +85,6 @@ class StageRendering:
         found = (self._by_matrix.get(m) for value in view_matrices(settings) for m in matrix_keys(value))
         return next((key for key in found if key is not None), None)
 
-    def _fits(self, key: str, image: Tensor) -> bool:
-        """Return whether an image has the size of a view at this level, as far as that is known."""
-        return self.accumulated is None or self.accumulated.get(key).shape == image.shape
-
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         if self.targets is not None:
@@ -107,12 +103,29 @@ class StageRendering:
             return target
         return target - self._below_target.get(key)
 
-    def compose(self, key: str | None, image: Tensor) -> Tensor:
-        """Return the composed image (3, h, w) of a view, given the rendered one; `key` is None for other cameras.
+    def compose(self, key: str | None, image: Tensor, *, by_place: bool = False) -> Tensor:
+        """Return the composed image (3, h, w) of a view.
+
+        Args:
+            key: of the view; None for other cameras.
+            image: (3, h, w) as rendered.
+            by_place: whether the view was recognised by its matrix alone. If the image has another size than its level,
+                it is of a viewer's camera at the same place.
 
         Raises:
             UserInputError: the image has another size than its level; in the backward pass: no view was recognised.
         """
+        below = None
+        if key is not None and self.accumulated is not None and (by_place or key in self.composed):
+            below = self.accumulated.get(key)
+            if below.shape != image.shape:
+                if not by_place:
+                    raise UserInputError(
+                        f"the checkout renders view {view_name(key)} at {image.shape[2]}x{image.shape[1]}, expected "
+                        f"{below.shape[2]}x{below.shape[1]}, the size of its level; switch its own resolution schedule "
+                        "off, or train with --hierarchy nested"
+                    )
+                key = None
         if key is None:
             if not self._needs_views:
                 return image
@@ -120,15 +133,8 @@ class StageRendering:
             if image.requires_grad:
                 image.register_hook(_refuse_unrecognised)  # type: ignore[no-untyped-call]  # torch's
             return image
-        below = None
-        if self.accumulated is not None and key in self.composed:
-            below = self.accumulated.get(key)
-            if below.shape != image.shape:
-                raise UserInputError(
-                    f"the checkout renders view {view_name(key)} at {image.shape[2]}x{image.shape[1]}, expected "
-                    f"{below.shape[2]}x{below.shape[1]}, the size of its level; switch its own resolution schedule "
-                    "off, or train with --hierarchy nested"
-                )
+        below = below if key in self.composed else None
+        if below is not None:
             image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
@@ -142,11 +148,7 @@ class StageRendering:
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
-        image = outputs.image
-        key = self.key(noted, settings)
-        if noted is None and key is not None and not self._fits(key, image):
-            key = None  # a viewer's camera at the place of a photo's
-        image = self.compose(key, image)
+        image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
             self.captured = image
         return outputs.with_image(image)

@@ -27,7 +27,7 @@ def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
 
     Args:
         model: class of the Gaussians.
-        running: returns the running stage, or that of the dry run; None between stages.
+        running: returns the running stage, that of the dry run, or a recorder; None between stages.
     """
     if hasattr(model, CLOCK):
         yield
@@ -39,7 +39,7 @@ def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
 
     def before(optimizer: Optimizer, *_: Any) -> None:
         stage = stage_of(optimizer)
-        if stage is not None and stage.record.iteration == 0:
+        if stage is not None and stage.iteration == 0:
             stage.iteration_begins(stage.gaussians)
 
     def after(optimizer: Optimizer, *_: Any) -> None:

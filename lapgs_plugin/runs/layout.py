@@ -7,6 +7,8 @@
     RUN/level_<l>/poses.json       corrections of the training photos' poses after that level, if these are refined
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
+    RUN/run.toml                   the options of `lapgs train` that made the run
+    RUN/tensorboard/               its event files, with --log tensorboard
     RUN/preview.jpg                an image that the viewer shows until it can render
     RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   results of other commands
 
@@ -33,6 +35,7 @@ from lapgs_plugin.untrusted import read_json
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
+RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "exposure.json", "poses.json"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
@@ -96,16 +99,14 @@ def is_run(folder: Path) -> bool:
 def remove_results(folder: Path) -> None:
     """Remove the files of a previous run and nothing else."""
     remove_scratch(folder)
-    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW):
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG):
         (folder / name).unlink(missing_ok=True)
-    for name in (RENDERS, EXPORT):
+    for name in (RENDERS, EXPORT, TENSORBOARD):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
     for level in folder.glob("level_*/"):
-        (level / PLY).unlink(missing_ok=True)
-        (level / OPTIMIZER).unlink(missing_ok=True)
-        (level / EXPOSURE).unlink(missing_ok=True)
-        (level / POSES).unlink(missing_ok=True)
+        for name in (PLY, OPTIMIZER, EXPOSURE, POSES):
+            (level / name).unlink(missing_ok=True)
         for pattern in (TRAINED_ALONG.format("*"), EXTENDED.format("*", "*")):
             for waiting in level.glob(pattern):
                 waiting.unlink()

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.files import FolderLock, atomic_write, one_line_errors
+from lapgs_plugin.files import FolderLock, one_line_errors, write_text
 from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import HistoryEntry, Metrics
@@ -84,9 +84,7 @@ class RunFiles:
         self._require_lock()
         kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
         text = "".join(json.dumps(entry) + "\n" for entry in kept)
-        path = self.path(HISTORY)
-        with one_line_errors(path, training=True), atomic_write(path) as stream:
-            stream.write(text.encode())
+        write_text(self.path(HISTORY), text, training=True)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Replace the run's metrics: JSON with finite numbers. Needs no lock."""
@@ -158,8 +156,7 @@ class RunFiles:
 
     def _write_json(self, name: str, values: dict[str, Any], training: bool = False) -> None:
         text = json.dumps(values, indent=2, allow_nan=False) + "\n"
-        with one_line_errors(self.path(name), training=training), atomic_write(self.path(name)) as stream:
-            stream.write(text.encode())
+        write_text(self.path(name), text, training=training)
 
     def _remove(self, *names: str) -> None:
         with one_line_errors(self._folder):

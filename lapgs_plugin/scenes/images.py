@@ -203,15 +203,13 @@ def write_image(path: Path, image: Tensor) -> None:
         raise UserInputError(
             f"{path}: cannot write {suffix or 'a file without extension'}, expected .png, .jpg or .exr"
         )
-    pixels = image.detach().to("cpu", torch.float32).permute(1, 2, 0)  # (h, w, 3)
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if suffix == ".exr":
-            _write_exr(unfinished, pixels.contiguous().numpy())
+            _write_exr(unfinished, _pixels(image).contiguous().numpy())
         else:
-            levels = (pixels.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
-            unfinished.write_bytes(_encode_8_bits(levels.contiguous().numpy(), suffix))
+            unfinished.write_bytes(encode_image(image, suffix))
         unfinished.replace(path)
     except OSError as error:
         raise LapgsError(
@@ -222,18 +220,24 @@ def write_image(path: Path, image: Tensor) -> None:
             unfinished.unlink(missing_ok=True)
 
 
-def _encode_8_bits(levels: NDArray[np.uint8], suffix: str) -> bytes:
-    """Encode (h, w, 3) pixels as PNG or JPEG.
+def encode_image(image: Tensor, suffix: str) -> bytes:
+    """Encode an image (3, h, w) in 8 bits, clamped to [0, 1] and rounded, as .png or .jpg.
 
     Pillow does it in memory: on a full disk OpenImageIO's JPEG writer aborts the process and its PNG writer reports
     success.
     """
+    levels = (_pixels(image).clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().numpy()
     encoded = io.BytesIO()
     if suffix == ".png":
         Image.fromarray(levels).save(encoded, "PNG", compress_level=PNG_LEVEL)
     else:
         Image.fromarray(levels).save(encoded, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4")
     return encoded.getvalue()
+
+
+def _pixels(image: Tensor) -> Tensor:
+    """Return (3, h, w) as (h, w, 3) in float32 on the CPU."""
+    return image.detach().to("cpu", torch.float32).permute(1, 2, 0)
 
 
 def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:

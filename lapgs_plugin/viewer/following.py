@@ -18,11 +18,10 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.rig import Rig
-from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import PictureSettings, ShownRun, draw
-from lapgs_plugin.viewer.poses import InitialView
+from lapgs_plugin.viewer.poses import InitialView, SceneCameras
 from lapgs_plugin.viewer.preview import read_preview, save_preview
 from lapgs_plugin.viewer.session import ViewerContent
 from lapgs_plugin.viewer.viewer import Viewer
@@ -70,29 +69,28 @@ class FollowedRun:
         self._placed: PlacedRasterizer | None = None
         self._created = ""
         self._stamps: dict[Path, Stamp] = {}
+        self._rig: Rig | None = None
         self.archive: RunArchive
         self.shown: ShownRun | None = None
         self.problem: str | None = None
-        self._read(None)
+        self._read()
         if self.problem is not None and self.shown is None:
             raise RunFolderError(self.problem)
 
-    def refresh(self, rig: Rig | None) -> bool:
+    def refresh(self) -> bool:
         """Read changes; False when there are none.
-
-        Args:
-            rig: the training cameras; None when unknown.
 
         Raises:
             RunFolderError: the run is missing or damaged; the earlier state is kept.
         """
         if all(_stamp(path) == stamp for path, stamp in self._stamps.items()):
             return False
-        self._read(rig)
+        self._read()
         return True
 
     def place(self, rig: Rig) -> None:
         """Set the training cameras."""
+        self._rig = rig
         if self.shown is not None:
             self.shown = ShownRun.of(self.shown.name, self.shown.renderer, rig)
 
@@ -106,7 +104,7 @@ class FollowedRun:
             return f"{self._folder.name}: {manifest.levels} levels"
         return f"{self._folder.name} is not complete: showing level {levels} of {manifest.levels}; others will follow"
 
-    def _read(self, rig: Rig | None) -> None:
+    def _read(self) -> None:
         stamps = {self._folder / MANIFEST: _stamp(self._folder / MANIFEST)}
         archive = RunArchive.open(self._folder, check=False)
         manifest = archive.manifest
@@ -132,7 +130,7 @@ class FollowedRun:
         self.shown = None
         if fields:
             renderer = HierarchyRenderer.of(manifest, fields, self._placed.rasterizer)
-            self.shown = ShownRun.of(archive.path().name, renderer, rig)
+            self.shown = ShownRun.of(archive.path().name, renderer, self._rig)
 
 
 class RunFollower:
@@ -159,8 +157,7 @@ class RunFollower:
         self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
         self._scene = scene
-        self._cameras: dict[str, Camera] = {}
-        self._rig: Rig | None = None
+        self._cameras: SceneCameras | None = None
         self._said: set[str] = set()
         self._placed_clients = False
 
@@ -171,15 +168,14 @@ class RunFollower:
             RunFolderError, SceneError: the given scene is not the run's.
         """
         try:
-            train, test = run_cameras(self._runs[0].archive, self._scene)
+            self._cameras = SceneCameras.of(self._runs[0].archive, self._scene)
         except (RunFolderError, SceneError) as error:
             if self._scene is not None:
                 raise
             self._report(f"without the scene's cameras: {error}")
         else:
-            self._cameras, self._rig = {**test, **train}, Rig.of(list(train.values()))
             for run in self._runs:
-                run.place(self._rig)
+                run.place(self._cameras.rig)
         self._show()
 
     def warm_up(self) -> None:
@@ -201,7 +197,7 @@ class RunFollower:
         """Show changes until `stop` is set."""
         while not stop.wait(POLL_SECONDS):
             try:
-                changed = [run.refresh(self._rig) for run in self._runs]
+                changed = [run.refresh() for run in self._runs]
                 if any(changed):
                     self._show()
             except LapgsError as error:  # a run that is removed or restarted stays visible
@@ -215,12 +211,12 @@ class RunFollower:
         if not self._placed_clients:
             self._placed_clients = True
             self._viewer.set_initial_view(self._start(shown))
-        self._viewer.show(ViewerContent(shown, others[0] if others else None, self._cameras, self._rig))
+        self._viewer.show(ViewerContent(shown, others[0] if others else None, self._cameras))
 
     def _start(self, shown: ShownRun) -> InitialView:
-        if self._rig is None:
+        if self._cameras is None:
             return InitialView.of_field(shown.renderer.fields[shown.renderer.levels - 1])
-        return InitialView.of_camera(next(iter(self._cameras.values())), self._rig)
+        return self._cameras.start
 
     def _set_status(self, line: str) -> None:
         self._page.status = line

@@ -13,18 +13,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.rendering.rig import Rig
-from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.pictures import ShownRun
-from lapgs_plugin.viewer.poses import InitialView
+from lapgs_plugin.viewer.poses import InitialView, SceneCameras
 from lapgs_plugin.viewer.session import PictureBudget, ViewerContent
 from lapgs_plugin.viewer.viewer import Viewer
 
@@ -56,8 +53,7 @@ class LiveView(Watcher):
         self._failed = False
         self._archive: RunArchive | None = None
         self._placed: PlacedRasterizer | None = None
-        self._cameras: dict[str, Camera] = {}
-        self._rig: Rig | None = None
+        self._cameras: SceneCameras | None = None
         self._begun = False  # whether clients have an initial view
         self._finished: dict[int, GaussianField] = {}
         self._credit, self._counted = 0.0, time.perf_counter()  # seconds for pictures, and the time of that balance
@@ -79,12 +75,11 @@ class LiveView(Watcher):
             self._placed = rasterizer_for(archive.manifest, self._device)
             self._finished = {level: archive.field(level) for level in archive.available_levels}
             try:
-                train, test = run_cameras(archive)
+                self._cameras = SceneCameras.of(archive)
             except LapgsError as error:
                 logger.info("shown without the scene's cameras: %s", error)
             else:
-                self._cameras, self._rig = {**test, **train}, Rig.of(list(train.values()))
-                self._viewer.set_initial_view(InitialView.of_camera(next(iter(self._cameras.values())), self._rig))
+                self._viewer.set_initial_view(self._cameras.start)
                 self._begun = True
 
     def stage_started(self, stage: Stage) -> None:
@@ -136,9 +131,9 @@ class LiveView(Watcher):
         if not self._begun:
             self._viewer.set_initial_view(InitialView.of_field(shown[manifest.levels - 1]))
             self._begun = True
-        self._viewer.show(
-            ViewerContent(ShownRun.of(self._archive.path().name, renderer, self._rig), None, self._cameras, self._rig)
-        )
+        rig = None if self._cameras is None else self._cameras.rig
+        run = ShownRun.of(self._archive.path().name, renderer, rig)
+        self._viewer.show(ViewerContent(run, None, self._cameras))
         self._page.status = (
             f"training level {stage.level} of {manifest.levels}: iteration {iteration:,} of {stage.iterations:,}, "
             f"{len(shown[stage.level]):,} Gaussians"

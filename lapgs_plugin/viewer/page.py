@@ -10,7 +10,6 @@ import errno
 import io
 import socket
 import threading
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,5 @@ class Page:
     def __enter__(self) -> Page:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()

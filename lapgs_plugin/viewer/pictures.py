@@ -7,9 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
@@ -183,13 +181,6 @@ def side_by_side(left: Tensor, right: Tensor, divider: float) -> Tensor:
     if 0 < column < width:
         image[:, :, max(column - DIVIDER_PIXELS // 2, 0) : column + DIVIDER_PIXELS // 2] = 1.0
     return image
-
-
-def as_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Convert an image (3, h, w) in [0, 1] to (h, w, 3) pixels of 8 bits."""
-    planes = image.mul(255.0).add_(0.5).to(torch.uint8)
-    # Stacking planes is faster than copying a permuted image, which jumps between planes for each byte.
-    return np.asarray(torch.stack(planes.unbind(0), dim=-1).cpu().numpy())
 
 
 def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int) -> tuple[Tensor, int]:

@@ -7,7 +7,9 @@ a training without it also saves a preview.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rendering.rig import Rig, Vector, forward, looking, posed
+from lapgs_plugin.runs.archive import RunArchive
 
 Quaternion = NDArray[np.float64]  # (4,) w, x, y, z
 
@@ -81,13 +84,39 @@ class InitialView:
         """Begin in front of a field with unknown cameras, with the up direction of COLMAP's images."""
         means = field.means.detach().cpu().double().numpy()
         centre = np.median(means, axis=0)
-        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.8))
+        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.8)) or 1.0  # all at one place
         position = centre - np.array([0.0, 0.0, 2.5 * radius])
         return cls(position, centre, np.array([0.0, -1.0, 0.0]), math.radians(50.0))
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera of a client that begins here, in a window of that size."""
         return looking(centred_lens(width, height, self.fov), self.position, self.look_at, self.up)
+
+
+@dataclass(frozen=True)
+class SceneCameras:
+    """The cameras of a run's scene.
+
+    Attributes:
+        by_view: by view name, held-out ones first.
+        rig: of the training cameras.
+    """
+
+    by_view: Mapping[str, Camera]
+    rig: Rig
+
+    @classmethod
+    def of(cls, archive: RunArchive, moved_to: Path | None = None) -> SceneCameras:
+        """Read the cameras of a run; arguments and errors as `rendering.run.run_cameras`."""
+        from lapgs_plugin.rendering.run import run_cameras  # a backbone's environment may lack what reads scenes
+
+        train, test = run_cameras(archive, moved_to)
+        return cls({**test, **train}, Rig.of(list(train.values())))
+
+    @property
+    def start(self) -> InitialView:
+        """The view from the first camera."""
+        return InitialView.of_camera(next(iter(self.by_view.values())), self.rig)
 
 
 def orbit_distance(position: Vector, rig: Rig) -> float:

@@ -60,7 +60,8 @@ def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> No
         start: the initial view.
     """
     with _logged(archive.path()):
-        from lapgs_plugin.viewer.pictures import PictureSettings, as_bytes, draw
+        from lapgs_plugin.rendering.images import as_bytes
+        from lapgs_plugin.viewer.pictures import PictureSettings, draw
 
         picture = draw(shown, None, start.camera(*SIZE), PictureSettings(), distance=1.0, zoom=1.0)
         manifest = archive.manifest
@@ -79,17 +80,14 @@ def save_run_preview(run: Path, device: str = "auto") -> None:
     """
     with _logged(run):
         # Imported here, because a backbone's environment may lack such packages as OpenImageIO.
-        from lapgs_plugin.rendering.rig import Rig
-        from lapgs_plugin.rendering.run import run_cameras, run_renderer
+        from lapgs_plugin.rendering.run import run_renderer
         from lapgs_plugin.runs.archive import RunArchive
         from lapgs_plugin.viewer.pictures import ShownRun
-        from lapgs_plugin.viewer.poses import InitialView
+        from lapgs_plugin.viewer.poses import SceneCameras
 
         archive = RunArchive.open(run)
-        train, test = run_cameras(archive)
-        rig = Rig.of(list(train.values()))
-        shown = ShownRun.of(run.name, run_renderer(archive, device), rig)
-        save_preview(archive, shown, InitialView.of_camera(next(iter({**test, **train}.values())), rig))
+        cameras = SceneCameras.of(archive)
+        save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from functools import partial
@@ -16,11 +16,11 @@ import viser
 from numpy.typing import NDArray
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.rendering.rig import Rig
+from lapgs_plugin.rendering.images import as_bytes
 from lapgs_plugin.viewer.controls import Controls
 from lapgs_plugin.viewer.pacing import TARGET_SECONDS, Pacing
-from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw
-from lapgs_plugin.viewer.poses import InitialView, Pose, orbit_distance
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw
+from lapgs_plugin.viewer.poses import InitialView, Pose, SceneCameras, orbit_distance
 
 MAX_SIDE = 2048
 """Longest side of a picture in pixels; browsers stretch it to larger windows."""
@@ -42,14 +42,12 @@ class ViewerContent:
     Attributes:
         run: the run.
         other: the run to compare with, or None.
-        cameras: the scene's cameras by view name; empty when unknown.
-        rig: the rig of these cameras, or None.
+        cameras: the scene's cameras; None when unknown.
     """
 
     run: ShownRun
     other: ShownRun | None
-    cameras: Mapping[str, Camera]
-    rig: Rig | None
+    cameras: SceneCameras | None
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,7 @@ class Session:
         self._sending: Future[None] | None = None
         self._lock = threading.Lock()
         self._content: ViewerContent | None = None
-        self._cameras: Mapping[str, Camera] = {}
-        self._rig: Rig | None = None
+        self._cameras: SceneCameras | None = None
         self._coming: ViewerContent | None = None  # content of the next picture
         self._controls: Controls | None = None
         self._handle: viser.IcosphereHandle | None = None
@@ -152,13 +149,13 @@ class Session:
 
     def _update_panel(self, content: ViewerContent) -> Controls:
         """Update the panel to the content."""
-        self._cameras, self._rig = content.cameras, content.rig
+        self._cameras = content.cameras
         if self._controls is None or not self._controls.fits(content.run, content.other):
             self._controls = Controls(
                 self._client,
                 content.run,
                 content.other,
-                list(content.cameras),
+                [] if content.cameras is None else list(content.cameras.by_view),
                 before=self._controls,
                 changed=self._change,
                 go_to=self._go_to,
@@ -231,14 +228,14 @@ class Session:
 
     def _go_to(self, index: int) -> None:
         """Move to a camera of the scene."""
-        assert self._rig is not None, "there are cameras"
-        pose = Pose.of(list(self._cameras.values())[index])
+        assert self._cameras is not None
+        pose = Pose.of(list(self._cameras.by_view.values())[index])
         camera = self._client.camera
         with self._client.atomic():
             camera.fov = pose.fov
             camera.position = pose.position
             camera.wxyz = pose.wxyz
-            camera.look_at = pose.position + orbit_distance(pose.position, self._rig) * pose.rotation[:, 2]
+            camera.look_at = pose.position + orbit_distance(pose.position, self._cameras.rig) * pose.rotation[:, 2]
 
     def _keep(self) -> int:
         """Store the current view for a path."""
@@ -265,16 +262,16 @@ class Session:
             frustum.visible = wanted
 
     def _add_frustums(self) -> list[viser.CameraFrustumHandle]:
-        assert self._rig is not None, "there are cameras"
+        assert self._cameras is not None
         frustums = []
-        for index, (name, camera) in enumerate(self._cameras.items()):
+        for index, (name, camera) in enumerate(self._cameras.by_view.items()):
             pose = Pose.of(camera)
             frustum = self._client.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov=pose.fov,
                 aspect=camera.width / camera.height,
-                scale=0.05 * self._rig.distance,
-                thickness=0.001 * self._rig.distance,
+                scale=0.05 * self._cameras.rig.distance,
+                thickness=0.001 * self._cameras.rig.distance,
                 color=(240, 150, 40),
                 wxyz=pose.wxyz,
                 position=pose.position,

@@ -13,16 +13,11 @@ import typer
 from lapgs_plugin.cli.run import CONTEXT, run
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import MissingExtraError, UserInputError
-from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_scene
-from tests.contract.stub_runs import STUBS, arguments
-from tests.viewer.pages import statuses
+from tests.contract.stub_runs import STUBS
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
-
-from lapgs_plugin.viewer.live import LiveView  # needs viser
 
 app = typer.Typer()
 app.command("train")(train)
@@ -46,24 +41,6 @@ def test_training_without_a_browser(scene: Path, tmp_path: Path) -> None:
     assert not any("view" in record["overhead_seconds"] for record in records)
     with socket.create_server(("127.0.0.1", port + 1)):
         pass  # nothing listens any more
-
-
-@pytest.mark.parametrize("command", ["train", "run"])
-def test_a_foreign_page_is_refused(command: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = []
-
-    def ask(self: LiveView, archive: RunArchive) -> None:
-        answers.extend(statuses(self._page.address))
-        raise typer.Exit
-
-    monkeypatch.setattr(LiveView, "run_started", ask)
-    if command == "train":
-        lapgs("train", scene, "-o", tmp_path / "run", "--view")
-    else:
-        stub, photos = STUBS["graphdeco"], tmp_path / "photos"
-        make_sample_scene(photos, width=64, height=48, views=12, points=300, progress=False)
-        lapgs("run", "--view", "--device", "cpu", stub.script, *arguments(stub, photos, tmp_path / "run"))
-    assert answers == [200, 403, 403]
 
 
 def test_mistakes_come_before_the_run_folder(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,6 +157,13 @@ def captured(folder: Path, results: list[Result]) -> Iterator[None]:
     results.append(Result(folder, output.getvalue(), progress.getvalue()))
 
 
+def without(kind: type, name: str) -> None:
+    """Take a method away from a class and its bases, which a test has loaded for itself."""
+    for each in kind.__mro__:
+        if name in vars(each):
+            delattr(each, name)
+
+
 def run_bare(stub: Stub, scene: Path, folder: Path, *more: Any) -> Result:
     """Run the script as Python does, without `lapgs run`."""
     results: list[Result] = []

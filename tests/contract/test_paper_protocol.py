@@ -176,6 +176,28 @@ def test_a_rate_of_sh_needs_the_familys_parameter_group(scene: Path, tmp_path: P
             drive(adapter, hierarchy="laplacian", sh_rate=2.0, **THIRDS)
 
 
+def test_a_rate_of_sh_holds_for_optimizers_that_a_loop_makes_again(scene: Path, tmp_path: Path) -> None:
+    rates: list[float] = []
+    more = ("--iterations", 12)
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *more) as adapter:
+        model = adapter.train.GaussianModel
+        setup, update = model.training_setup, model.update_learning_rate
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            self.given = training_args
+            setup(self, training_args)
+
+        def update_learning_rate(self: Any, iteration: int) -> Any:
+            rates.append(next(group["lr"] for group in self.optimizer.param_groups if group["name"] == "f_rest"))
+            if iteration == 6:
+                self.training_setup(self.given)
+            return update(self, iteration)
+
+        model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
+        drive(adapter, levels=1, sh_rate=2.0)
+    assert rates == pytest.approx([2 * 0.0025 / 20] * 12)
+
+
 def test_a_rate_of_sh_is_a_positive_factor() -> None:
     with pytest.raises(UserInputError, match=r"--sh-rate 0.0: expected a positive factor"):
         RunSettings(sh_rate=0.0)

@@ -113,6 +113,23 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
+def test_arguments_that_a_script_gathers_are_passed_on_by_name() -> None:
+    given: list[dict[str, Any]] = []
+
+    def training(cfg: Any, opt: Any, **more: Any) -> None:
+        given.append(more)
+
+    def gathering(cfg: Any, opt: Any, *more: Any) -> None:
+        given.append({"more": more})
+
+    cfg, opt = SimpleNamespace(source_path="scene"), SimpleNamespace(iterations=30)
+    TrainingCall.bind(training, (cfg,), {"opt": opt, "quiet": True}).changed(quiet=False).run()
+    TrainingCall.bind(gathering, (cfg, opt), {}).run()
+    assert given == [{"quiet": False}, {"more": ()}]
+    with pytest.raises(UserInputError, match=r"gathering\(\) of the script got 1 argument\(s\) in \*more"):
+        TrainingCall.bind(gathering, (cfg, opt, 3), {})
+
+
 def lapgs(*words: Any) -> None:
     typer.main.get_command(app)(list(map(str, words)), standalone_mode=False)
 

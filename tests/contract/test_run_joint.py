@@ -186,6 +186,26 @@ def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypat
         )
 
 
+def test_parameters_of_a_forks_own_are_not_followed(scene: Path, tmp_path: Path) -> None:
+    """A parameter group without a name, or of another name, belongs to no archived field."""
+    folder, rates = tmp_path / "run", []
+    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, "--densify_from_iter", 500) as adapter:
+        model = adapter.train.GaussianModel
+        setup = model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            setup(self, training_args)
+            own = torch.nn.Parameter(torch.zeros(3))
+            self.optimizer.param_groups.insert(0, {**self.optimizer.param_groups[0], "params": [own], "name": "tone"})
+            self.shoptimizer = torch.optim.Adam([own])
+            rates.append(self.optimizer.param_groups[1]["name"])
+
+        model.training_setup = training_setup
+        drive_residuals(adapter, joint=0.1, inherit="full")
+    assert rates == ["xyz", "xyz"]
+    assert RunArchive.open(folder).manifest.complete
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> None:
     """Joint training reduces the error of the training views."""

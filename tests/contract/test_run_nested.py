@@ -41,6 +41,7 @@ from tests.contract.stub_runs import (
     loaded,
     run_hierarchy,
     run_residuals,
+    without,
 )
 
 DEGREE = 2
@@ -108,13 +109,6 @@ def watch(adapter: Any, seen: Seen) -> None:
 
     model.update_learning_rate = update_learning_rate
     renderer.GaussianRasterizer = make_rasterizer
-
-
-def without(kind: type, name: str) -> None:
-    """Take a method away from a class and its bases, which a test has loaded for itself."""
-    for each in kind.__mro__:
-        if name in vars(each):
-            delattr(each, name)
 
 
 def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = False, resume: bool = False) -> Seen:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,18 @@ from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runner.imported import import_run, read_foreign_run
 from lapgs_plugin.runner.recording import BareRunRecorder
 from lapgs_plugin.runs import gpu_busy
-from tests.contract.stub_runs import ITERATIONS, NAMES, STUBS, Result, arguments, captured, loaded, run_bare
+from tests.contract.stub_runs import (
+    CHECKOUTS,
+    ITERATIONS,
+    NAMES,
+    STUBS,
+    Result,
+    arguments,
+    captured,
+    loaded,
+    run_bare,
+    without,
+)
 
 SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
 
@@ -69,6 +81,20 @@ def test_a_recorded_run_is_the_bare_run_to_the_bit(name: str, scene: Path, tmp_p
     assert values["gpu_busy_seconds"] == pytest.approx(each * ITERATIONS)
     assert values["train_seconds"] + values["saving_seconds"] < wall
     assert values["timeline"][-1]["elapsed"] <= values["train_seconds"]
+
+
+def test_iterations_are_steps_where_nothing_says_when_they_begin(scene: Path, tmp_path: Path) -> None:
+    script = tmp_path / "checkouts" / "graphdeco" / "train.py"
+    shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__"))
+    text = script.read_text(encoding="utf-8")
+    script.write_text(text.replace("gaussians.update_learning_rate(iteration)", "pass"), encoding="utf-8")
+    folder, more = tmp_path / "out", ("--iterations", 20)
+    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, *more, script=script) as adapter:
+        without(adapter.profile.model, "update_learning_rate")
+        BareRunRecorder(adapter, "cpu").run()
+    values = json.loads((folder / BARE_RECORD).read_text())
+    assert values["iterations"] == 20, "the loop leaves out the last step"
+    assert [entry["iteration"] for entry in values["timeline"]] == list(range(1, 21))
 
 
 def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) -> None:

@@ -194,6 +194,20 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--mult", "0.7", "--mult", "0.5"], ["--set", "mult=0.5"]),
+        (["--mult=0.7", "--dense=0.1"], ["--set", "mult=0.7"]),
+        (["--antialiasing", "-r", "2"], ["--set", "antialiasing=true"]),
+        (["--antialiasing"], ["--set", "antialiasing=true"]),
+        (["--dense", "mult"], []),
+    ],
+)
+def test_arguments_that_change_how_a_field_is_rendered(arguments: list[str], expected: list[str]) -> None:
+    assert commands._raster_options(arguments) == expected
+
+
+@pytest.mark.parametrize(
     ("resolution", "width", "expected"),
     [
         *(("1k", 4000, "1600"), ("1k", 800, "1"), ("2k", 4000, "2800"), ("4k", 4000, "1"), ("full", 4000, "1")),

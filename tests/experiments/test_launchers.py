@@ -18,6 +18,7 @@ from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
 from lapgs_plugin.experiments.runner import execute
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
+from lapgs_plugin.experiments.worker import Slot, gpu_name
 from tests.experiments.examples import COPY, START, copying_jobs
 
 NOTE_ENVIRONMENT = START + (
@@ -49,7 +50,7 @@ def starts(tmp_path: Path) -> Counter[str]:
 
 def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
     code = COPY.replace(START, NOTE_ENVIRONMENT)
-    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus="3,5")
+    work_order = order(tmp_path, 6, 2, code, seconds=0.3, gpus="3, 5")
     outcomes = run_all(work_order, lambda: launch(work_order))
     assert [outcome.state for outcome in outcomes] == [DONE] * 6
     assert set((tmp_path / "started-gpus").read_text().split()) == {"3", "5"}
@@ -61,6 +62,20 @@ def test_visible_gpus_are_those_that_are_allowed(monkeypatch: pytest.MonkeyPatch
     assert launchers.visible_gpus() == ["2", "7"]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert launchers.visible_gpus() == []
+
+
+def test_the_gpu_of_a_slot_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text('#!/bin/sh\necho "Card ${4}"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,7")
+    assert gpu_name(Slot()) == "Card 2"
+    assert gpu_name(Slot("7")) == "Card 7"
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert gpu_name(Slot()) == "", "hidden"
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert gpu_name(Slot()) == "Card 0"
 
 
 def test_workers_that_do_nothing_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

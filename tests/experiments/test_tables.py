@@ -137,6 +137,12 @@ def test_latex() -> None:
         assert {line.count(" & ") + 1 for line in rows} == {columns}
 
 
+def test_titles_in_latex_keep_their_characters() -> None:
+    text = latex(table_of(paper_experiment(title=r"a@b ^2 {x} \y ~ $5 rho rhombus N_GS")))
+    escaped = r"a@b \textasciicircum{}2 \{x\} \textbackslash{}y \textasciitilde{} \$5 $\rho$ rhombus $N_{\mathrm{GS}}$."
+    assert rf"\caption{{{escaped}}}" in text
+
+
 def test_transposed_tables_have_a_column_for_each_variant() -> None:
     table = table_of(paper_experiment(table={"columns": ["psnr", "minutes"], "transposed": True}))
     assert "|  | bare | two |" in markdown(table)
@@ -168,6 +174,12 @@ def test_csv_is_tidy(tmp_path: Path) -> None:
         {"run": "a", "psnr": "30.25", "note": 'x,"y', "ssim": ""},
         {"run": "b", "psnr": "", "note": "", "ssim": "0.5"},
     ]
+
+
+def test_names_that_look_like_numbers_stay_names(tmp_path: Path) -> None:
+    rows = [{"variant": "0.50", "scene": "1e3", "psnr": 30.25}, {"variant": "0.5", "scene": "007", "psnr": 31}]
+    exports.write_csv(tmp_path / "r.csv", rows)
+    assert exports.read_csv(tmp_path / "r.csv") == rows
 
 
 def test_parquet_has_types_and_nulls(tmp_path: Path) -> None:

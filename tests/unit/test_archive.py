@@ -160,8 +160,8 @@ def test_overwrite_removes_only_files_of_a_run(tmp_path: Path) -> None:
         archive.append_history({"level": 0, "iteration": 1})
         archive.save_checkpoint({"x": 1})
         archive.write_metrics({"psnr": 1.0})
-    written = ("renders/test/a.png", "report.html", "preview.jpg", "cache/train/000000.bin")
-    for name in (*written, "level_1/.point_cloud.ply.9.tmp"):
+    written = ("renders/test/a.png", "report.html", "preview.jpg", "cache/train/000000.bin", "run.toml")
+    for name in (*written, "tensorboard/events.out.tfevents.1", "level_1/.point_cloud.ply.9.tmp"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"ours")
     mine = {"notes.txt": b"mine", "level_1/edited.ply": b"mine", "paper/figure.png": b"mine"}

@@ -22,6 +22,7 @@ from lapgs_plugin.reports.charts import (
     draw_bars,
     draw_lines,
 )
+from lapgs_plugin.reports.report import number_text
 
 LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
 WIDTH, HEIGHT = WHOLE.width, WHOLE.height
@@ -122,6 +123,14 @@ def test_nothing_runs_behind_an_inset(curves: list[list[tuple[float, float]]]) -
                 assert x < INSET_AT[0] - 0.1 or y < INSET_AT[1]  # y counts downwards
 
 
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, "0"), (0.01234, "0.0123"), (12.34, "12.3"), (999.4, "999"), (999.7, "1,000"), (1234.5, "1,234")],
+)
+def test_numbers_have_three_digits_or_all_before_the_point(value: float, expected: str) -> None:
+    assert number_text(value) == expected
+
+
 coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 
 
@@ -130,7 +139,7 @@ coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 def test_arrows_begin_and_point_where_the_axes_say(
     ends: list[tuple[tuple[float, float], tuple[float, float]]],
 ) -> None:
-    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr, head=4.0)
+    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr)
     right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
     top = float(chart.y_ticks[-1].label)
     for arrow, (start, end) in zip(chart.arrows, ends, strict=True):

@@ -28,7 +28,7 @@ class Camera(nn.Module):
         self.image_name = name
         self.original_image = torch.full((3, HEIGHT, WIDTH), 0.5, device=data_device)
         self.image_width, self.image_height, self.resolution = WIDTH, HEIGHT, (WIDTH, HEIGHT)
-        self.focal_x, self.focal_y, self.Cx, self.FoVx = 10.0, 12.0, 4.0, 0.7
+        self.focal_x, self.focal_y, self.Cx, self.FoVx = 10.0, np.float32(12.0), 4.0, 0.7
         self.K = np.array([[10.0, 0, 4], [0, 12, 3], [0, 0, 1]])
         self.mask = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % WIDTH < WIDTH // 2
         self.invdepthmap, self.depth_mask, self.depth_reliable = np.ones((HEIGHT, WIDTH), np.float32), None, True
@@ -51,7 +51,7 @@ def test_attributes_follow_the_size_of_the_level() -> None:
     assert images[images.key(camera)].size == (WIDTH, HEIGHT)
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
     assert (view.image_width, view.image_height, view.resolution) == (4, 3, (4, 3))
-    assert (view.focal_x, view.focal_y, view.Cx, view.FoVx) == (5.0, 6.0, 2.0, 0.7)
+    assert (view.focal_x, view.focal_y, view.Cx, view.FoVx) == (5.0, 6.0, 2.0, 0.7), "also a number of NumPy"
     assert view.K.tolist() == [[5, 0, 2], [0, 6, 1.5], [0, 0, 1]]
     assert view.mask.tolist() == [[[True, True, False, False]] * 3]
     assert view.invdepthmap.shape == (3, 4)
@@ -115,6 +115,18 @@ def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
     assert image.shape == (3, 4, 3)
     assert image.unique().tolist() == [0.75], "over zero, not over the checkout's white background"
     assert wrapper.noted is None
+
+
+def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo() -> None:
+    """Joint training renders it at each reading."""
+    camera, images = made()
+    wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    below, read = wrapper.stage.accumulated, []  # type: ignore[union-attr]  # just set
+    wrapper.stage.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))  # type: ignore[union-attr,assignment]
+    place = camera.world_view_transform
+    assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), place))[1].unique().tolist() == [0.75]
+    assert read == [images.key(camera)]
+    assert function(torch.zeros(2, 3), settings(6, 8, torch.ones(3), place))[1].unique().tolist() == [GREY]
 
 
 def test_training_on_a_view_that_is_not_recognised_stops() -> None:

@@ -23,7 +23,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
-from lapgs_plugin.rasterizers import signed_color
+from lapgs_plugin.rasterizers import extensions, signed_color
 from lapgs_plugin.rasterizers.extensions import CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
     ColorPath,
@@ -147,9 +147,9 @@ def test_the_paths_of_signed_calls() -> None:
     assert forced.calls == [(2, True)]
 
 
-def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_one_warning_and_one_probe(caplog: pytest.LogCaptureFixture) -> None:
     extension = Unpatched()
-    rasterizer = SignedColorRasterizer(extension, checkout=tmp_path)
+    rasterizer = SignedColorRasterizer(extension)
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             scene(signed=True).render(rasterizer)
@@ -228,6 +228,12 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
         found = list(check(subject, chosen))
     assert len(found) == 2 * len(names)
     assert [(outcome.case, outcome.problems) for outcome in found if outcome.problems] == []
+
+
+def test_an_extension_inside_of_a_package_that_is_absent_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    owners = {"absent_package.raster": None, "absent_module": None, "json.decoder": None}
+    monkeypatch.setattr(extensions, "rasterizer_owners", lambda: owners)
+    assert installed_extensions() == ["json.decoder"]
 
 
 def test_screen_gradients_come_back_in_pixels() -> None:

@@ -69,17 +69,17 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     monkeypatch.setattr(GaussianField, "load_ply", lambda path: read.append(path.parent.name) or load(path))
     run = FollowedRun(folder, "cpu", "auto")
     assert levels(run) == []
-    assert not run.refresh(None)
+    assert not run.refresh()
     finish(folder, complete)
-    assert run.refresh(None)
+    assert run.refresh()
     assert levels(run) == [1]
     finish(folder, complete)
-    assert run.refresh(None)
+    assert run.refresh()
     assert levels(run) == [1, 0]
     assert [name for name in read if name.startswith("level")][-1:] == ["level_0"]
     assert run.status() == "run: 2 levels"
     before = len(read)
-    assert not run.refresh(None)
+    assert not run.refresh()
     assert len(read) == before
 
 
@@ -92,7 +92,7 @@ def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:
     assert levels(run) == [1]
     assert "cut short" in run.status()
     ply.write_bytes(whole)
-    assert run.refresh(None)
+    assert run.refresh()
     assert levels(run) == [1, 0]
     assert run.problem is None
 
@@ -117,7 +117,7 @@ def test_another_run_in_the_same_folder_is_another_field(scene: Path, tmp_path: 
     for level in (1, 0):
         new = (other / f"level_{level}" / "point_cloud.ply").read_bytes()
         (folder / f"level_{level}" / "point_cloud.ply").write_bytes(new)
-    assert run.refresh(None)
+    assert run.refresh()
     assert not torch.equal(run.shown.renderer.fields[1].means, first)
 
 
@@ -161,7 +161,7 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
         stop.set()
         thread.join()
     assert [list(content.run.counts) for content in viewer.shown[:2]] == [[1], [1, 0]]
-    assert len(viewer.shown[0].cameras) == 10
+    assert len(viewer.shown[0].cameras.by_view) == 10
     assert viewer.starts == 1
     assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]
 

@@ -18,8 +18,9 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, as_bytes, draw, side_by_side
-from lapgs_plugin.viewer.poses import Pose
+from lapgs_plugin.rendering.images import as_bytes
+from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw, side_by_side
+from lapgs_plugin.viewer.poses import InitialView, Pose
 from tests.training_scene import blob_field, ring_camera
 
 CAMERA = ring_camera(0.4, 64, 48)
@@ -171,3 +172,16 @@ def test_poses_and_cameras_are_inverse() -> None:
 def test_bytes_are_rounded() -> None:
     pixels = as_bytes(torch.tensor([0.0, 0.5, 1.0]).view(3, 1, 1))
     np.testing.assert_array_equal(pixels, [[[0, 128, 255]]])
+
+
+def test_a_view_of_a_field_whose_cameras_are_unknown() -> None:
+    means = torch.tensor([[1.0, 2.0, 3.0]]).repeat(5, 1)
+    field = GaussianField(means, torch.eye(4)[:1].expand(5, 4), means, torch.zeros(5), torch.zeros(5, 1, 3))
+    for spread in (0.0, 0.5):  # all at one place, or not
+        shown = field.with_parameters({"means": means + spread * torch.randn(5, 3)})
+        camera = InitialView.of_field(shown).camera(32, 16)
+        x, y, z = (
+            camera.world_to_camera[:3, :3] @ means.new_tensor(np.median(shown.means, 0)) + camera.world_to_camera[:3, 3]
+        )
+        assert (x, y) == pytest.approx((0.0, 0.0), abs=1e-5)  # worst seen: 5e-7
+        assert z > 0

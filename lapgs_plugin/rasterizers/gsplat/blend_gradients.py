@@ -24,7 +24,7 @@ gsplat divides the transmittance behind the last Gaussian, 1e-4 or more with an 
 
 
 class ToBlend(NamedTuple):
-    """Sorted Gaussians of c cameras, n for each, with p pairs of a Gaussian and a tile; all contiguous."""
+    """Hold sorted Gaussians of c cameras, n for each, with p pairs of a Gaussian and a tile; all contiguous."""
 
     means2d: Tensor  # (c, n, 2)
     conics: Tensor  # (c, n, 3)
@@ -36,7 +36,7 @@ class ToBlend(NamedTuple):
 
 
 class Blended(NamedTuple):
-    """Images, and what their gradients need."""
+    """Hold images, and what their gradients need."""
 
     images: Tensor  # (c, h, w, 3)
     alphas: Tensor  # (c, h, w, 1), empty if our kernels blended

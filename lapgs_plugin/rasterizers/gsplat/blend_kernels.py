@@ -39,7 +39,7 @@ NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
 
 
 class Shape(NamedTuple):
-    """How a program's region and its bucket of Gaussians lie in the threads of its warps; all are powers of 2.
+    """Lay out a program's region and its bucket of Gaussians in the threads of its warps; all are powers of 2.
 
     Attributes:
         lanes: threads side by side, one for each column of the region.

@@ -13,7 +13,7 @@ from lapgs_plugin.fields.camera import Camera
 
 
 class DeviceCameras(NamedTuple):
-    """c cameras of one image size on the device that renders."""
+    """Hold c cameras of one image size on the device that renders."""
 
     poses: Tensor  # (c, 4, 4) world to camera
     intrinsics: Tensor  # (c, 3, 3)

@@ -36,7 +36,7 @@ FAR_PLANE = 1e10
 
 
 class Intermediates(NamedTuple):
-    """Intermediate results of a render, which the backward pass needs; n Gaussians, c cameras."""
+    """Hold what the backward pass of a render needs; n Gaussians, c cameras."""
 
     given: ToBlend
     blended: Blended
@@ -118,7 +118,7 @@ def _channels_first(images: Tensor) -> Tensor:
 
 
 class _Render(torch.autograd.Function):
-    """(field, cameras) -> image (3, h, w), or images (c, 3, h, w) of several, with interleaved colours in memory."""
+    """Map (field, cameras) to an image (3, h, w), or images (c, 3, h, w), with interleaved colours in memory."""
 
     @staticmethod
     def forward(

@@ -16,7 +16,8 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
-from lapgs_plugin.reference_raster.layout import MIN_ROOT, NEAR_DEPTH, PIXEL_VARIANCE, RADIUS_SIGMAS
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.oracle import footprint_radii
 
 
 @dataclass(frozen=True)
@@ -118,9 +119,7 @@ def three_sigma_radii(conics: Tensor) -> Tensor:
     """Return radii (n,) in whole pixels from the entries xx, xy, yy of the inverse 2D covariances, (n, 3)."""
     xx, xy, yy = conics.unbind(-1)  # (n,) each
     determinants = 1 / (xx * yy - xy * xy)  # of the covariances
-    middles = 0.5 * (xx + yy) * determinants
-    roots = torch.sqrt(torch.clamp_min(middles * middles - determinants, MIN_ROOT))
-    return torch.ceil(RADIUS_SIGMAS * torch.sqrt(middles + roots))
+    return footprint_radii(xx * determinants, yy * determinants, determinants)
 
 
 @lru_cache(maxsize=4)

@@ -17,7 +17,8 @@ from types import ModuleType
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.standins import fused_ssim, simple_knn
+from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
+from lapgs_plugin.reference_raster.standins import fused_ssim
 from lapgs_plugin.reference_raster.standins.choice import variant_for
 from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 
@@ -42,7 +43,8 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
         found[f"{name}._C"] = _module(f"{name}._C", ssim if VARIANTS[each].fused_ssim else {})
     found |= {
         "simple_knn": _module("simple_knn", {}, package=True),
-        "simple_knn._C": _module("simple_knn._C", {"distCUDA2": simple_knn.distCUDA2}),
+        # With fewer than four points the mean is over those that exist, where the CUDA code returns infinity.
+        "simple_knn._C": _module("simple_knn._C", {"distCUDA2": mean_squared_distance}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
     }
     for full, module in found.items():

@@ -129,7 +129,7 @@ class Output:
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
-    """Render, differentiable by all tensors of `inputs`.
+    """Render differentiably by all tensors of `inputs`.
 
     Raises:
         UserInputError: tensors do not fit each other, or the projection does not fit the field of view.
@@ -182,7 +182,7 @@ def view_of(settings: Settings) -> View:
 
 def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
     """Return which points (n, 3) are in front of the near plane, (n,) bool; the CUDA code tests no more."""
-    return _depths(positions.detach(), settings.viewmatrix) > NEAR_DEPTH
+    return depths_of(positions.detach(), settings.viewmatrix) > NEAR_DEPTH
 
 
 class _Call:
@@ -220,13 +220,13 @@ class _Call:
         """Render with the tiles of the options."""
         assign = None
         if self.options.mult is not None:
-            depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
+            depths = depths_of(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
             assign = snug_tiles(depths, self.options.mult, *self.view.tiles)
         return pipeline.render(gaussians, self.view, background, keep=keep, assign=assign)
 
     def shaded_by_depth(self, gaussians: Gaussians) -> Gaussians:
         """Return the same Gaussians with 1 / depth as their first colour channel."""
-        depths = _depths(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
+        depths = depths_of(torch.from_numpy(gaussians.means), self.settings.viewmatrix).numpy()
         colors = np.zeros((len(depths), 3), np.float32)
         np.divide(1, depths, out=colors[:, 0], where=depths > 0)
         return replace(gaussians, sh=None, colors=colors)
@@ -247,7 +247,7 @@ class _Rasterize(torch.autograd.Function):
         )
         if n == 0:
             image = torch.zeros_like(image)
-        depths = _depths(torch.from_numpy(gaussians.means), call.settings.viewmatrix)
+        depths = depths_of(torch.from_numpy(gaussians.means), call.settings.viewmatrix)
         call.depths = torch.where(radii > 0, depths, 0.0)
         if weights is not None:
             assert rendering.kept is not None
@@ -332,7 +332,7 @@ def _add(a: list[Tensor | None], b: list[Tensor | None]) -> list[Tensor | None]:
     return [y if x is None else x if y is None else x + y for x, y in zip(a, b, strict=True)]
 
 
-def _depths(means: Tensor, viewmatrix: Tensor) -> Tensor:
+def depths_of(means: Tensor, viewmatrix: Tensor) -> Tensor:
     """Return camera-space z, (n,)."""
     matrix = viewmatrix.detach().to("cpu", torch.float32)
     return means @ matrix[:3, 2] + matrix[3, 2]

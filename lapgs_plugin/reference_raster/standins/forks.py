@@ -22,7 +22,7 @@ from lapgs_plugin.reference_raster.oracle import rotation_matrices
 from lapgs_plugin.reference_raster.standins.binding import Rasterizer, WholeSh, gather
 from lapgs_plugin.reference_raster.standins.blending import Blending
 from lapgs_plugin.reference_raster.standins.covariance import covariances_of, matrices
-from lapgs_plugin.reference_raster.standins.engine import Inputs, Options, Output, rasterize
+from lapgs_plugin.reference_raster.standins.engine import Inputs, Options, Output, depths_of, rasterize
 
 logger = logging.getLogger(__name__)
 
@@ -219,7 +219,7 @@ class PixelGS(WholeSh):
         settings = self.raster_settings
         points = inputs.means2d
         if settings.depth_threshold is not None and points.requires_grad:
-            depths = inputs.means.detach() @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
+            depths = depths_of(inputs.means.detach(), settings.viewmatrix)
             factors = (depths / settings.depth_threshold).square().clamp(max=1)[:, None]
             points = points * factors + (points * (1 - factors)).detach()
         return super()._render(replace(inputs, means2d=points))
@@ -305,9 +305,9 @@ class Surfels(WholeSh):
         third = inputs.scales.detach().max(1, keepdim=True).values * THIN
         inputs = replace(inputs, scales=torch.cat([inputs.scales, third], 1))
         output = rasterize(settings, inputs, Options())
-        depths = inputs.means @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
         normals = rotations[:, :, 2] @ settings.viewmatrix[:3, :3]
         centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
+        depths = centres[:, 2]
         normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
         black = settings._replace(bg=torch.zeros(3))
         unshaded = replace(inputs, sh=None, means2d=torch.zeros_like(inputs.means2d))
