@@ -29,6 +29,16 @@ def one_line(text: str) -> str:
     return line
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or the name of its type if it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def typed_line(error: BaseException) -> str:
+    """Return the type of an error and the first line of its message."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or ['no message'])[0]}"
+
+
 class LapgsError(Exception):
     """An error that one line explains; the command line prints it and exits with `exit_code`.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from lapgs_plugin.errors import typed_line
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, pixel_weights, random_case
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, render_transmittance
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
@@ -189,8 +190,7 @@ def check_case(subject: Subject, case: Case) -> Outcome:
     try:
         actual = _render(subject.rasterizer, case, weights, subject.device)
     except Exception as error:  # an error of the rasterizer is a result, and the next case follows
-        line = (str(error).splitlines() or [""])[0]
-        return replace(outcome, problems=(f"raised {type(error).__name__}: {line}",))
+        return replace(outcome, problems=(f"raised {typed_line(error)}",))
     problems = list(_shape_problems(actual, expected))
     if problems:
         return replace(outcome, problems=tuple(problems))

@@ -131,7 +131,13 @@ class StagePlan:
         return iter(self.stages)
 
     def __getitem__(self, level: int) -> Stage:
-        """Return the stage that trains `level`."""
+        """Return the stage that trains `level`.
+
+        Raises:
+            IndexError: there is none; a negative level does not count from the end.
+        """
+        if not 0 <= level < self.levels:
+            raise IndexError(f"level {level}, expected 0 to {self.levels - 1}")
         return self.stages[self.levels - 1 - level]
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,13 +71,14 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def one_line_errors(out: Path) -> Iterator[None]:
-    """Turn an OSError during writing into a LapgsError."""
+    """Turn an error of the file system or of SQLite during writing into a LapgsError."""
     try:
         yield
-    except OSError as error:
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, "strerror", None) or error
         raise LapgsError(
-            f"{out}: the scene cannot be written ({error.strerror or error}); check free space and permissions, then "
-            "run the command again"
+            f"{out}: the scene cannot be written ({reason}); check free space and permissions, then run the command "
+            "again"
         ) from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import kornia
@@ -210,9 +211,13 @@ def test_refuses_what_it_cannot_compare(p: Tensor, t: Tensor, weight: float, mes
 
 
 @pytest.mark.parametrize("device", ["cpu", "meta"])
-def test_images_of_two_shapes_are_refused_on_every_device(device: str) -> None:
-    """PyTorch would broadcast them, and a kernel read beyond the smaller one."""
+def test_the_same_is_refused_on_every_device(device: str) -> None:
+    """PyTorch would broadcast images of two shapes, and a kernel read beyond the smaller one."""
     p, t = torch.zeros(3, 8, 8, device=device), torch.zeros(1, 8, 8, device=device)
     for pair in ((p, t), (p[None], p), (p[None], torch.stack([p, p]))):
         with pytest.raises(UserInputError, match="expected two images of one shape"):
             photometric_loss(*pair)
+    with pytest.raises(UserInputError, match=r"pass target.detach\(\)"):
+        photometric_loss(p, p.clone().requires_grad_())
+    with pytest.raises(UserInputError, match="ssim_weight nan: expected a number from 0 to 1"):
+        photometric_loss(p, p, math.nan)

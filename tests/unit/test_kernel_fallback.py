@@ -156,7 +156,7 @@ def test_a_stack(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixtu
     monkeypatch.setattr(rasterizer_module, "direct_works", lambda: True)
     monkeypatch.setattr(rasterizer_module, "GsplatStack", lambda fields, device, **options: chosen.update(options))
     rasterizer = GsplatRasterizer(device="cpu")
-    rasterizer._device = torch.device("cuda")
+    rasterizer._may_be_direct = True
     rasterizer.stack([field()])
     assert chosen == {"antialiased": False, "direct": False}
     (line,) = said(caplog)

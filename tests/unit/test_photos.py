@@ -24,7 +24,7 @@ from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserI
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.prepare import clip as clip_module
-from lapgs_plugin.scenes.prepare import left_out, pipeline, placement
+from lapgs_plugin.scenes.prepare import left_out, pipeline
 from lapgs_plugin.scenes.prepare import photos as photos_module
 from lapgs_plugin.scenes.prepare.clip import judge, pick_frames, sharp_and_moving, write_frames
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher
@@ -52,7 +52,7 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
     photos, masks = tmp_path / "photos", tmp_path / "masks"
     photos.mkdir()
     hidden = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    hidden[:, 120:] = 1
+    hidden[:, SIZE[0] // 3 :] = 1
     for index in range(4):
         picture, mask = Image.fromarray(_pixels(index)), hidden
         if index == 1:
@@ -71,7 +71,7 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
     result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
     assert len(result.registered) == 4
     model = pycolmap.Reconstruction(out / "sparse" / "0")
-    assert _centre_errors(model).max() < 0.02  # seen 4.4e-3
+    assert _centre_errors(model).max() < 0.02  # seen 7.4e-4
     scene = load_scene(out, progress=False)
     by_name = {view.name: view for view in scene.train}
     assert sorted(by_name) == ["00.png", "01.jpg", "02.jpg", "03.png"]
@@ -244,54 +244,6 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
     refused(r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or 2_mask\.png")
     write_image(masks / "2.png", torch.ones(3, 80, 64))
     refused(r"2\.png: the mask is 64x80 pixels, its photo 80x64 \(EXIF turns .*\); expected the same size")
-
-
-def _model(fx: float, fy: float, placed: int) -> SimpleNamespace:
-    images = {key: SimpleNamespace(camera_id=1, has_pose=True) for key in range(placed)}
-    camera = SimpleNamespace(focal_length_x=fx, focal_length_y=fy)
-    return SimpleNamespace(images=images, cameras={1: camera}, num_reg_images=lambda: placed, num_points3D=lambda: 0)
-
-
-@pytest.mark.parametrize(
-    ("asked", "first", "again", "chosen", "message"),
-    [
-        ("auto", (1090, 8), 8, "second", "differ by 9%, which no usual lens does; placing the cameras again"),
-        ("auto", (1090, 8), 5, "first", "with a simpler lens only 5 of 8 photos could be placed"),
-        ("auto", (1000, 2), 8, "second", "only 2 of 8 photos could be placed; placing the cameras again"),
-        ("auto", (1000, 2), 3, "incremental", "only 3 photos could be placed; looking for more matches"),
-        ("auto", (1000, 7), 8, "first", ""),
-        ("OPENCV", (1090, 8), 8, "first", "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
-    ],
-)
-def test_doubtful_lenses_are_told_and_tried_again(
-    asked: str,
-    first: tuple[float, int],
-    again: int,
-    chosen: str,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    models = {"first": _model(first[0], 1000, first[1]), "second": _model(1000, 1000, again)}
-    models["incremental"] = models["global"] = _model(1000, 1000, 8)
-
-    def mapped(
-        job: object, title: str, folder: Path, model: str | None, mapper: str | None, database: Path | None
-    ) -> list[object]:
-        assert model in (None, "SIMPLE_RADIAL")
-        return [models[mapper or ("first" if model is None else "second")]]
-
-    monkeypatch.setattr(placement, "map_photos", mapped)
-    monkeypatch.setattr(placement, "remove_unlinked", lambda model: None)
-    monkeypatch.setattr(placement, "match_more", lambda job: tmp_path)
-    found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(8)})
-    job = Job(tmp_path, found, PrepareSettings(camera_model=asked), False)
-    with caplog.at_level(logging.INFO):
-        (best,) = placement.place_cameras(job)
-    assert best is models[chosen]
-    assert message in caplog.text
-    assert bool(message) == bool(caplog.text)
 
 
 def test_cameras_of_a_database_get_one_focal_length(tmp_path: Path) -> None:

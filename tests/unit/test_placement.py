@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+import shutil
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
-from lapgs_plugin.scenes.prepare import placement
-from lapgs_plugin.scenes.prepare.colmap import MOST_GUIDED, match_more
+from lapgs_plugin.scenes.prepare import colmap, placement
+from lapgs_plugin.scenes.prepare.colmap import MOST_GUIDED, Attempt, match_more
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import Photos
 from lapgs_plugin.scenes.prepare.settings import GLOBAL, INCREMENTAL, PrepareSettings
@@ -46,42 +49,61 @@ def test_photos_that_points_do_not_link_are_removed() -> None:
     placement.remove_unlinked(made)
     assert placed(made) == [1, 2, 3, 4]
     assert made.num_points3D() == 30
-    made = model(photos=2)
-    placement.remove_unlinked(made)
-    assert len(placed(made)) == 1
+    for photos in (0, 2):
+        made = model(photos=photos)
+        placement.remove_unlinked(made)
+        assert len(placed(made)) == min(photos, 1)
 
 
 @pytest.mark.parametrize(
-    ("placed_by", "attempts", "kept"),
+    ("lens", "focal", "placed_by", "attempts", "kept", "message"),
     [
-        ((6, 8, 8, 8), 1, 6),  # enough are placed: three quarters
-        ((5, 6, 8, 8), 2, 6),  # a simpler lens suffices
-        ((5, 4, 6, 8), 3, 6),  # more matches suffice
-        ((5, 4, 5, 8), 4, 8),
-        ((5, 4, 4, 4), 4, 5),  # never fewer than the first attempt
+        ("auto", 50, (6, 8, 8, 8), 1, 6, ""),  # enough are placed: three quarters
+        ("auto", 50, (5, 6, 8, 8), 2, 6, "only 5 of 8 photos could be placed; placing the cameras again"),
+        ("auto", 50, (5, 4, 6, 8), 3, 6, "only 5 photos could be placed; looking for more matches"),
+        ("auto", 50, (5, 4, 5, 8), 4, 8, "looking for more matches"),
+        ("auto", 50, (5, 4, 4, 4), 4, 5, "looking for more matches"),  # never fewer than the first attempt
+        ("auto", 54.5, (8, 8), 2, 8, "differ by 9%, which no usual lens does; placing the cameras again"),
+        ("auto", 54.5, (8, 5), 2, 8, "with a simpler lens only 5 of 8 photos could be placed"),
+        ("OPENCV", 54.5, (8, 8), 1, 8, "leave out --camera-model OPENCV, or choose SIMPLE_RADIAL"),
     ],
 )
 def test_the_attempt_that_places_most_photos_is_kept(
-    placed_by: tuple[int, ...], attempts: int, kept: int, monkeypatch: pytest.MonkeyPatch
+    lens: str,
+    focal: float,
+    placed_by: tuple[int, ...],
+    attempts: int,
+    kept: int,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     asked: list[tuple[str | None, str | None, Path | None]] = []
+    made: list[pycolmap.Reconstruction] = []
 
-    def mapped(
-        _: Job, __: str, ___: Path, lens: str | None, mapper: str | None, database: Path | None
-    ) -> list[pycolmap.Reconstruction]:
-        asked.append((lens, mapper, database))
+    def mapped(_: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
+        asked.append((attempt.lens, attempt.mapper, attempt.database))
         photos = placed_by[len(asked) - 1]
         # The global mapper gives every photo a place; only some are linked.
-        return [model((20, range(1, photos + 1)), photos=PHOTOS if mapper == GLOBAL else photos)]
+        found = model((20, range(1, photos + 1)), photos=PHOTOS if attempt.mapper == GLOBAL else photos)
+        if attempt.lens is None:
+            found.cameras[1].model = pycolmap.CameraModelId.PINHOLE
+            found.cameras[1].params = [focal, 50.0, 32.0, 24.0]
+        made.append(found)
+        return [found]
 
     monkeypatch.setattr(placement, "map_photos", mapped)
     monkeypatch.setattr(placement, "match_more", lambda job: job.work / "more.db")
     found = Photos(Path("photos"), {f"{number}.jpg": Path() for number in range(1, PHOTOS + 1)})
-    models = placement.place_cameras(Job(Path("work"), found, PrepareSettings(), progress=False))
+    with caplog.at_level(logging.INFO):
+        (best,) = placement.place_cameras(Job(Path("work"), found, PrepareSettings(camera_model=lens), progress=False))
     more = Path("work", "more.db")
     expected = [(None, None, None), (SIMPLE, None, None), (SIMPLE, INCREMENTAL, more), (SIMPLE, GLOBAL, more)]
     assert asked == expected[:attempts]
-    assert models[0].num_reg_images() == kept
+    assert best.num_reg_images() == kept
+    assert best is next(each for each in reversed(made) if each.num_reg_images() == kept)
+    assert message in caplog.text
+    assert bool(message) == bool(caplog.text)
 
 
 @pytest.mark.parametrize("pairs", [0, MOST_GUIDED + 1])
@@ -94,3 +116,32 @@ def test_no_more_matches_without_pairs_or_with_too_many(pairs: int, tmp_path: Pa
     database.close()
     assert match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False)) is None
     assert [file.name for file in tmp_path.iterdir()] == ["database.db"]
+
+
+def test_more_matches_start_from_the_whole_database_after_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite would add the log of an interrupted call to a new copy; and COLMAP's own log may outlive COLMAP."""
+    readers = []
+
+    def write(file: Path, pairs: Sequence[tuple[int, int]]) -> None:
+        """Add rows as COLMAP does, while another connection is open, which keeps them in the log."""
+        with closing(sqlite3.connect(file)) as writer:
+            writer.execute("PRAGMA journal_mode=WAL")
+            writer.execute("CREATE TABLE IF NOT EXISTS two_view_geometries (pair_id INTEGER, rows INTEGER)")
+            writer.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", pairs)
+            writer.commit()
+            readers.append(sqlite3.connect(file))
+            readers[-1].execute("SELECT * FROM two_view_geometries").fetchone()
+
+    write(tmp_path / "killed.db", [(pair, 99) for pair in range(2000)])
+    for suffix in ("", "-wal"):
+        shutil.copy(tmp_path / f"killed.db{suffix}", tmp_path / f"guided.partial{suffix}")
+    write(tmp_path / "database.db", [(1, 14), (2, 15)])
+    monkeypatch.setattr(colmap, "_run_step", lambda *_: write(tmp_path / "guided.partial", [(2, 30)]))
+    found = match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False))
+    assert found is not None
+    with closing(sqlite3.connect(found)) as database:
+        assert list(database.execute("SELECT * FROM two_view_geometries")) == [(1, 14), (2, 30)]
+    for reader in readers:
+        reader.close()

@@ -109,6 +109,14 @@ def test_gaps_are_refused() -> None:
         StagePlan((Stage(2, (100, 100), 10, False), Stage(0, (400, 400), 10, True)))
 
 
+def test_a_level_that_the_plan_lacks_has_no_stage() -> None:
+    plan = StagePlan.create((400, 400), 10, 2)
+    assert [plan[level].level for level in (0, 1)] == [0, 1]
+    for level in (-1, 2):
+        with pytest.raises(IndexError, match=f"level {level}, expected 0 to 1"):
+            plan[level]
+
+
 def test_parse_split() -> None:
     assert parse_split("1/3, 2/3") == (Fraction(1, 3), Fraction(2, 3))
     assert parse_split("0.25,0.75") == (Fraction(1, 4), Fraction(3, 4))

@@ -18,6 +18,7 @@ from torch import Tensor
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import render_transmittance
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rasterizers.extensions import CudaExtension
@@ -352,6 +353,20 @@ def test_a_degree_that_the_field_lacks_is_refused_before_anything_is_rendered(
             with pytest.raises(UserInputError, match=f"sh_degree {degree}: expected 0 to 1"):
                 rasterizer(case.field, case.camera, background=torch.zeros(3), sh_degree=degree)
     assert without_cuda.asked == {}
+
+
+@pytest.mark.parametrize(
+    ("count", "degree", "direct"), [(44_739_242, 3, True), (44_739_243, 3, False), (10**8, 0, True)]
+)
+def test_fields_whose_coefficients_32_bits_cannot_number_are_left_to_gsplat(
+    count: int, degree: int, direct: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes = (3,), (4,), (3,), (), ((degree + 1) ** 2, 3)
+    field = GaussianField(*(torch.empty(count, *size, device="meta") for size in sizes))
+    monkeypatch.setattr(gsplat_adapter, "direct_works", lambda: True)
+    rasterizer = GsplatRasterizer("cpu")
+    rasterizer._may_be_direct = True
+    assert rasterizer._calls_kernels(field) is direct
 
 
 def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: WithoutCuda) -> None:

@@ -12,8 +12,8 @@ from torch import Tensor
 from lapgs_plugin.ops.photometric_loss.in_torch import (
     DEFAULT_SSIM_WEIGHT,
     as_batch,
+    check_arguments,
     photometric_loss_torch,
-    require_one_shape,
 )
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
@@ -33,9 +33,10 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
         The loss, a scalar; the mean over several views.
 
     Raises:
-        UserInputError: the images differ in shape, or on a CPU are neither float32 nor float64.
+        UserInputError: the images differ in shape, the target requires a gradient, the weight leaves [0, 1], or the
+            prediction is on a CPU and neither float32 nor float64.
     """
-    require_one_shape(prediction, target)
+    check_arguments(prediction, target, ssim_weight)
     if triton_works(prediction):
         from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 

@@ -25,7 +25,7 @@ from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, absolute, fetch_add, fma, load, select, splat, store
 from lapgs_plugin.jit.threads import parallel
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA, require_one_shape
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA, check_arguments
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C2 as C2
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_RADIUS as RADIUS
@@ -239,19 +239,6 @@ def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
     return np.array(blocks, dtype=np.int64), pitch
 
 
-def _check(prediction: Tensor, target: Tensor) -> None:
-    require_one_shape(prediction, target)
-    if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
-        raise UserInputError(
-            f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
-            "convert one with .to(dtype)"
-        )
-    if prediction.device.type != "cpu" or target.device.type != "cpu":
-        raise UserInputError(
-            f"prediction on {prediction.device} and target on {target.device}: expected the CPU; move them with .cpu()"
-        )
-
-
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -287,13 +274,18 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
         A scalar of the images' type, the same bits for any number of threads.
 
     Raises:
-        UserInputError: the images do not match, the target requires a gradient, or the weight leaves [0, 1].
+        UserInputError: as `check_arguments`; or an image is on a GPU, or of another type than the other.
     """
-    _check(prediction, target)
-    if target.requires_grad:
-        raise UserInputError("the target requires a gradient, expected a constant image; pass target.detach()")
-    if not 0 <= ssim_weight <= 1:
-        raise UserInputError(f"ssim_weight {ssim_weight}: expected a number from 0 to 1, such as 0.2")
+    check_arguments(prediction, target, ssim_weight)
+    if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
+        raise UserInputError(
+            f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
+            "convert one with .to(dtype)"
+        )
+    if prediction.device.type != "cpu" or target.device.type != "cpu":
+        raise UserInputError(
+            f"prediction on {prediction.device} and target on {target.device}: expected the CPU; move them with .cpu()"
+        )
     # SSIM is computed channel by channel: several images are one of more channels.
     planes = prediction.flatten(0, -3), target.flatten(0, -3)
     loss: Tensor = _PhotometricLoss.apply(*planes, ssim_weight)  # type: ignore[no-untyped-call]  # torch's

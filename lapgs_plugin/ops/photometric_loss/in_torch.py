@@ -42,13 +42,21 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     return kornia_ssim(pad(prediction, border), pad(target, border), width, eps=0.0, padding="valid")
 
 
-def require_one_shape(prediction: Tensor, target: Tensor) -> None:
-    """Raise a UserInputError unless both are images (c, h, w), or batches (b, c, h, w), of one shape."""
+def check_arguments(prediction: Tensor, target: Tensor, ssim_weight: float) -> None:
+    """Check what `photometric_loss` is given, on any device.
+
+    Raises:
+        UserInputError: the images differ in shape, the target requires a gradient, or the weight leaves [0, 1].
+    """
     if prediction.ndim not in (3, 4) or prediction.shape != target.shape or prediction.numel() == 0:
         raise UserInputError(
             f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
             "(channels, height, width); resize the target to the level that is rendered"
         )
+    if target.requires_grad:
+        raise UserInputError("the target requires a gradient, expected a constant image; pass target.detach()")
+    if not 0 <= ssim_weight <= 1:
+        raise UserInputError(f"ssim_weight {ssim_weight}: expected a number from 0 to 1, such as 0.2")
 
 
 def as_batch(image: Tensor) -> Tensor:

@@ -27,6 +27,8 @@ from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
 
 NAME = "gsplat"
+MOST_NUMBERS = 2**31 - 1
+"""SH coefficients of a field that our kernels can number: 44 million Gaussians of degree 3."""
 
 LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
 SEMANTICS = Semantics(
@@ -149,7 +151,7 @@ class GsplatRasterizer:
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         """Render images of several cameras together; see `fields.rasterizer.ImageRasterizer`."""
-        if len(field) == 0 or (self._direct and len(cameras) == 1):
+        if len(field) == 0 or (len(cameras) == 1 and self._calls_kernels(field)):
             images = self._images(field, cameras, background, None)
             return images[None] if len(cameras) == 1 else images
         return self._stock.images(field, cameras, background, field.sh_degree)
@@ -163,13 +165,13 @@ class GsplatRasterizer:
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.StackingRasterizer`."""
-        antialiased = self._stock.antialiased
-        direct = self._device.type == "cuda" and not antialiased and direct_works() and stacking_works()
-        return GsplatStack(fields, self._device, antialiased=antialiased, direct=direct)
+        direct = self._calls_kernels(*fields) and stacking_works()
+        return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
 
-    @property
-    def _direct(self) -> bool:
-        return self._may_be_direct and (self._must_be_direct or direct_works())
+    def _calls_kernels(self, *fields: GaussianField) -> bool:
+        """Return whether kernels are called directly, for fields that are rendered together."""
+        numbers = 3 * max(len(field) for field in fields) * max(field.sh.shape[1] for field in fields)
+        return self._may_be_direct and numbers <= MOST_NUMBERS and (self._must_be_direct or direct_works())
 
     def _render(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
@@ -178,7 +180,7 @@ class GsplatRasterizer:
         degree, absgrad = degree_to_evaluate(field, sh_degree), self._absgrad
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad)
-        if self._direct:
+        if self._calls_kernels(field):
             on_device, own_radii = self._cameras.get(cameras, field.means), self._stock.own_radii
             return direct.render(field, on_device, background, degree, absgrad=absgrad, own_radii=own_radii)
         return self._stock.render(field, cameras, background, degree, absgrad=absgrad)
@@ -190,7 +192,7 @@ class GsplatRasterizer:
         degree = degree_to_evaluate(field, sh_degree)
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad=False).image
-        if self._direct:
+        if self._calls_kernels(field):
             return direct.render_images(field, self._cameras.get(cameras, field.means), background, degree)
         images = self._stock.images(field, cameras, background, degree)
         # All that follows in training reads channel by channel: better reordered once than in each operation.

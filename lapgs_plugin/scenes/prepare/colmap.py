@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,7 @@ def find_features(job: Job, single_camera: bool) -> None:
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
     _run_step(
-        job,
-        "Finding features",
-        "photos",
-        len(job.names),
-        "features",
-        options,
+        *(job, "Finding features", "photos", len(job.names), "features", options),
         lambda: _rows(job.database, "descriptors"),
     )
 
@@ -111,7 +107,7 @@ def match_more(job: Job) -> Path | None:
         return None
     if not found.is_file():
         partial = found.with_suffix(".partial")
-        shutil.copyfile(job.database, partial)
+        _copy(job.database, partial)
         with closing(sqlite3.connect(partial)) as connection, connection:
             # COLMAP matches pairs without a geometry again.
             connection.execute(f"DELETE {known}", (VERIFIED,))
@@ -121,8 +117,19 @@ def match_more(job: Job) -> Path | None:
             *(job, "Matching more", "pairs", total, "pairs", options),
             lambda: _rows(partial, "two_view_geometries") - before,
         )
+        with closing(sqlite3.connect(partial)) as connection:
+            # COLMAP leaves matches in its log if the progress bar reads the database while COLMAP closes it.
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         partial.rename(found)
     return found
+
+
+def _copy(database: Path, copy: Path) -> None:
+    """Copy a database with its write-ahead log; that of a copy that was interrupted would be added to the new one."""
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{copy}{suffix}").unlink(missing_ok=True)
+    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+        source.backup(target)
 
 
 def _pairing(job: Job) -> dict[str, Any]:
@@ -146,22 +153,27 @@ def _neighbour_pairs(count: int) -> int:
     return sum(max(0, count - 2**power) for power in range(pycolmap.SequentialPairingOptions().overlap))
 
 
-def map_photos(
-    job: Job,
-    title: str,
-    folder: Path,
-    model: str | None = None,
-    mapper: str | None = None,
-    database: Path | None = None,
-) -> list[pycolmap.Reconstruction]:
-    """Recover models into a folder, unless it is there, and return them.
+@dataclass(frozen=True)
+class Attempt:
+    """Describe an attempt at placing the cameras.
 
-    Args:
-        job: the job.
+    Attributes:
         title: of the progress bar.
-        folder: of the models.
-        model, mapper, database: replace the job's.
+        folder: name of the folder of its models.
+        lens: camera model to fit; None for the database's.
+        mapper, database: to use instead of the job's.
     """
+
+    title: str
+    folder: str
+    lens: str | None = None
+    mapper: str | None = None
+    database: Path | None = None
+
+
+def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
+    """Recover models into the attempt's folder, unless it is there, and return them."""
+    folder = job.work / attempt.folder
     if not folder.is_dir():
         unfinished, placed = folder.with_suffix(".partial"), job.work / "placed"
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -171,29 +183,25 @@ def map_photos(
             "photos": str(job.photos.absolute()),
             "models": str(unfinished),
             "placed": str(placed),
-            "mapper": mapper or job.settings.mapper,
+            "mapper": attempt.mapper or job.settings.mapper,
         }
-        if model is not None:
+        if attempt.lens is not None:
             other = job.work / "simple.db"
-            shutil.copyfile(database or job.database, other)
-            options |= {"database": str(other.absolute()), "camera_model": model}
-        _run_step(job, title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
+            _copy(attempt.database or job.database, other)
+            options |= {"database": str(other.absolute()), "camera_model": attempt.lens}
+        _run_step(job, attempt.title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
         for written in unfinished.iterdir():
             check_written(written)
         unfinished.rename(folder)
-    models = [pycolmap.Reconstruction(each) for each in sorted(folder.iterdir())]
-    models.sort(key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
-    return models
+    return [pycolmap.Reconstruction(each) for each in sorted(folder.iterdir())]
 
 
 def _rows(database: Path, table: str) -> int:
     """Return the number of rows in a table of COLMAP's database, also while COLMAP writes it; 0 before it exists."""
     try:
-        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=POLL_SECONDS)
-        try:
+        uri = f"{database.absolute().as_uri()}?mode=ro"
+        with closing(sqlite3.connect(uri, uri=True, timeout=POLL_SECONDS)) as connection:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-        finally:
-            connection.close()
     except sqlite3.Error:  # locked, or still being made
         return 0
 

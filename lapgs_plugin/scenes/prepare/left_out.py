@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pycolmap
@@ -45,7 +46,7 @@ def left_out_because(
         models: the models that were found, the scene's first.
         left_out: names of the photos.
     """
-    with sqlite3.connect(database) as connection:
+    with closing(sqlite3.connect(database)) as connection:
         ids = {name: key for key, name in connection.execute("SELECT image_id, name FROM images")}
         features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
         pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (VERIFIED,))
@@ -54,7 +55,6 @@ def left_out_because(
             one, other = pycolmap.pair_id_to_image_pair(pair)
             linked.setdefault(one, set()).add(other)
             linked.setdefault(other, set()).add(one)
-    connection.close()
     placed, elsewhere = _placed(models[:1]), _placed(models[1:])
     reasons: dict[str, list[str]] = {}
     for name in left_out:

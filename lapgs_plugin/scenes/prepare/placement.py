@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -12,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lapgs_plugin.errors import SceneError
-from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, map_photos, match_more
+from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, Attempt, map_photos, match_more
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, GLOBAL, INCREMENTAL
 
@@ -37,7 +36,7 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
     Raises:
         SceneError: no photo could be placed.
     """
-    models = _mapped(job, "Placing cameras", "models")
+    models = _mapped(job, Attempt("Placing cameras", "models"))
     if (doubt := _doubt(job, models)) is not None:
         if job.settings.camera_model != AUTO:
             logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.settings.camera_model)
@@ -54,7 +53,7 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
 def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
     """Return the best of doubtful models, those of a simpler lens, and if few are placed, of further attempts."""
     logger.info("%s; placing the cameras again with a simpler lens", doubt)
-    again = _mapped(job, "Placing again", "models_simple", SIMPLE_MODEL)
+    again = _mapped(job, Attempt("Placing again", "models_simple", SIMPLE_MODEL))
     if _placed(again) >= _placed(models):
         models = again
     if _few(job, models) and job.settings.mapper == INCREMENTAL:
@@ -72,24 +71,16 @@ def _with_more_matches(job: Job, models: list[pycolmap.Reconstruction]) -> list[
     """Return the best of these models and those with more matches, by the incremental and then the global mapper."""
     logger.info("only %d photos could be placed; looking for more matches", _placed(models))
     database = match_more(job)
-    mappers = [*([INCREMENTAL] if database is not None else []), *([GLOBAL] if HAS_GLOBAL else [])]
-    for mapper in mappers:
-        if _few(job, models):
-            found = _mapped(job, f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database)
-            models = found if _placed(found) > _placed(models) else models
+    for mapper, possible in ((INCREMENTAL, database is not None), (GLOBAL, HAS_GLOBAL)):
+        if possible and _few(job, models):
+            attempt = Attempt(f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database)
+            models = max(models, _mapped(job, attempt), key=_placed)  # the earlier ones if both place as many
     return models
 
 
-def _mapped(
-    job: Job,
-    title: str,
-    folder: str,
-    lens: str | None = None,
-    mapper: str | None = None,
-    database: Path | None = None,
-) -> list[pycolmap.Reconstruction]:
-    """Return the models of one attempt, the one with most photos first, without photos whose place is arbitrary."""
-    models = map_photos(job, title, job.work / folder, lens, mapper, database)
+def _mapped(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
+    """Return the models of an attempt, the one with most photos first, without photos whose place is arbitrary."""
+    models = map_photos(job, attempt)
     for model in models:
         remove_unlinked(model)
     return sorted(models, key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
@@ -113,7 +104,7 @@ def remove_unlinked(model: pycolmap.Reconstruction) -> None:
     links = coo_array(((shared.data >= LINKED), (shared.row, shared.col)), shared.shape).tocsr()
     links.eliminate_zeros()
     _, groups = connected_components(links, directed=False)
-    largest = np.bincount(groups).argmax()
+    largest = np.bincount(groups, minlength=1).argmax()
     for key, group in zip(placed, groups, strict=True):
         if group != largest:
             model.deregister_frame(model.images[key].frame_id)
