@@ -3,8 +3,8 @@
 All of this package reads such files here. Size, nesting and numbers are limited first; then values are validated
 against a type. Every error is one line that names the file, the key, the value, what was expected and what to do.
 
-A type is anything that pydantic validates. Dataclasses and TypedDicts with `STRICT` as their `__pydantic_config__`
-accept no other types, no unknown keys and no NaN.
+A type is anything that pydantic validates. Dataclasses with `STRICT` as their `__pydantic_config__`, and dictionaries
+that derive from `Strict`, accept no other types, no unknown keys and no NaN.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from typing_extensions import TypedDict  # pydantic cannot read that of `typing` before Python 3.12
 
 from lapgs_plugin.errors import UserInputError
 
@@ -44,12 +46,23 @@ KEY_PARTS = 32
 LARGEST_INTEGER = 2**63
 
 STRICT: Any = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
-"""`__pydantic_config__` of a dataclass or TypedDict whose values come from a file."""
-STRICT_WITH_MORE: Any = {**STRICT, "extra": "allow"}
-"""The same for one that may hold further keys."""
+"""`__pydantic_config__` of a dataclass whose values come from a file."""
+_STRICT_WITH_MORE: Any = {**STRICT, "extra": "allow"}
 
 _KEY_PART = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
 _LONG_KEY = re.compile(rf"""(?<![A-Za-z0-9_"'-]){_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{KEY_PARTS}}}""")
+
+
+class Strict(TypedDict):
+    """Type a dictionary of a file: a key for each value, unless it is `NotRequired`."""
+
+    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+
+
+class StrictWithMore(TypedDict):
+    """Type those values of a dictionary that are used; it may have others."""
+
+    __pydantic_config__ = _STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
 
 
 def read_json(

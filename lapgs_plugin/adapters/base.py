@@ -25,7 +25,7 @@ from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, typed_line
 from lapgs_plugin.hierarchy.plan import Hierarchy
 
 if TYPE_CHECKING:
@@ -253,7 +253,7 @@ class BackboneAdapter(ABC):
         except Exception as error:  # a missing package, a failed download, a damaged file: any would stop training
             raise UserInputError(
                 f"--test_iterations {' '.join(map(str, due))}: the checkout computes LPIPS then, which fails now "
-                f"already ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}); "
+                f"already ({typed_line(error)}); "
                 "mend that, or leave these reports out with --test_iterations -1 if the script adds none of its own: "
                 "`lapgs eval` measures the run"
             ) from error

@@ -112,8 +112,8 @@ class Profile:
         found = self.holders(vars(rasterizer.module)[name])
         if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
             found.append((rasterizer.module, name))
-        holder = self.script.module if use.holder == "__main__" else sys.modules[use.holder]
-        if name in vars(holder) and (holder, name) not in found:  # something that wraps it
+        holder = self._holder(use)
+        if holder is not None and name in vars(holder) and (holder, name) not in found:  # something that wraps it
             found.append((holder, name))
         return found
 
@@ -206,9 +206,13 @@ class Profile:
             if "__init__" in vars(found) and _names(vars(found)["__init__"]) >= CAMERA_ROLES:
                 yield found
 
+    def _holder(self, use: RasterizerUse) -> ModuleType | None:
+        """Return the module that imports a rasterizer; None if it is not imported itself."""
+        return self.script.module if use.holder == "__main__" else sys.modules.get(use.holder)
+
     def _find_renderers(self) -> Iterator[FunctionType]:
         for use in self.source.rasterizers:
-            holder = self.script.module if use.holder == "__main__" else sys.modules.get(use.holder)
+            holder = self._holder(use)
             for name in use.functions:
                 if isinstance(function := getattr(holder, name, None), FunctionType):
                     yield function

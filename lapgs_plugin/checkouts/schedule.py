@@ -171,8 +171,8 @@ class Schedule:
 
     def __init__(self, function: ast.FunctionDef) -> None:
         self._function = function
-        loop = _iteration_loop(function)
-        self.events = [] if loop is None else list(_events(loop.body, _target(loop), ()))
+        loop, self._variable = _iteration_loop(function)
+        self.events = [] if loop is None else list(_events(loop.body, self._variable, ()))
 
     def describe(self, variables: Mapping[str, Any] | None = None) -> list[str]:
         """Return a line for each event that calls something, or has a number of its own, and can happen.
@@ -197,7 +197,7 @@ class Schedule:
             window: place of the stage.
             keep: names of other options that stay.
         """
-        changed = StageSchedule(self._function)
+        changed = StageSchedule(self._function, self._variable)
         periods = {event.period.name for event in self.events if event.period is not None} - {""}
         keep = {*keep, *KEPT, *periods}
         late = window.total / RARE
@@ -228,6 +228,7 @@ class StageSchedule:
     """
 
     _function: ast.FunctionDef
+    _variable: str  # of its loop
     options: dict[tuple[str, str], int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     _numbers: dict[Place, int] = field(default_factory=dict)
@@ -285,7 +286,7 @@ class StageSchedule:
         elsewhere = {option: value for option, value in self.options.items() if option[0] not in arguments}
         if not (self._numbers or self._moved or elsewhere):
             return original
-        rewriter = _Rewriter(self._numbers, self._moved, elsewhere, _target_of(self._function))
+        rewriter = _Rewriter(self._numbers, self._moved, elsewhere, self._variable)
         tree = ast.Module([rewriter.visit(copy.deepcopy(self._function))], type_ignores=[])
         original = inspect.unwrap(original)
         code = original.__code__
@@ -332,25 +333,14 @@ def _place(node: ast.expr) -> Place:
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 
-def _iteration_loop(function: ast.FunctionDef) -> ast.For | None:
-    """Return the longest loop over a range."""
+def _iteration_loop(function: ast.FunctionDef) -> tuple[ast.For | None, str]:
+    """Return the longest loop over a range, and its variable; None and no name without any."""
     loops = [
-        node
+        (node, node.target.id)
         for node in ast.walk(function)
         if isinstance(node, ast.For) and isinstance(node.target, ast.Name) and "range" in _names(node.iter)
     ]
-    return max(loops, key=lambda loop: sum(1 for _ in ast.walk(loop)), default=None)
-
-
-def _target(loop: ast.For) -> str:
-    assert isinstance(loop.target, ast.Name)
-    return loop.target.id
-
-
-def _target_of(function: ast.FunctionDef) -> str:
-    loop = _iteration_loop(function)
-    assert loop is not None, "without a loop nothing changes"
-    return _target(loop)
+    return max(loops, key=lambda loop: sum(1 for _ in ast.walk(loop[0])), default=(None, ""))
 
 
 def _names(node: ast.AST) -> set[str]:

@@ -11,6 +11,7 @@ from lapgs_plugin.cli.bench_blend import blend
 from lapgs_plugin.cli.bench_experiment import bench_experiment
 from lapgs_plugin.cli.bench_raster import raster
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import UserInputError
 
 EXPERIMENT = "run"
 """The default subcommand: `lapgs bench smoke.toml`."""
@@ -38,8 +39,6 @@ def ops(
 
     Speed-ups and differences are against PyTorch's operations. Other libraries have their own names.
     """
-    from lapgs_plugin.errors import UserInputError
-
     if device not in ("auto", "cpu", "cuda"):
         raise UserInputError(f"--device {device}: expected auto, cpu or cuda")
     import torch

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import UserInputError
 
 
 def blend(
@@ -38,7 +39,6 @@ def blend(
     from rich import box
     from rich.table import Table
 
-    from lapgs_plugin.errors import UserInputError
     from lapgs_plugin.evaluation import bench_blend, bench_raster
     from lapgs_plugin.fields.gaussian_field import GaussianField
 

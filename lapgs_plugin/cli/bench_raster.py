@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
     import torch
@@ -45,10 +48,6 @@ def raster(
     CPU rasterizer is compared with the oracle and with gsplat's PyTorch code, both differentiated by autograd. All
     sizes together take minutes.
     """
-    import json
-    import os
-
-    from lapgs_plugin.errors import UserInputError
 
     if dtype not in DTYPES:
         raise UserInputError(f"--dtype {dtype}: expected {' or '.join(DTYPES)}")

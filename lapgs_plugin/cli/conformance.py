@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
     from lapgs_plugin.evaluation.conformance import Outcome, Subject
@@ -41,9 +44,6 @@ def conformance(
     A CUDA extension is checked with its native signed colour, if it has any, and with colours precomputed in PyTorch.
     gsplat compiles its CUDA code at first use, which takes minutes. The exit code is 1 if a check fails.
     """
-    import json
-    from dataclasses import asdict
-
     from lapgs_plugin.evaluation.conformance import check, conformance_cases
 
     subjects = _chosen(rasterizer or [])
@@ -105,8 +105,6 @@ def _extension_subjects(name: str) -> list[Subject]:
 
 
 def _chosen(names: Sequence[str]) -> list[Subject]:
-    from lapgs_plugin.errors import UserInputError
-
     available = reachable()
     for name in names:
         if name not in available:

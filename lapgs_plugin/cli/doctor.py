@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
     from lapgs_plugin.environment.findings import Finding
@@ -40,7 +42,6 @@ def doctor(
     The command changes and downloads nothing, and its exit code is 0 unless CHECKOUT is none. Lines marked !! are
     problems and say what to do. Lines marked -- are optional parts that are not installed.
     """
-    import json
     from dataclasses import asdict
 
     from lapgs_plugin.cli.doctor_checkout import describe
@@ -61,7 +62,6 @@ def examine() -> dict[str, list[Finding]]:
     from lapgs_plugin.adapters.registry import known_extensions
     from lapgs_plugin.environment import driver_version, findings
     from lapgs_plugin.environment.probes import run_probe
-    from lapgs_plugin.errors import UserInputError
 
     requirements = findings.own_requirements()
     try:
@@ -97,7 +97,6 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
     from lapgs_plugin.adapters.registry import recognise
     from lapgs_plugin.checkouts.source import training_scripts
     from lapgs_plugin.environment.findings import Finding
-    from lapgs_plugin.errors import UserInputError
 
     try:
         adapter = recognise(folder)
@@ -106,7 +105,7 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
     if adapter is not None:
         place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
         names = [str(path.relative_to(folder)) for path in training_scripts(folder)]
-        script = adapter.info.script if adapter.info.script in names else names[0]
+        script = adapter.info.script if adapter.info.script in names or not names else names[0]
         detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run {script} ...` trains it on {place}"
         return Finding("Current folder", "ok", detail)
     if all((folder / file).is_file() for file in GSPLAT_FILES):

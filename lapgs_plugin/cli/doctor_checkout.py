@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
+from lapgs_plugin.checkouts.schedule import Schedule
+from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
 from lapgs_plugin.environment import is_installed
-from lapgs_plugin.errors import UserInputError
-
-if TYPE_CHECKING:
-    from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
-    from lapgs_plugin.checkouts.source import CheckoutSource
-    from lapgs_plugin.environment.findings import Finding
+from lapgs_plugin.environment.findings import Finding
+from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 COLORS = {"shs", "colors_precomp"}
 """Inputs of rasterizers by which a residual gets colours of both signs."""
@@ -28,9 +27,6 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         UserInputError: it is no 3DGS checkout, and the line says what is missing; or it has several training scripts
             and none of them is `train.py` in its root.
     """
-    from lapgs_plugin.adapters.registry import adapter_class
-    from lapgs_plugin.environment.findings import Finding
-
     source, others = _source(path)
     adapter = adapter_class(source.root)
     parameters = ", ".join(argument.arg for argument in source.training.args.args)
@@ -51,9 +47,6 @@ def describe(path: Path) -> dict[str, list[Finding]]:
 
 def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     """Return the sources of the training script to describe, and the names of other training scripts."""
-    from lapgs_plugin.adapters.registry import adapter_class
-    from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
-
     if path.is_file():
         return CheckoutSource.read(path), []
     found: dict[str, CheckoutSource] = {}
@@ -77,8 +70,6 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
 
 
 def _others(path: Path, scripts: list[str]) -> list[Finding]:
-    from lapgs_plugin.environment.findings import Finding
-
     if not scripts:
         return []
     return [
@@ -87,8 +78,6 @@ def _others(path: Path, scripts: list[str]) -> list[Finding]:
 
 
 def _rasterizer(use: RasterizerUse) -> Finding:
-    from lapgs_plugin.environment.findings import Finding
-
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
     if is_installed(use.module):
@@ -97,15 +86,11 @@ def _rasterizer(use: RasterizerUse) -> Finding:
 
 
 def _no_rasterizer(source: CheckoutSource) -> Finding:
-    from lapgs_plugin.environment.findings import Finding
-
     return Finding("none", "problem", f"none of the {len(source.modules)} modules that the script imports uses one")
 
 
 def _packages(source: CheckoutSource) -> list[Finding]:
     """Return packages that the script cannot do without and that are not installed."""
-    from lapgs_plugin.environment.findings import Finding
-
     needed = {one.name.partition(".")[0]: one for one in reversed(source.externals) if not one.optional}
     known = sys.stdlib_module_names | {module.partition(".")[0] for module in source.rasterizer_modules}
     missing = {name: one for name, one in needed.items() if name not in known and not is_installed(name)}
@@ -116,16 +101,11 @@ def _packages(source: CheckoutSource) -> list[Finding]:
 
 def _schedule(source: CheckoutSource) -> list[Finding]:
     """Return what the training loop does at which iteration."""
-    from lapgs_plugin.checkouts.schedule import Schedule
-    from lapgs_plugin.environment.findings import Finding
-
     lines = [line.partition(": ") for line in Schedule(source.training).describe()]
     return [Finding(place, "ok", event) for place, _, event in lines] or [Finding("none", "ok", "counts no iterations")]
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:
-    from lapgs_plugin.environment.findings import Finding
-
     if (several := source.image_scales) is not None:
         why = f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
@@ -147,10 +127,6 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
 
 
 def _stand_in(source: CheckoutSource) -> Finding:
-    from lapgs_plugin.adapters.registry import adapter_class
-    from lapgs_plugin.environment.findings import Finding
-    from lapgs_plugin.errors import MissingExtraError
-
     try:
         return Finding("--device cpu", "ok", f"stand-in {adapter_class(source.root).stand_in_for(source.root, ())}")
     except MissingExtraError as error:

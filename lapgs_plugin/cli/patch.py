@@ -6,12 +6,24 @@ import difflib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from lapgs_plugin.patching import FileChange, Target
+from lapgs_plugin.errors import PatchError
+from lapgs_plugin.patching import (
+    ALL_SETS,
+    FileChange,
+    Target,
+    alone,
+    find_targets,
+    plan_apply,
+    plan_revert,
+    read_only,
+    status,
+    uncommitted,
+    write_all,
+)
 
 app = typer.Typer(
     help="Patch a checkout's CUDA rasterizer: add signed colour, or make it build with a current CUDA.",
@@ -37,8 +49,6 @@ AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files
 @app.command("status")
 def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     """Show which edits are applied, which can be applied, and what prevents the others."""
-    from lapgs_plugin.patching import plan_apply, read_only, status, uncommitted
-
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         for target, sets in chosen:
@@ -52,7 +62,7 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
                 if not found.problems:
                     for path in read_only(plan_apply(target, [found.set])):
                         typer.echo(f"    read-only: {path}")
-            for path in uncommitted(_files(target)):
+            for path in uncommitted(target.paths.values()):
                 typer.echo(f"  uncommitted changes: {path}")
 
 
@@ -72,9 +82,6 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
 
     Reinstall the extension afterwards with the command that is printed.
     """
-    from lapgs_plugin.errors import PatchError
-    from lapgs_plugin.patching import uncommitted, write_all
-
     chosen = _targets(checkout, set_name, opt_in=False)
     with _alone(chosen):
         planned = _planned(chosen)
@@ -96,8 +103,6 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
 @app.command("revert")
 def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     """Remove the edits; your own changes in the same files stay."""
-    from lapgs_plugin.patching import plan_revert, write_all
-
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         planned = [(target, change) for target, sets in chosen for change in plan_revert(target, sets)]
@@ -113,8 +118,6 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
 @contextmanager
 def _alone(chosen: Sequence[tuple[Target, Collection[str]]]) -> Iterator[None]:
     """Lock out other `lapgs patch` processes, and remove files that a killed one left."""
-    from lapgs_plugin.patching import alone
-
     with alone(target for target, _ in chosen) as stuck:
         for path in stuck:
             typer.echo(f"a killed `lapgs patch` left {path}, which cannot be removed", err=True)
@@ -128,9 +131,6 @@ def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Targe
         checkout, set_name: as the commands take them.
         opt_in: whether "all" includes the sets that must be named otherwise.
     """
-    from lapgs_plugin.errors import PatchError
-    from lapgs_plugin.patching import ALL_SETS, find_targets
-
     targets = find_targets(checkout)
     known = sorted({name for target in targets for name in target.recipe.sets})
     if set_name not in (ALL_SETS, *known):
@@ -145,19 +145,10 @@ def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Targe
 
 
 def _planned(chosen: Sequence[tuple[Target, Collection[str]]]) -> list[tuple[Target, FileChange]]:
-    from lapgs_plugin.patching import plan_apply
-
     return [(target, change) for target, sets in chosen for change in plan_apply(target, sets)]
 
 
-def _files(target: Target) -> list[Path]:
-    return [path for path in (target.folder / file for file in target.recipe.files) if path.is_file()]
-
-
 def _refuse_read_only(changes: Sequence[FileChange]) -> None:
-    from lapgs_plugin.errors import PatchError
-    from lapgs_plugin.patching import read_only
-
     blocked = read_only(changes)
     if blocked:
         raise PatchError(f"read-only: {_listed(blocked)}; make them writable first; nothing was changed")

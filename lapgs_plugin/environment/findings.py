@@ -24,7 +24,8 @@ from lapgs_plugin.environment import (
     run_program,
     usable_processors,
 )
-from lapgs_plugin.environment.probes import Probe, first_line, run_probe
+from lapgs_plugin.environment.probes import Probe, run_probe
+from lapgs_plugin.errors import typed_line
 
 OLDEST_PYTHON = (3, 10)
 DEVELOPMENT_EXTRA = "dev"
@@ -240,7 +241,7 @@ def extension_finding(module: str, purpose: str) -> Finding:
     try:
         there = importlib.util.find_spec(module.partition(".")[0]) is not None
     except (ImportError, ValueError) as error:
-        return Finding(module, "problem", first_line(error), "install it again")
+        return Finding(module, "problem", typed_line(error), "install it again")
     if not there:
         return Finding(module, "absent", f"not installed ({purpose})")
     probe = run_probe("import", "torch", module)  # extensions find PyTorch's libraries after it is loaded

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lapgs_plugin.environment import PACKAGE, run_program
+from lapgs_plugin.errors import typed_line
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,6 @@ def run_probe(name: str, *arguments: str) -> Probe:
     except (IndexError, ValueError):
         return Probe({}, "the probe printed nothing readable")
     return Probe({}, facts["error"]) if "error" in facts else Probe(facts)
-
-
-def first_line(error: BaseException) -> str:
-    """Return the type of an error and the first line of its message."""
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
 
 
 def _probe_torch() -> dict[str, Any]:
@@ -100,7 +96,7 @@ def _main(name: str, *arguments: str) -> None:
     try:
         facts = PROBES[name](*arguments)
     except BaseException as error:  # an import may raise anything, SystemExit included
-        facts = {"error": first_line(error)}
+        facts = {"error": typed_line(error)}
     print(json.dumps(facts))
 
 

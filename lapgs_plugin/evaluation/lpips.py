@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and deviation by which LPIPS normalizes each channel of an image in [-1, 1]."""
@@ -317,9 +317,8 @@ def _read(path: Path) -> Mapping[str, Tensor]:
             f"LPIPS weights {path}: reading .safetensors needs a package; pip install 'lapgs_plugin[lpips]'"
         ) from error
     except Exception as error:  # torch and safetensors raise many types for damaged files
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise UserInputError(
-            f"LPIPS weights {path} cannot be read ({reason}); expected tensors by name, .safetensors or .pth"
+            f"LPIPS weights {path} cannot be read ({first_line(error)}); expected tensors by name, .safetensors or .pth"
         ) from error
     return weights
 

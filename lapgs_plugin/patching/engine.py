@@ -30,6 +30,12 @@ class Target:
     recipe: Recipe
     folder: Path
 
+    @property
+    def paths(self) -> dict[str, Path]:
+        """Sources that the recipe needs by their names in it, without missing ones."""
+        paths = {file: self.folder / file for file in self.recipe.files}
+        return {file: path for file, path in paths.items() if path.is_file()}
+
 
 @dataclass(frozen=True)
 class FileChange:
@@ -140,9 +146,7 @@ def _subfolders(checkout: Path) -> Iterable[Path]:
 
 
 def _read(target: Target) -> dict[str, str]:
-    """Return the sources that a recipe needs by file, without missing files."""
-    paths = {file: target.folder / file for file in target.recipe.files}
-    return {file: read_source(path) for file, path in paths.items() if path.is_file()}
+    return {file: read_source(path) for file, path in target.paths.items()}
 
 
 def _present_sets(sources: Iterable[str]) -> frozenset[str]:

@@ -55,7 +55,7 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
     Raises:
         PatchError: another process holds one of the folders for longer than `PATIENCE`.
     """
-    files = {path.resolve() for target in targets for path in _present(target)}
+    files = {path.resolve() for target in targets for path in target.paths.values()}
     folders = sorted({path.parent for path in files})
     with ExitStack() as locks:
         # The same order in every process prevents deadlocks.
@@ -100,10 +100,6 @@ def write_all(changes: Sequence[FileChange]) -> None:
 def _writable(path: Path) -> bool:
     # The mode counts, too: root may write everything, but somebody marked the file read-only.
     return os.access(path, os.W_OK) and bool(path.stat().st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH))
-
-
-def _present(target: Target) -> list[Path]:
-    return [path for path in (target.folder / file for file in target.recipe.files) if path.is_file()]
 
 
 def _temporaries(file: Path) -> list[Path]:

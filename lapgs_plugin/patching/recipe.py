@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import NotRequired
+
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.patching.tokens import occurrences, tokenize
-from lapgs_plugin.untrusted import STRICT, read_toml, shortened
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
+from lapgs_plugin.untrusted import Strict, read_toml, shortened
 
 
-class _Place(TypedDict):
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+class _Place(Strict):
     file: str
     find: NotRequired[str]
     function: NotRequired[str]
 
 
-class _EditEntry(TypedDict):
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+class _EditEntry(Strict):
     set: str
     name: str
     file: str
@@ -37,8 +31,7 @@ class _EditEntry(TypedDict):
     unless: NotRequired[Any]  # `_edit` checks it
 
 
-class _CheckEntry(TypedDict):
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
+class _CheckEntry(Strict):
     set: str
     find: str
     times: int
@@ -46,10 +39,9 @@ class _CheckEntry(TypedDict):
     places: list[_Place]
 
 
-class _File(TypedDict):
+class _File(Strict):
     """Type the contents of a recipe's file; patches/README.md explains the entries."""
 
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
     name: str
     title: str
     present: list[_Place]
@@ -74,9 +66,6 @@ class Anchor:
     file: str
     find: str
     function: str | None = None
-
-    def __str__(self) -> str:
-        return f"{self.file}, {self.function}" if self.function else self.file
 
 
 @dataclass(frozen=True)
@@ -234,7 +223,7 @@ def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...]
             checks=base.checks + tuple(check for item in table.get("check", ()) for check in _checks(item)),
             opt_in=base.opt_in + tuple(table.get("opt_in", ())),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except ValueError as error:
         raise PatchError(f"patches/{name}.toml: {error}; patches/README.md says what an entry holds") from error
 
 

@@ -36,7 +36,7 @@ PROBE_TOLERANCE = 1e-3
 
 
 class ColorPath(Enum):
-    """Say what computes the colours of a signed field: the extension, or PyTorch before it."""
+    """Choose where the colours of a signed field are computed: in the extension, or in PyTorch before it."""
 
     NATIVE = "native"
     PRECOMPUTED = "precomputed"

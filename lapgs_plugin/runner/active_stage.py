@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
-from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError
+from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError, first_line, typed_line
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
@@ -31,7 +31,15 @@ class ActiveStage:
         call: the script's call of `training` that trains the stage.
         finished: the stages before, coarsest first.
         before: result of the last of them; None for the base.
+
+    Attributes:
+        gaussians: the checkout's model that is trained; None before its scene is made.
+        scene_files: folder of the files that the checkout's Scene writes beside a model, for its viewers. They are
+            copied once the loop has a scene: some checkouts refuse an output folder that is there before they make it.
     """
+
+    keeps_schedule = False
+    """Whether the schedule is the checkout's own, for the whole run."""
 
     def __init__(
         self,
@@ -53,19 +61,9 @@ class ActiveStage:
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
-        self._gaussians: Any = None
-        self._scene_files: Path | None = None
+        self.gaussians: Any = None
+        self.scene_files: Path | None = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
-
-    @property
-    def keeps_schedule(self) -> bool:
-        """Whether the schedule is the checkout's own, for the whole run."""
-        return False
-
-    @property
-    def gaussians(self) -> Any:
-        """The checkout's model that is trained; None before its scene is made."""
-        return self._gaussians
 
     @property
     def iteration(self) -> int:
@@ -84,22 +82,17 @@ class ActiveStage:
         self._context.wrapper.stage = self._views.rendering
 
     @property
-    def as_finished(self) -> FinishedStage:
-        """This stage for the stages after it, once its field is in the archive."""
-        return FinishedStage(self.stage, self._call)
-
-    @property
     def resets_opacities(self) -> bool:
         """Whether the checkout may reset opacities: against floaters near cameras, the base's resets are enough."""
         return self._options.residual_resets or not self.stage.signed
 
     def scene_for(self, gaussians: Any) -> Any:
         """Return the scene of this stage, and initialise `gaussians` from it."""
-        self._gaussians = gaussians
-        if self._scene_files is not None:
+        self.gaussians = gaussians
+        if self.scene_files is not None:
             folder = Path(self._call.dataset.model_path)
             folder.mkdir(exist_ok=True)
-            for path in self._scene_files.iterdir():
+            for path in self.scene_files.iterdir():
                 if path.is_file():
                     shutil.copy(path, folder)
         scene = self._run.scene.copy(
@@ -175,7 +168,7 @@ class ActiveStage:
         """
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
-        gaussians, self._gaussians = self._gaussians, None
+        gaussians, self.gaussians = self.gaussians, None
         field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
         self._require_finite(field)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
@@ -194,17 +187,10 @@ class ActiveStage:
     def close(self) -> None:
         """Drop the stage's images, except the predictions for the next stage."""
         self._context.wrapper.stage = None
-        self._joint = self._gaussians = None
+        self._joint = self.gaussians = None
         self._views.close()
         if self._context.device.type == "cuda":
             torch.cuda.empty_cache()
-
-    def copy_scene_files(self, source: Path) -> None:
-        """Copy the files that the checkout's Scene writes beside a model, for its viewers, once the loop has a scene.
-
-        Some checkouts refuse an output folder that is there before they make it.
-        """
-        self._scene_files = source
 
     def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
@@ -214,7 +200,7 @@ class ActiveStage:
             f"out of GPU memory at level {self.stage.level} with {self.record.peak:,} Gaussians; images held on the "
             f"GPU: {images / 2**30:.2f} GiB; {help_}, more --levels or a smaller resolution too; "
             f"finished levels ({self._archived_levels()}) are kept, --resume continues after them "
-            f"[{str(error).splitlines()[0]}]"
+            f"[{first_line(error)}]"
         )
 
     def _log_start(self) -> None:
@@ -289,9 +275,9 @@ class ActiveStage:
             raise
         except Exception as error:
             logger.warning(
-                "held-out views of level %d could not be measured (%s: %s); the level is in the run folder, and `lapgs "
+                "held-out views of level %d could not be measured (%s); the level is in the run folder, and `lapgs "
                 "eval` measures the run",
-                *(self.stage.level, type(error).__name__, (str(error).splitlines() or ["no message"])[0]),
+                *(self.stage.level, typed_line(error)),
             )
 
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:

@@ -175,14 +175,14 @@ class HierarchyDriver:
                 if stage.level in run.archive.available_levels:
                     before = active.restore()
                 else:
-                    active.copy_scene_files(scene_files)
+                    active.scene_files = scene_files
                     before = active.train()
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
                 self._active = None
                 active.close()
-            finished.append(active.as_finished)
+            finished.append(FinishedStage(stage, call))
 
     def _stage_call(self, run: TrainingRun, window: StageWindow) -> TrainingCall:
         """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""

@@ -24,7 +24,7 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
-from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
@@ -194,7 +194,7 @@ class DryRun:
         try:
             mean_quality([(image, view.original_image)])
         except Exception as error:
-            logger.warning("held-out views cannot be measured (%s): the run goes on without", _first_line(error))
+            logger.warning("held-out views cannot be measured (%s): the run goes on without", typed_line(error))
 
     def _color_path(self, view: Any, gaussians: Any) -> ColorPath:
         """Return how the rasterizer evaluates signed colour: render colours of both signs with and without its flag."""
@@ -232,7 +232,7 @@ class DryRun:
             raise
         except Exception as error:
             raise UserInputError(
-                f"dry run: {what} failed at {self._place(error)}: {_first_line(error)}; expected {expected}; {works}"
+                f"dry run: {what} failed at {self._place(error)}: {typed_line(error)}; expected {expected}; {works}"
             ) from error
 
     def _place(self, error: Exception) -> str:
@@ -310,10 +310,6 @@ def _some(points: Any) -> Any:
     step = len(points.points) // MOST_POINTS + 1
     names = ("points", "colors", "normals")
     return points if step == 1 else points._replace(**{name: getattr(points, name)[::step] for name in names})
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {(str(error).splitlines() or ['no message'])[0]}"
 
 
 @contextmanager

@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import ast
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
+
+from typing_extensions import NotRequired
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
@@ -33,24 +34,19 @@ from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import exists
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText, SceneReference
 from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.scenes import smallest_size
-from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked, read_json, read_text
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
+from lapgs_plugin.untrusted import StrictWithMore, checked, read_json, read_text
 
 CFG_ARGS, TRAIN_INFO, BREAKDOWN = "cfg_args", "TRAIN_INFO", "runtime_breakdown.json"
 COPY = "copy it again"
 
 
-class Options(TypedDict):
+class Options(StrictWithMore):
     """Type the options used of cfg_args, which has others, too."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     source_path: PathText
     resolution: int
     sh_degree: Literal[0, 1, 2, 3]
@@ -60,17 +56,15 @@ class Options(TypedDict):
     images: NotRequired[PathText | None]
 
 
-class BreakdownOptions(TypedDict):
+class BreakdownOptions(StrictWithMore):
     """Type the options used of a breakdown."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     blur_up: NotRequired[bool]
 
 
-class BreakdownFile(TypedDict):
+class BreakdownFile(StrictWithMore):
     """Type the entries used of `BREAKDOWN`."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     config: NotRequired[BreakdownOptions]
     backbone: NotRequired[str | None]
 
@@ -153,7 +147,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
             "below it without gaps; give the folder that training wrote with -m"
         )
     breakdown: dict[str, Any] = {}
-    if _is_file(folder / BREAKDOWN):
+    if exists(folder / BREAKDOWN):
         advice = f"{COPY} or remove it"
         breakdown = read_json(folder / BREAKDOWN, BreakdownFile, error=RunFolderError, advice=advice, finite=False)
     if trained[expected[0]] != folder and options.get("white_background"):
@@ -165,7 +159,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
     is_single = levels[0].ply.is_relative_to(folder / "point_cloud")
-    record = read_bare_record(folder / BARE_RECORD) if is_single and _is_file(folder / BARE_RECORD) else {}
+    record = read_bare_record(folder / BARE_RECORD) if is_single and exists(folder / BARE_RECORD) else {}
     return ForeignRun(folder, options, levels, _recognised(options, breakdown), record)
 
 
@@ -175,7 +169,7 @@ def read_cfg_args(path: Path) -> dict[str, Any]:
     Raises:
         RunFolderError: it is missing or something else, or lacks an option.
     """
-    if not _is_file(path):
+    if not exists(path):
         raise RunFolderError(
             f"{path} does not exist; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
         )
@@ -305,11 +299,6 @@ def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str
             return adapter.info.name
     noted = breakdown.get("backbone")
     return noted if noted in list(BACKBONES) else None
-
-
-def _is_file(path: Path) -> bool:
-    with one_line_errors(path, "read"):
-        return path.is_file()
 
 
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:

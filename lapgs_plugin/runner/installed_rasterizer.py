@@ -7,7 +7,7 @@ from pathlib import Path
 from lapgs_plugin.adapters.registry import known_extensions
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.source import CheckoutSource
-from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
 
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
@@ -63,9 +63,8 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
     where = next((one.where for one in imports if _package(one.name) == package), None)
     if not package or (purpose is None and where is None):
         return None
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     named = f", the {purpose}" if purpose else ""
-    problem = f"{where or script} needs {package}{named}, which cannot be imported ({reason})"
+    problem = f"{where or script} needs {package}{named}, which cannot be imported ({first_line(error)})"
     rasterizers = () if source is None else map(_package, source.rasterizer_modules)
     if purpose is None and package not in rasterizers:
         return MissingExtraError(f"{problem}: pip install {DISTRIBUTIONS.get(package, package)}")

@@ -68,18 +68,16 @@ class StageReplacements:
 
     def _in_training(self, profile: Profile) -> list[Replacement]:
         scenes = profile.script_names(profile.scene)
-        saves = [Replacement(profile.scene, "save", self._make_save, None, "training() at --save_iterations")]
         return [
             Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, None, "training()") for name in scenes),
-            *(saves if "save" in vars(profile.scene) else ()),
+            *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
 
     def _in_rendering(self, profile: Profile) -> list[Replacement]:
         consumer = "the training loop, score functions and reports"
         wrapper = self._context.wrapper
-        made = [(function, wrapper.renderer) for function in profile.renderers]
-        found = [(owner, name, make) for value, make in made for owner, name in profile.holders(value)]
+        found = [(*place, wrapper.renderer) for function in profile.renderers for place in profile.holders(function)]
         for rasterizer in profile.rasterizers:
             for name in rasterizer.settings:
                 found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]

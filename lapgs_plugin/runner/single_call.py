@@ -40,15 +40,13 @@ class NestedStage(ActiveStage):
         others: as of `ActiveStage`.
     """
 
+    keeps_schedule = True
+
     def __init__(self, *others: Any, advance: Callable[[Any], ActiveStage]) -> None:
         super().__init__(*others)
         self._advance = advance
         if self._options.prune and (until := pruning_iteration(self._call)) is not None:
             self._prune_at = until - self.window.start  # the call counts the iterations of the whole run
-
-    @property
-    def keeps_schedule(self) -> bool:
-        return True
 
     @property
     def has_more(self) -> bool:
@@ -62,7 +60,7 @@ class NestedStage(ActiveStage):
 
     def take_over(self, before: NestedStage, gaussians: Any) -> None:
         """Continue training the model, with the views, of the stage before."""
-        self._gaussians = gaussians
+        self.gaussians = gaussians
         self._views.take_over(before._views)
 
 
@@ -98,7 +96,7 @@ class SingleCall:
             return
         stage = self._stage = self._next(self._restored(self._done[-1]) if self._done else None)
         try:
-            stage.copy_scene_files(scene_files)
+            stage.scene_files = scene_files
             self._begin(stage)
             if self._done:
                 self._run_from(stage.window.start)

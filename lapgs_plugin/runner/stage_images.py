@@ -14,7 +14,7 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.image_store import ImageStore, chosen_precision
-from lapgs_plugin.runs.level_images import ImageStores, LevelImages
+from lapgs_plugin.runs.level_images import HeldImages, ImageStores, LevelImages
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 
@@ -115,6 +115,5 @@ class StageImages:
             store.close()
 
     @property
-    def _all_stores(self) -> tuple[ImageStore, ...]:
-        upsampled = (images.store for images in (self.coarse, self.accumulated) if images is not None)
-        return (self.targets, *upsampled, *([self.weights] if isinstance(self.weights, ImageStore) else []))
+    def _all_stores(self) -> tuple[ImageStore | HeldImages, ...]:
+        return (*self._images.stores, *([] if self.accumulated is None else [self.accumulated.store]))

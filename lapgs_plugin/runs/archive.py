@@ -335,9 +335,7 @@ class RunArchive(RunFiles):
 
     def _require_file(self, record: LevelRecord) -> None:
         path = self.field_path(record.level)
-        with one_line_errors(path, "read"):
-            is_there = path.is_file()
-        if not is_there:
+        if not exists(path):
             raise RunFolderError(
                 f"level {record.level} of {self._folder} is missing: no {path.name}; train it again with --overwrite"
             )

@@ -64,7 +64,7 @@ class ImageStores:
 class HeldImages:
     """Keep images as the tensors they are. It has those methods of an `ImageStore` that training calls."""
 
-    bytes_on_device = bytes_in_memory = bytes_on_disk = 0  # nothing has to be copied
+    bytes_on_device = 0  # nothing has to be copied
 
     def __init__(self) -> None:
         self._images: dict[str, Tensor] = {}

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, fields
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveInt
+from typing_extensions import NotRequired
 
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST, require_manifest
 from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Stage
-from lapgs_plugin.untrusted import STRICT, STRICT_WITH_MORE, checked, read_json, shortened, usable_path
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
+from lapgs_plugin.untrusted import STRICT, StrictWithMore, checked, read_json, shortened, usable_path
 
 FORMAT_VERSION = 1
 ADVICE = "restore it or train again with --overwrite"
@@ -41,10 +36,9 @@ MemoryBytes = Annotated[dict[str, NonNegativeInt], AfterValidator(_peak_and_imag
 Settings = Annotated[dict[str, Any], GetPydanticSchema(lambda _source, schema: schema(KnownSettings))]
 
 
-class KnownSettings(TypedDict):
+class KnownSettings(StrictWithMore):
     """Check settings that other rooms look up in a manifest. `training.settings` checks all of them."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     iterations: NotRequired[PositiveInt]
     hierarchy: NotRequired[Literal["nested", "laplacian"]]
     clamped: NotRequired[bool]

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+from typing_extensions import NotRequired
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.runs.manifest import MemoryBytes
-from lapgs_plugin.untrusted import STRICT, STRICT_WITH_MORE, read_json
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
+from lapgs_plugin.untrusted import Strict, StrictWithMore, read_json
 
 
-class HistoryEntry(TypedDict):
+class HistoryEntry(StrictWithMore):
     """One line of the history."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     level: NonNegativeInt
     iteration: NonNegativeInt
     elapsed: NotRequired[NonNegativeFloat]
@@ -33,24 +27,27 @@ class HistoryEntry(TypedDict):
     num_gaussians: NotRequired[NonNegativeInt]
 
 
-class MetricsOfView(TypedDict):
-    """One view in `Metrics`."""
+class _Distances(StrictWithMore):
+    """LPIPS variants that were measured."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
-    name: str
-    psnr: float
-    fitted_psnr: NotRequired[float]
-    ssim: float
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]
     lpips_squeeze: NotRequired[float]
     lpips_vgg_3dgs: NotRequired[float]
 
 
-class MetricsOfLevel(TypedDict):
+class MetricsOfView(_Distances):
+    """One view in `Metrics`."""
+
+    name: str
+    psnr: float
+    fitted_psnr: NotRequired[float]
+    ssim: float
+
+
+class MetricsOfLevel(StrictWithMore):
     """One level in `Metrics`."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     psnr: float
     upsampled_psnr: float
     iterations: PositiveInt
@@ -64,17 +61,12 @@ class MetricsOfLevel(TypedDict):
     memory_bytes: MemoryBytes
 
 
-class Metrics(TypedDict):
+class Metrics(_Distances):
     """The metrics of a run, as far as `evaluation.figures.run_figures` measured them."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     psnr: NotRequired[float]
     fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
-    lpips_vgg: NotRequired[float]
-    lpips_alex: NotRequired[float]
-    lpips_squeeze: NotRequired[float]
-    lpips_vgg_3dgs: NotRequired[float]
     lpips_missing: NotRequired[dict[str, str]]
     fps: NotRequired[NonNegativeFloat]
     split: NotRequired[Literal["test", "train"]]
@@ -95,19 +87,17 @@ class Metrics(TypedDict):
     versions: NotRequired[dict[str, str]]
 
 
-class Timeline(TypedDict):
+class Timeline(Strict):
     """One moment of a `BareRecord`."""
 
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
     iteration: NonNegativeInt
     elapsed: NonNegativeFloat
     num_gaussians: NonNegativeInt
 
 
-class BareRecord(TypedDict):
+class BareRecord(Strict):
     """A script's own run without a hierarchy, as `lapgs run --off --record` measures it (`runner.recording`)."""
 
-    __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
     iterations: PositiveInt
     train_seconds: NonNegativeFloat
     saving_seconds: NonNegativeFloat

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, first_line
 from lapgs_plugin.files import atomic_write, one_line_errors
 
 
@@ -41,8 +41,7 @@ def read_tensors(path: Path, advice: str) -> dict[str, Any]:
         _require_stored(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # RuntimeError, UnpicklingError, EOFError, OSError, ...: it depends on the damage
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
+        raise RunFolderError(f"{path} cannot be read ({first_line(error)}); {advice}") from error
     if not isinstance(state, dict):
         raise RunFolderError(f"{path} holds a {type(state).__name__}, expected a dictionary; {advice}")
     _require_held(state, path, advice)

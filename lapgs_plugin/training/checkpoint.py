@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,13 @@ from typing import Any
 import torch
 from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveInt, TypeAdapter, ValidationError
 from torch import Tensor
+from typing_extensions import NotRequired, TypedDict
 
-from lapgs_plugin.errors import FieldError, RunFolderError
+from lapgs_plugin.errors import FieldError, RunFolderError, first_line
 from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import problem
-
-if sys.version_info >= (3, 12):
-    from typing import NotRequired, TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import NotRequired, TypedDict
 
 ADVICE = "delete it to continue from the last finished level"
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
@@ -31,10 +26,13 @@ _STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 Moments = dict[str, dict[str, Tensor]]
 
 
-class ProgressState(TypedDict):
+class _State(TypedDict):
+    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
+
+
+class ProgressState(_State):
     """State of a `stage_progress.StageProgress`; the loss is NaN before the first iteration."""
 
-    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     iteration: NonNegativeInt
     seconds: NonNegativeFloat
     loss: float
@@ -43,29 +41,26 @@ class ProgressState(TypedDict):
     most_views: NotRequired[PositiveInt | None]
 
 
-class ModelState(TypedDict):
+class ModelState(_State):
     """Result of `model.TrainableField.state`."""
 
-    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     params: dict[str, Tensor]
     moments: Moments
     gradients: NotRequired[dict[str, Tensor]]
     signed: bool
 
 
-class TransformsState(TypedDict):
+class TransformsState(_State):
     """Result of `view_transforms.ViewTransforms.state`."""
 
-    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     transforms: Tensor
     gradient: Tensor | None
     moments: dict[str, Tensor]
 
 
-class BestState(TypedDict):
+class BestState(_State):
     """The best state of a stage so far, with --keep best."""
 
-    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     psnr: float
     iteration: PositiveInt
     model: ModelState
@@ -74,10 +69,9 @@ class BestState(TypedDict):
     poses: NotRequired[TransformsState | None]
 
 
-class StageState(TypedDict):
+class StageState(_State):
     """Result of `stage.StageRun.state`, and the overhead so far."""
 
-    __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
     level: NonNegativeInt
     progress: ProgressState
     breakdown: NotRequired[dict[str, NonNegativeFloat]]
@@ -207,7 +201,7 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
     try:
         torch.Generator().set_state(random)
     except RuntimeError as error:
-        raise ValueError(f"random is no state of PyTorch's generator ({str(error).splitlines()[0]})") from error
+        raise ValueError(f"random is no state of PyTorch's generator ({first_line(error)})") from error
 
 
 def _check_joint(models: Mapping[int, dict[str, Any]], name: str, settings: TrainSettings) -> None:

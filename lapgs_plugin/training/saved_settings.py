@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +9,7 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.training.settings import IN_MANIFEST, LAST, OFF, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, STRATEGIES
-from lapgs_plugin.untrusted import STRICT_WITH_MORE, checked
-
-if sys.version_info >= (3, 12):
-    from typing import TypedDict
-else:  # pydantic cannot read the older TypedDict of `typing`
-    from typing_extensions import TypedDict
+from lapgs_plugin.untrusted import StrictWithMore, checked
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.manifest import Manifest
@@ -60,10 +54,9 @@ def settings_from_manifest(manifest: Manifest, name: str = "the run's manifest")
         raise RunFolderError(f"{name} is damaged: {error}; {advice}") from error
 
 
-class _OldSettings(TypedDict):
+class _OldSettings(StrictWithMore):
     """Settings of a run of any version that `_of_this_version` converts."""
 
-    __pydantic_config__ = STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
     densification: dict[str, Any]
     learning_rates: dict[str, Any]
     split: str | list[str] | None
