@@ -16,8 +16,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import typed_line
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, pixel_weights, random_case
-from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, render_transmittance
-from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, degree_to_evaluate, render_transmittance
+from lapgs_plugin.rasterizers.signed_color import precomputed_colors
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
 
@@ -290,9 +290,7 @@ def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance
     transmittance = actual.transmittance[mask.pixels]  # (p,)
     if bool(((transmittance < -tolerance) | (transmittance > 1 + tolerance)).any()):
         yield "transmittance in the band is not in [0, 1]"
-    degree = case.field.sh_degree if case.sh_degree is None else case.sh_degree
-    directions = torch.nn.functional.normalize(case.field.means - case.camera.position, dim=-1)  # (n, 3)
-    colors = sh_to_color(case.field.sh, directions, degree, signed=case.field.signed)  # (n, 3)
+    colors = precomputed_colors(case.field, case.camera, degree_to_evaluate(case.field, case.sh_degree))  # (n, 3)
     palette = torch.cat([colors, case.background_tensor[None]])  # (n + 1, 3)
     low, high = (palette.amin(0) - tolerance)[:, None], (palette.amax(0) + tolerance)[:, None]  # (3, 1) each
     pixels = actual.image[:, mask.pixels]  # (3, p)

@@ -53,13 +53,13 @@ class Variant:
     Attributes:
         description: of its module.
         settings: fields of its `GaussianRasterizationSettings`, in their order.
-        options: from the settings of a call to what it asks of the engine.
-        outputs: from these settings and the engine's output to what `forward` returns.
+        options: from the settings of a call to its options of the engine.
+        outputs: from these settings and the engine's output to the result of `forward`.
         module: name that checkouts import.
         binding: `GaussianRasterizer` without its `variant`; its `forward` has the arguments of the CUDA module's.
         sparse_adam: whether the module has `SparseGaussianAdam`.
         fused_ssim: whether its binding `_C` has SSIM.
-        functions: what its module has besides the rasterizer.
+        functions: other functions and classes of its module.
         beside: variants of other modules that the same checkouts import.
         needs_logs: whether these checkouts cannot do without TensorBoard.
     """
