@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from lapgs_plugin.experiments.runner import execute
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
 from lapgs_plugin.experiments.worker import Slot, gpu_name
-from tests.experiments.examples import COPY, START, copying_jobs
+from tests.experiments.examples import COPY, START, copying_jobs, starts
 
 NOTE_ENVIRONMENT = START + (
     "import os; stream = open(started + '-gpus', 'a'); "
@@ -42,10 +41,6 @@ def run_all(order: WorkOrder, start: Callable[[], Launcher]) -> list[Outcome]:
     outcomes = execute(ResultStore(order.store), order.run_ids, start, said.append)
     assert sorted(each.run_id for each in said) == sorted(order.run_ids), "each is told of once"
     return outcomes
-
-
-def starts(tmp_path: Path) -> Counter[str]:
-    return Counter(name.partition("-attempt")[0] for name in (tmp_path / "started").read_text().split())
 
 
 def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
