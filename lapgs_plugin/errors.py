@@ -21,6 +21,14 @@ def printable(text: str) -> str:
     )
 
 
+def one_line(text: str) -> str:
+    """Return text as one printable line without the middle of very long text."""
+    line = printable(text)
+    if len(line) > LONGEST_LINE:  # it quotes a long value; the file and the advice are at its ends
+        line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
+    return line
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type if it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]
@@ -41,10 +49,7 @@ class LapgsError(Exception):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, message: str = "") -> None:
-        line = printable(message)
-        if len(line) > LONGEST_LINE:  # it quotes a long value; the file and the advice are at its ends
-            line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
-        super().__init__(line)
+        super().__init__(one_line(message))
 
 
 class UserInputError(LapgsError, ValueError):

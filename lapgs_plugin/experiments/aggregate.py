@@ -21,6 +21,10 @@ from lapgs_plugin.untrusted import shortened
 
 Row = Mapping[str, Any]
 """Row of results, see `rows`."""
+LEVELS = "_level_"
+"""End of a source that stands for one column for each level."""
+TIMES = ("minutes", "train_seconds", "iteration_ms")
+"""Columns for the speed-up; the first one in the table is used."""
 
 
 @dataclass(frozen=True)
@@ -350,10 +354,6 @@ class _GroupBuilder:
         return notes
 
 
-TIMES = ("minutes", "train_seconds", "iteration_ms")
-"""Columns for the speed-up; the first one in the table is used."""
-
-
 def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: PaperFigure | None) -> Cell:
     """Compute a figure from the rows of all scenes, for each seed."""
     figures = [[_value(row, column) for row in scenes] for scenes in seeds]
@@ -392,10 +392,6 @@ def _number(row: Row, name: str) -> float:
             "experiment again in another folder"
         )
     return value
-
-
-LEVELS = "_level_"
-"""End of a source that stands for one column for each level."""
 
 
 def _compare(base: Cell | None, own: Cell | None, how: Callable[[float, float], float]) -> Ratio:

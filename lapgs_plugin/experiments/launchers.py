@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.environment import run_program
-from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.errors import MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.worker import Slot, work
 
@@ -128,7 +128,7 @@ class LocalLauncher(Launcher):
         try:
             work(order.store, order.run_ids, slot, self._stop)
         except Exception as error:  # reported by the caller; a thread's traceback would break the progress display
-            self._errors.append(f"worker on {slot.gpu or 'the processor'}: {type(error).__name__}: {error}")
+            self._errors.append(f"worker on {slot.gpu or 'the processor'}: {typed_line(error)}")
 
 
 class SlurmLauncher(Launcher):

@@ -10,13 +10,15 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from lapgs_plugin.errors import UserInputError, printable
+from lapgs_plugin.errors import UserInputError, one_line
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 
 T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+LINE = r"^[^\x00-\x1f\x7f]*$"
+"""Text of one line, which fits into a table."""
 OF_BARE_RUNS = {"gpu_busy"}
 """Options that a checkout's script by itself can be run with."""
 Options = dict[str, bool | int | float | str]
@@ -99,7 +101,7 @@ class Backbone(_StrictModel):
         options: options of `lapgs train` for every run, or of `lapgs run` for every hierarchy.
     """
 
-    title: str = ""
+    title: str = Field("", pattern=LINE)
     rasterizer: str | None = None
     checkout: str | None = Field(None, pattern=NAME)
     preset: str | None = None
@@ -138,7 +140,7 @@ class Variant(_StrictModel):
         baseline: whether other variants on the same backbone are compared with it.
     """
 
-    name: str
+    name: str = Field(pattern=LINE, min_length=1)
     method: Literal["hierarchy", "bare"] = "hierarchy"
     backbones: list[str] = []
     preset: dict[str, str] = {}
@@ -146,7 +148,7 @@ class Variant(_StrictModel):
     resolution: str | None = None
     options: Options = {}
     arguments: list[str] = []
-    section: str = ""
+    section: str = Field("", pattern=LINE)
     paper: str | dict[str, str] = ""
     baseline: bool = False
 
@@ -182,7 +184,7 @@ class Experiment(_StrictModel):
     """A whole experiment file."""
 
     name: str = Field(pattern=NAME)
-    title: str
+    title: str = Field(pattern=LINE)
     iterations: int = Field(REFERENCE_ITERATIONS, ge=1)
     seeds: list[int] = Field([0], min_length=1)
     scenes: list[Scenes] = Field(min_length=1)
@@ -238,8 +240,6 @@ PARTS: Mapping[str, type[BaseModel]] = {
     "sample": SampleScene,
 }
 """The model behind each key that holds tables."""
-LONGEST_LINE = 1000
-"""Most characters of one mistake's line."""
 ALTERNATIVES = ("bool", "int", "float", "str", "dict[str,str]")
 """Pydantic's names for the alternative types of a value."""
 
@@ -282,12 +282,6 @@ def nearest(name: str, known: Set[str]) -> str:
     """Suggest the nearest known name, or list all of them."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(sorted(known))}"
-
-
-def one_line(text: str) -> str:
-    """Return the text as one line of limited length, with control characters escaped."""
-    line = printable(text)
-    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
 
 
 def _problems(error: ValidationError) -> list[str]:

@@ -216,16 +216,8 @@ class ResultStore:
 
     def claim(self, run_ids: Collection[str]) -> Claim | None:
         """Claim the first free run of these; None when none is free."""
-        now, wanted = time.time(), set(run_ids)
         with self._transaction() as connection:
-            found = connection.execute(
-                "SELECT run_id, job, state, owner, lease_until, claims FROM runs WHERE state IN (?, ?) "
-                "ORDER BY position",
-                (PENDING, RUNNING),
-            ).fetchall()
-            for run_id, job, state, holder, lease_until, claims in found:
-                if run_id not in wanted or (state == RUNNING and not _abandoned(holder, lease_until, now)):
-                    continue
+            for run_id, job, claims in _free(connection, run_ids):
                 if claims >= MAX_CLAIMS:
                     connection.execute(
                         "UPDATE runs SET state = ?, owner = NULL, error = ? WHERE run_id = ?",
@@ -235,20 +227,15 @@ class ResultStore:
                 owner = _new_owner()
                 connection.execute(
                     "UPDATE runs SET state = ?, owner = ?, lease_until = ?, claims = ? WHERE run_id = ?",
-                    (RUNNING, owner, now + LEASE, claims + 1, run_id),
+                    (RUNNING, owner, time.time() + LEASE, claims + 1, run_id),
                 )
                 return Claim(Job.from_json(job).attempt(claims + 1), owner, claims + 1)
         return None
 
     def has_free(self, run_ids: Collection[str]) -> bool:
         """Tell whether `claim` would find one of these runs."""
-        now, wanted = time.time(), set(run_ids)
         with self._transaction() as connection:
-            found = connection.execute("SELECT run_id, state, owner, lease_until FROM runs").fetchall()
-        return any(
-            run_id in wanted and (state == PENDING or (state == RUNNING and _abandoned(holder, lease_until, now)))
-            for run_id, state, holder, lease_until in found
-        )
+            return any(True for _ in _free(connection, run_ids))
 
     def renew(self, claim: Claim) -> bool:
         """Extend a claim by `LEASE`; False when it is lost, and the run must be stopped."""
@@ -308,6 +295,18 @@ class ResultStore:
             raise RunFolderError(f"{self._path} is no store of results ({error}); choose another folder") from error
         finally:
             connection.close()  # rolls back what was not committed
+
+
+def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[tuple[str, str, int]]:
+    """Yield name, job and claims of those of these runs that wait or were abandoned, in order."""
+    wanted, now = set(run_ids), time.time()
+    found = connection.execute(
+        "SELECT run_id, job, claims, state, owner, lease_until FROM runs WHERE state IN (?, ?) ORDER BY position",
+        (PENDING, RUNNING),
+    ).fetchall()
+    for run_id, job, claims, state, holder, lease_until in found:
+        if run_id in wanted and (state == PENDING or _abandoned(holder, lease_until, now)):
+            yield run_id, job, claims
 
 
 def _differences(one: str, other: str) -> str:

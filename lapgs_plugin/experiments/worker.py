@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 from lapgs_plugin import __version__
 from lapgs_plugin.environment import run_program, versions
-from lapgs_plugin.errors import LapgsError, printable
+from lapgs_plugin.errors import LapgsError, one_line
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 
@@ -79,7 +79,7 @@ class RunFailedError(LapgsError):
     """A command of a run failed; the message has the end of its log, line by line."""
 
     def __init__(self, message: str) -> None:
-        Exception.__init__(self, "\n".join(printable(line) for line in message.split("\n")))
+        Exception.__init__(self, "\n".join(map(one_line, message.split("\n"))))
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:

@@ -194,7 +194,7 @@ def _blur(image: Tensor, dim: int) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-@torch.inference_mode(False)  # kept for others, who may need gradients
+@torch.inference_mode(False)  # cached for later calls, which may need gradients
 def _mirrored(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the samples that pad a side of n before and after; sides of 1 and 2 are mirrored repeatedly."""
     before, after = _reflected(torch.tensor([[-2, -1], [n, n + 1]]), n).to(device)
@@ -224,7 +224,7 @@ def _take(image: Tensor, dim: int, index: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-@torch.inference_mode(False)  # kept for others, who may need gradients
+@torch.inference_mode(False)  # cached for later calls, which may need gradients
 def _neighbours(
     n: int, centres: tuple[float, float, int], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.ops.upsample import upsample_add
+from lapgs_plugin.ops.upsample import upsample, upsample_add
 
 AS_TRAINED: Mapping[int, float] = MappingProxyType({})
 
@@ -92,14 +92,15 @@ def scaled(image: Tensor, gain: float) -> Tensor:
     return image if gain == 1.0 else gain * image
 
 
-def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid) -> Tensor:
+def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid, finest: int = 0) -> Tensor:
     """Upsample a composed image of `level` to the size of the full-resolution view, as if finer residuals were zero.
 
     Args:
         image: (3, h, w) at the size of `level`.
         camera: of the full-resolution view.
+        finest: level at whose size to end instead.
     """
-    for finer in range(level - 1, -1, -1):
+    for finer in range(level - 1, finest - 1, -1):
         width, height = level_size((camera.width, camera.height), finer)
-        image = pyramid.up(image, (height, width))
+        image = upsample(pyramid, image, (height, width))
     return image

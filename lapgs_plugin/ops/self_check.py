@@ -60,7 +60,7 @@ class SelfCheck:
 
 
 def _in_one_line(error: BaseException) -> str:
-    """Return what went wrong first; Triton's errors show source code before they say it."""
+    """Return the first cause of an error; Triton's errors show source code before they name it."""
     while error.__cause__ is not None:
         error = error.__cause__
     text = str(getattr(error, "error_message", None) or error).strip()

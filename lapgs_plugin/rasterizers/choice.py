@@ -41,7 +41,7 @@ class PlacedRasterizer:
 
 
 def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "auto") -> PlacedRasterizer:
-    """Choose what renders a run, and log the choice with its reason.
+    """Choose the rasterizer of a finished run and its device, and log the choice with its reason.
 
     "auto" takes the rasterizer of the training if it can be imported and has its device, then gsplat if it can render
     here, then the fast CPU rasterizer.

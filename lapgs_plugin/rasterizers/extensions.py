@@ -80,7 +80,7 @@ class CudaExtension:
     Args:
         name: of its module, a rasterizer of a registered backbone.
         device: where it renders; a stand-in for the CPU renders there.
-        settings: what to set instead of `CONSTANTS`, such as {"mult": 0.5}.
+        settings: values that replace those of `CONSTANTS`, such as {"mult": 0.5}.
         module: the module of that name; None imports it.
 
     Raises:

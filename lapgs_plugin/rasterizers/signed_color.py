@@ -36,7 +36,7 @@ PROBE_TOLERANCE = 1e-3
 
 
 class ColorPath(Enum):
-    """Say what computes the colours of a signed field: the extension, or PyTorch before it."""
+    """Choose where the colours of a signed field are computed: in the extension, or in PyTorch before it."""
 
     NATIVE = "native"
     PRECOMPUTED = "precomputed"
@@ -101,6 +101,7 @@ def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Ten
     return sh_to_color(field.sh, directions, degree, signed=field.signed)
 
 
+@torch.inference_mode(False)  # whatever mode the caller is in: it takes gradients
 def has_signed_color(extension: CudaExtension) -> bool:
     """Test whether the installed extension renders and differentiates signed colour."""
     field, camera, degree = _probe_scene(extension.device)

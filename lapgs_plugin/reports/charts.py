@@ -61,7 +61,7 @@ class Series:
 
     Attributes:
         kind: style of the line.
-        points: (x, y) in data units, by increasing x.
+        points: (x, y) by increasing x, in data units, or in chart units when drawn.
     """
 
     kind: str
@@ -83,7 +83,7 @@ class Arrow:
     Attributes:
         kind: style of the arrow.
         label: tooltip.
-        start, end: (x, y) in data units.
+        start, end: (x, y) in data units, or in chart units when drawn; the drawn end leaves room for the head.
     """
 
     kind: str
@@ -133,25 +133,6 @@ class PlacedMark:
 
 
 @dataclass(frozen=True)
-class Line:
-    """One line in chart units; `points` is the attribute of an SVG polyline."""
-
-    kind: str
-    points: str
-    last: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class PlacedArrow:
-    """An arrow in chart units; its end leaves room for the head."""
-
-    kind: str
-    label: str
-    start: tuple[float, float]
-    end: tuple[float, float]
-
-
-@dataclass(frozen=True)
 class Chart:
     """A drawn chart of lines or of arrows.
 
@@ -169,8 +150,8 @@ class Chart:
     frame: Frame
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
-    lines: tuple[Line, ...] = ()
-    arrows: tuple[PlacedArrow, ...] = ()
+    lines: tuple[Series, ...] = ()
+    arrows: tuple[Arrow, ...] = ()
     marks: tuple[PlacedMark, ...] = ()
     inset: Chart | None = None
 
@@ -251,10 +232,10 @@ def draw_lines(
     if inset is not None:
         y_ticks = _clear_inset(series, right, y_ticks)
     bottom, top = y_ticks[0], y_ticks[-1]
-    lines = []
-    for line in series:
-        placed = [(frame.x(x / right), frame.y((y - bottom) / (top - bottom))) for x, y in line.points]
-        lines.append(Line(line.kind, " ".join(f"{x},{y}" for x, y in placed), placed[-1]))
+    lines = [
+        Series(line.kind, [(frame.x(x / right), frame.y((y - bottom) / (top - bottom))) for x, y in line.points])
+        for line in series
+    ]
     return Chart(
         title,
         x_label,
@@ -328,7 +309,7 @@ def draw_arrows(
         length = math.dist(start, end)
         share = max(0.0, 1.0 - ARROW_HEAD / length) if length else 1.0
         tip = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
-        placed.append(PlacedArrow(arrow.kind, arrow.label, start, (round(tip[0], 1), round(tip[1], 1))))
+        placed.append(Arrow(arrow.kind, arrow.label, start, (round(tip[0], 1), round(tip[1], 1))))
     return Chart(
         title,
         x_label,

@@ -170,9 +170,9 @@ def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np
         fx = _focal(values, "x", width)
         fy = _focal(values, "y", height) or fx
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    except SceneError:
+        raise
     except (TypeError, ValueError, ArithmeticError) as error:
-        if isinstance(error, SceneError):
-            raise
         raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export the scene again") from error
     if fx is None or fy is None:
         raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export the scene again")

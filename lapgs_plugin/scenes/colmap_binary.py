@@ -83,10 +83,8 @@ def _records(file: Path) -> tuple[bytes, list[int]]:
 
 def _camera_end(data: bytes, start: int) -> int:
     (model,) = struct.unpack_from("<i", data, start + 4)
-    camera = pycolmap.Camera()
-    camera.model = pycolmap.CameraModelId(model)
-    parameters = [*camera.focal_length_idxs(), *camera.principal_point_idxs(), *camera.extra_params_idxs()]
-    return start + 4 + 4 + 8 + 8 + 8 * len(parameters)
+    camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    return start + 4 + 4 + 8 + 8 + 8 * len(camera.params)
 
 
 def _image_end(data: bytes, start: int) -> int:

@@ -91,11 +91,7 @@ def _check_camera(line: _Line) -> int:
     model = line.words[1]
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
-    camera = pycolmap.Camera()
-    camera.model = pycolmap.CameraModelId.__members__[model]
-    count = sum(
-        len(each()) for each in (camera.focal_length_idxs, camera.principal_point_idxs, camera.extra_params_idxs)
-    )
+    count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
     if len(line.numbers(float, line.words[4:], f"{count} finite parameters of {model}")) != count:
         line.refuse(f"{count} parameters of {model}, not {len(line.words) - 4}")
     return key

@@ -51,6 +51,15 @@ def has_alpha(path: Path) -> bool:
     return _channels(_open(path).spec()).alpha >= 0
 
 
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether images of these sizes may be copies of each other, whose sides resizing rounded by up to a pixel.
+
+    >>> same_shape((1599, 1066), (3118, 2078)), same_shape((1600, 1200), (3118, 2078))
+    (True, False)
+    """
+    return abs(one[0] / other[0] - one[1] / other[1]) <= 1.0 / other[0] + 1.0 / other[1]
+
+
 def check_image(path: Path) -> tuple[int, int]:
     """Decode an image file completely, a few rows at a time, and return its width and height in pixels.
 

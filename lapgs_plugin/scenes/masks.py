@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
-from lapgs_plugin.scenes.images import has_alpha, image_size, read_image
+from lapgs_plugin.scenes.images import has_alpha, image_size, read_image, same_shape
 from lapgs_plugin.scenes.source import is_folder
 
 MASKS = "masks"
@@ -95,8 +95,7 @@ def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tens
         SceneError: it cannot be read, has another shape, or is black everywhere.
     """
     width, height = image_size(path)
-    # Masks may be smaller or larger copies, whose sides were rounded.
-    if abs(width / photo[0] - height / photo[1]) > 1.0 / photo[0] + 1.0 / photo[1]:
+    if not same_shape((width, height), photo):
         turned = " (EXIF turns photos for display; masks belong to stored pixels)" if width == photo[1] else ""
         raise SceneError(
             f"{path}: the mask is {width}x{height} pixels, its photo {photo[0]}x{photo[1]}{turned}; expected the same "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -24,7 +25,7 @@ def in_threads(
     work: Callable[[_Item], _Result],
     items: Sequence[_Item],
     *,
-    threads: int,
+    most: int | None = None,
     progress: bool | ProgressCallback,
 ) -> list[_Result]:
     """Apply `work` to all items in threads and return the results in order; raise the first error in order.
@@ -33,14 +34,15 @@ def in_threads(
         title, unit: of the progress bar.
         work: what to do.
         items: what to do it with.
-        threads: their number.
+        most: number of threads; None for one a processor that this process may use.
         progress: True shows a bar on stderr, False nothing; a function is called after each item.
     """
     bar = item_progress(unit) if progress is True else None
     task = bar.add_task(title, total=len(items)) if bar else None
     results = []
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     # One thread an item: torch's own threads would compete with these.
-    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ThreadPoolExecutor(min(usable, most or usable), initializer=torch.set_num_threads, initargs=(1,))
     with bar or nullcontext():
         try:
             for done, future in enumerate([pool.submit(work, item) for item in items], start=1):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +17,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
-from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape
 from lapgs_plugin.scenes.masks import ALPHA, AUTO, NONE, alpha_mask, find_masks, read_mask, resolve_masks
 from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
@@ -225,8 +224,7 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
     """Return the camera at its training size, after comparing the shapes of model and file."""
     camera = frame.camera
     width, height = image_size(frame.path)
-    # Resizing may have rounded both sides by up to a pixel.
-    if abs(width / camera.width - height / camera.height) > 1.0 / camera.width + 1.0 / camera.height:
+    if not same_shape((width, height), (camera.width, camera.height)):
         raise SceneError(
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
             "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
@@ -269,13 +267,7 @@ def _load_views(
         return View(frame.name, camera, read(frame.path, size), read_its_mask(frame, size))
 
     items = list(zip(frames, cameras, strict=True))
-    return in_threads("Reading images", "images", load, items, threads=_workers(), progress=progress)
-
-
-def _workers() -> int:
-    """Return the number of threads for reading."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(usable, MAX_WORKERS)
+    return in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=progress)
 
 
 def _extent(path: Path, train: Sequence[Frame]) -> float:

@@ -184,19 +184,17 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
     if iteration > (most := stage.iterations + settings.extension_of(stage)):
         raise ValueError(f"progress.iteration is {iteration}, expected at most {most}")
-    _check_model(state["model"], "model", stage.signed, settings.sh_degree)
-    if (best := state.get("best")) is not None:
-        if best["iteration"] > iteration:
-            raise ValueError(f"best.iteration is {best['iteration']}, expected at most {iteration}")
-        _check_model(best["model"], "best.model", stage.signed, settings.sh_degree)
-        for level, model in (best["joint"] or {}).items():
-            _check_model(model, f"best.joint.{level}", model["signed"], settings.sh_degree)
+    _check_model(state["model"], "model", stage.signed, settings.sh_degree_of(stage.level))
     joint = state.get("joint") or {}
     wanted = set(finished) - {stage.level} if joint_from is not None and iteration >= joint_from else set()
     if joint.keys() != wanted:
         raise ValueError(f"joint has levels {sorted(joint)}, expected {sorted(wanted)}")
-    for level, model in joint.items():
-        _check_model(model, f"joint.{level}", model["signed"], settings.sh_degree)
+    _check_joint(joint, "joint", settings)
+    if (best := state.get("best")) is not None:
+        if best["iteration"] > iteration:
+            raise ValueError(f"best.iteration is {best['iteration']}, expected at most {iteration}")
+        _check_model(best["model"], "best.model", stage.signed, settings.sh_degree_of(stage.level))
+        _check_joint(best["joint"] or {}, "best.joint", settings)
     random = state["random"]
     if random.dtype != torch.uint8 or random.shape != torch.get_rng_state().shape:
         raise ValueError(f"random is {_described(random)}, expected a state of PyTorch's generator")
@@ -204,6 +202,12 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         torch.Generator().set_state(random)
     except RuntimeError as error:
         raise ValueError(f"random is no state of PyTorch's generator ({first_line(error)})") from error
+
+
+def _check_joint(models: Mapping[int, dict[str, Any]], name: str, settings: TrainSettings) -> None:
+    """Check the fields of coarser levels."""
+    for level, model in models.items():
+        _check_model(model, f"{name}.{level}", model["signed"], settings.sh_degree_of(level))
 
 
 def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int) -> None:

@@ -50,13 +50,12 @@ class CoarserLevels:
 
     def prediction(self, names: Sequence[str]) -> Tensor | None:
         """Return the upsampled prediction (3, h, w) of a view, or (b, 3, h, w) of several; None without levels."""
-        several = len(names) > 1
         if self.joint is not None:
             self.breakdown.mark("forward")
-            return self.joint.predict_batch(names) if several else self.joint.predict(names[0])
+            return self.joint.predict(names)
         if self.cached is None:
             return None
-        return self.cached.get_batch(names) if several else self.cached.get(names[0])
+        return self.cached.get_batch(names) if len(names) > 1 else self.cached.get(names[0])
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return what adds `prediction` to renders of the views."""

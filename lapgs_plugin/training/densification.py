@@ -121,14 +121,20 @@ class Densifier(DensityControl):
         assert result is not None, "needed in this iteration"
         refined, reset = self._schedule.refines(iteration), iteration % self._schedule.reset_every == 0
         if refined:
-            info = self._info(result, camera)
-            self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
+            self._refine(model, iteration, result, camera, scores)
         else:
             self.accumulate(result, camera)
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
             self._lower_opacities(model, self._strategy.prune_opa * 2.0)
         return refined or reset
+
+    def _refine(
+        self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera, scores: ViewScores | None
+    ) -> None:
+        """Accumulate the statistics of a render, and add and remove Gaussians by them."""
+        info = self._info(result, camera)
+        self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
         """Return a render as gsplat's strategies expect it."""

@@ -68,9 +68,10 @@ class StageEvaluation:
         camera = level_camera(view.camera, level)
         camera = camera if run.poses is None else run.poses.camera(view.name, camera)
         image = self.context.rasterizer(run.model.field, camera, background=run.background).image
-        cached = None if cache is None else cache.get
-        predict = cached if run.coarser.joint is None else run.coarser.joint.predict
-        image = add_prediction(image, None if predict is None else predict(view.name))
+        if (joint := run.coarser.joint) is not None:
+            image = add_prediction(image, joint.predict([view.name]))
+        elif cache is not None:
+            image = add_prediction(image, cache.get(view.name))
         whole = to_full_size(image, view.camera, level, self.context.pyramid)
         if exposure is not None:
             whole = transform_colors(whole, exposure.to(device))

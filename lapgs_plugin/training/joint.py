@@ -47,21 +47,21 @@ class JointFields:
     poses: ViewPoses | None = None
     _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
-    def predict(self, name: str) -> Tensor:
-        """(3, h, w) Up of what the fields make of a view, at the size of the level below them, with gradients."""
-        return self._upsampled([name])
+    def predict(self, names: Sequence[str]) -> Tensor:
+        """Return Up of what the fields make of views, at the size of the level below them, with gradients.
 
-    def predict_batch(self, names: Sequence[str]) -> Tensor:
-        """(b, 3, h, w) `predict` of two views or more of one size, each field's in one set of launches."""
-        return self._upsampled(names)
+        Args:
+            names: of the views; several have one size, and each field renders them in one set of launches.
 
-    def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return what adds `predict` of a view, or `predict_batch` of several, to an image of that shape."""
-        return partial(upsample_add, self.pyramid, self._composed(names))
-
-    def _upsampled(self, names: Sequence[str]) -> Tensor:
+        Returns:
+            (3, h, w) of one view, (b, 3, h, w) of several.
+        """
         camera = self._camera(names[0], min(self.models) - 1)
         return upsample(self.pyramid, self._composed(names), (camera.height, camera.width))
+
+    def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Return what adds `predict` of the views to an image of that shape."""
+        return partial(upsample_add, self.pyramid, self._composed(names))
 
     def _composed(self, names: Sequence[str]) -> Tensor:
         """Return what the fields make of a view or of several, at their own finest level."""

@@ -119,17 +119,7 @@ class MultiviewDensifier(Densifier):
             assert scores is not None, "needed in this iteration"
             self._remove(model, (_opacities(model) < LATE_OPACITY) | (scores.blame > LATE_BLAME))
             return True
-        if not self.needs_statistics(iteration):
-            return False
-        assert result is not None, "needed in this iteration"
-        self.accumulate(result, camera)
-        refined, reset = self._schedule.refines(iteration), iteration % self._schedule.reset_every == 0
-        if refined:
-            assert scores is not None, "needed in this iteration"
-            self._refine(model, iteration, scores)
-        if reset:
-            self._lower_opacities(model, self._strategy.prune_opa * 2.0)
-        return refined or reset
+        return super().after_step(model, iteration, result, camera, scores)
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of absolute gradients, too; see `DensityControl`."""
@@ -141,7 +131,11 @@ class MultiviewDensifier(Densifier):
         add_statistics(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
 
     @torch.no_grad()
-    def _refine(self, model: TrainableField, iteration: int, scores: ViewScores) -> None:
+    def _refine(
+        self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera, scores: ViewScores | None
+    ) -> None:
+        assert scores is not None, "needed in this iteration"
+        self.accumulate(result, camera)
         state, extent = self.state, self.state["scene_scale"]
         times = state["count"].clamp_min(1)
         wanted = scores.pixels > self._options.error_pixels

@@ -108,7 +108,7 @@ class StageSchedule:
             densify_every=given.every,
             reset_every=resets,
             sh_every=constant(settings.sh_every, 1000, 1),
-            sh_degree=settings.sh_degree_of(stage),
+            sh_degree=settings.sh_degree_of(stage.level),
             means_first=rates.means_first,
             means_last=rates.means_last,
             sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),

@@ -17,7 +17,7 @@ from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.training.losses import ViewLosses
 from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
 from lapgs_plugin.training.poses import ViewPoses, at_pose
-from lapgs_plugin.training.views import LevelView
+from lapgs_plugin.training.views import LevelView, shuffled
 
 
 @dataclass
@@ -52,8 +52,7 @@ class FieldScoring:
             threshold: as `view_scores` takes it.
         """
         images, ssim_weight = self.losses.images, self.losses.ssim_weight
-        place = (self.seed * 1_000_003 + self.losses.stage.level) * 1_000_003 + iteration
-        chosen = torch.randperm(len(self.views), generator=torch.Generator().manual_seed(place % 2**63))
+        chosen = shuffled(len(self.views), self.seed, self.losses.stage.level, iteration)
         plain, grey = _grey(field)
 
         def asked(view: LevelView) -> ScoredView:
@@ -66,7 +65,7 @@ class FieldScoring:
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view), whole, target, loss)
 
-        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS].tolist())
+        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS])
         return view_scores(views, grey, threshold)
 
     def least_visible(self, field: GaussianField, share: float) -> Tensor:

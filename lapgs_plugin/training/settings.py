@@ -323,7 +323,7 @@ class TrainSettings(HierarchySettings):
 
     def strategy_of(self, stage: Stage, pixels: int) -> Strategy:
         """Return the strategy of density control with the options of a stage and the pixels of its training images."""
-        part = StagePart(self.threshold_factor(stage), pixels, base=self._is_base(stage), finest=stage.level == 0)
+        part = StagePart(self.threshold_factor(stage), pixels, base=self._is_base(stage.level), finest=stage.level == 0)
         return self.densification.options.of_stage(part)
 
     def sh_rate_factor_of(self, stage: Stage, training_views: int) -> float:
@@ -342,17 +342,17 @@ class TrainSettings(HierarchySettings):
             **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF, "refine_poses": False},
         }
 
-    def sh_degree_of(self, stage: Stage) -> int:
-        """Return the highest SH degree of a stage's field."""
-        return self.base_sh_degree if self._is_base(stage) and self.base_sh_degree is not None else self.sh_degree
+    def sh_degree_of(self, level: int) -> int:
+        """Return the highest SH degree of a level's field."""
+        return self.base_sh_degree if self._is_base(level) and self.base_sh_degree is not None else self.sh_degree
 
     def densify_share_of(self, stage: Stage) -> float | None:
         """Return the share of its iterations in which a stage densifies; None if the schedule decides."""
-        return self.densification.base_share if self._is_base(stage) else None
+        return self.densification.base_share if self._is_base(stage.level) else None
 
-    def _is_base(self, stage: Stage) -> bool:
-        """Return whether a stage is the first of several."""
-        return self.levels > 1 and stage.level == self.levels - 1
+    def _is_base(self, level: int) -> bool:
+        """Return whether a level is the coarsest of several."""
+        return level == self.levels - 1 > 0
 
     @property
     def rates(self) -> LearningRates:

@@ -46,7 +46,7 @@ def first_model(context: RunContext, stage: Stage) -> TrainableField:
 
 def _field_of_points(context: RunContext, stage: Stage) -> GaussianField:
     scene, settings = context.scene, context.settings
-    points = field_from_points(scene.points, scene.colors, settings.sh_degree_of(stage))
+    points = field_from_points(scene.points, scene.colors, settings.sh_degree_of(stage.level))
     return settings.densification.options.start(points)
 
 

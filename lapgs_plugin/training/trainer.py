@@ -173,9 +173,9 @@ class Trainer:
         return state
 
     def _out_of_memory(self) -> DeviceMemoryError:
-        next_level = self.archive.manifest.next_level
+        level = self.archive.manifest.next_level or 0  # of a run that is extended, the finest
         return DeviceMemoryError(
-            f"the GPU has no memory left at level {next_level}; finished levels and the last checkpoint are kept: "
+            f"the GPU has no memory left at level {level}; finished levels and the last checkpoint are kept: "
             "continue with --resume on a larger one, or start again with --packed, --images-on memory, a smaller "
             "--resolution or a smaller --cap-max"
         )

@@ -37,12 +37,13 @@ def view_index(iteration: int, count: int, seed: int, level: int) -> int:
     A pure function of its arguments, so that a resumed run sees the same views as an uninterrupted one.
     """
     epoch, position = divmod(iteration - 1, count)
-    return _order(count, (seed * 1_000_003 + level) * 1_000_003 + epoch)[position]
+    return shuffled(count, seed, level, epoch)[position]
 
 
 @lru_cache(maxsize=4)
-def _order(count: int, seed: int) -> list[int]:
-    """Return the views of an epoch in order."""
-    generator = torch.Generator().manual_seed(seed % 2**63)  # the generator takes no larger seed
+def shuffled(count: int, seed: int, level: int, number: int) -> list[int]:
+    """Return `count` views of a level in the random order of that number."""
+    place = (seed * 1_000_003 + level) * 1_000_003 + number
+    generator = torch.Generator().manual_seed(place % 2**63)  # the generator takes no larger seed
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order

@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_images
-from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.rig import Rig
@@ -198,7 +198,4 @@ def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int)
         image = renderer.band(full, level, settings.gains.get(level, 1.0))
         if level < renderer.levels - 1:
             image = around_grey(image)
-    for finer in range(level - 1, top - 1, -1):
-        at_finer = level_camera(full, finer)
-        image = renderer.pyramid.up(image, (at_finer.height, at_finer.width))
-    return image.clamp(0.0, 1.0), level
+    return to_full_size(image, full, level, renderer.pyramid, top).clamp(0.0, 1.0), level

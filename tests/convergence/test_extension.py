@@ -11,9 +11,10 @@ from statistics import fmean
 from typing import Any
 
 import pytest
+import torch
 
 from lapgs_plugin.cli.train import _extended
-from lapgs_plugin.errors import TrainingStoppedError, UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hierarchy.plan import Stage
@@ -23,6 +24,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import trainer
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
@@ -177,3 +179,16 @@ def test_the_schedule_goes_on_as_it_ended() -> None:
     assert done == 5001
     assert set(steps[-100:-1]) == {calm.gather}
     assert all(4000 < each <= 5001 for each in longer.sampled(4))
+
+
+def test_a_full_gpu_names_the_finest_level(
+    finished: Path, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+    path = tmp_path / "run"
+    shutil.copytree(finished, path)
+    monkeypatch.setattr(trainer, "warm_up", full)
+    with pytest.raises(DeviceMemoryError, match="no memory left at level 0; finished levels"):
+        extend(path, scene)

@@ -69,6 +69,9 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         ('name = "one"', 'name = "one"\nmethod = "naked"', ("method", "'naked'")),
         ("levels = 1 }", 'levels = 1 }\n[[variants]]\nname = "one"', ("two variants are called 'one'",)),
         ('name = "x"', 'name = "x y"', ("name", "'x y'")),
+        ('name = "one"', r'name = "o\nne"', ("variants.0.name", r"'o\nne'")),
+        ('name = "one"', 'name = ""', ("variants.0.name", "at least 1 character")),
+        ('title = "X"', r'title = "X\ty"', ("title", r"'X\ty'")),
         ("[[variants]]", '[[scenes]]\nname = "a"\n[[variants]]', ("scene 'a' is listed twice",)),
         ('name = "one"', 'name = "one"\nmethod = "bare"', ("bare, which is one level; leave levels out",)),
         (

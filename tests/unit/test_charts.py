@@ -49,12 +49,11 @@ def test_ticks_are_round_few_and_enclose_the_data(low: float, span: float) -> No
 def test_points_lie_where_the_axes_say() -> None:
     chart = draw_lines("t", "x", [Series("run", [(0, 0), (5, 40), (10, 100)])], marks=[Mark(5, "half")])
     top = float(chart.y_ticks[-1].label)
-    points = [tuple(map(float, pair.split(","))) for pair in chart.lines[0].points.split()]
+    points = chart.lines[0].points
     height = HEIGHT - TOP - BOTTOM
     assert points[0] == (LEFT, HEIGHT - BOTTOM)
     assert points[1] == pytest.approx(((LEFT + WIDTH - RIGHT) / 2, HEIGHT - BOTTOM - height * 40 / top), abs=0.06)
     assert points[2] == pytest.approx((WIDTH - RIGHT, HEIGHT - BOTTOM - height * 100 / top), abs=0.06)
-    assert chart.lines[0].last == points[2]
     assert chart.marks[0].at == pytest.approx(points[1][0])
     assert {tick.label: tick.at for tick in chart.x_ticks}["10"] == WIDTH - RIGHT
 
@@ -70,14 +69,9 @@ def test_labels_of_close_marks_stand_below_each_other() -> None:
 @pytest.mark.parametrize("from_zero", [True, False])
 def test_flat_and_single_points_are_drawn(points: list[tuple[float, float]], from_zero: bool) -> None:
     chart = draw_lines("t", "x", [Series("run", points)], from_zero=from_zero)
-    for pair in chart.lines[0].points.split():
-        x, y = map(float, pair.split(","))
+    for x, y in chart.lines[0].points:
         assert LEFT <= x <= WIDTH - RIGHT
         assert TOP - 0.1 <= y <= HEIGHT - BOTTOM + 0.1
-
-
-def plotted(points: str) -> list[tuple[float, float]]:
-    return [(float(x), float(y)) for x, y in (pair.split(",") for pair in points.split())]
 
 
 def in_data(point: tuple[float, float], right: float, bottom: float, top: float, frame: Frame) -> tuple[float, float]:
@@ -96,7 +90,7 @@ def test_an_inset_holds_the_start_and_nothing_else() -> None:
     assert chart.inset is not None
     (line,) = chart.inset.lines
     ticks = [float(tick.label) for tick in chart.inset.y_ticks]
-    found = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in plotted(line.points)]
+    found = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in line.points]
     assert found == [pytest.approx(point, abs=0.1) for point in rising[:6]]
     assert chart.inset.inset is None
     assert draw_lines("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
@@ -116,8 +110,7 @@ def test_nothing_runs_behind_an_inset(curves: list[list[tuple[float, float]]]) -
     if chart.inset is None:
         return
     for line in chart.lines:
-        points = plotted(line.points)
-        for (x0, y0), (x1, y1) in pairwise(points):
+        for (x0, y0), (x1, y1) in pairwise(line.points):
             for share in (0.0, 0.25, 0.5, 0.75, 1.0):
                 x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
                 assert x < INSET_AT[0] - 0.1 or y < INSET_AT[1]  # y counts downwards

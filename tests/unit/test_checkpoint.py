@@ -10,6 +10,7 @@ import signal
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,13 @@ Saved = dict[str, Any]
 
 
 class StopInTheEnd(Monitor):
-    """Stop the run one iteration before its end, during joint training."""
+    """Stop the run one iteration before the end of a level, of the finest during joint training."""
+
+    def __init__(self, level: int = 0) -> None:
+        self._level = level
 
     def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == (0, stage.iterations - 1):
+        if (tick.level, tick.iteration) == (self._level, stage.iterations - 1):
             signal.raise_signal(signal.SIGINT)
 
 
@@ -261,6 +265,19 @@ def test_a_damaged_optimizer_state_is_one_line(
     finally:
         checkpoint.write_bytes(kept[0])
         path.write_bytes(kept[1])
+
+
+@pytest.mark.parametrize("level", [1, 0])
+def test_a_base_with_fewer_harmonics_is_resumed(level: int, scene: Scene, tmp_path: Path) -> None:
+    """In its own stage, and in that of the residual, which trains it jointly."""
+    settings = replace(SETTINGS, inherit="geometry", base_sh_degree=0)
+    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
+    with RunArchive.create(tmp_path / "run", manifest) as archive:
+        with pytest.raises(TrainingStoppedError):
+            Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopInTheEnd(level)).run()
+        Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
+        assert [archive.field(each).sh_degree for each in (1, 0)] == [0, 1]
 
 
 def test_the_checkpoint_itself_is_fine(stopped: Path, scene: Scene) -> None:

@@ -205,7 +205,8 @@ def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypa
 
 
 def test_files_that_are_no_photos_are_named(noise: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for name in ("a.dng", "b.mov"):
+    for name in ("a.dng", "b.mov", ".c.jpg", ".thumbnails/0.jpg"):
+        (noise / name).parent.mkdir(exist_ok=True)
         (noise / name).write_bytes(b"")
     assert list(find_photos(noise).files) == ["0.jpg", "1.jpg", "2.jpg"]
     assert "not photos, left out: a.dng, b.mov" in caplog.text

@@ -23,6 +23,8 @@ from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import Scene, load_scene
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
+from lapgs_plugin.scenes.colmap_binary import check_whole
+from lapgs_plugin.scenes.colmap_text import check_text
 
 POINTS = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 3))
 COLORS = np.random.default_rng(4).integers(0, 256, (40, 3))
@@ -302,6 +304,16 @@ def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: st
     with pytest.raises(SceneError, match=message + ".*`lapgs prepare") as caught:
         load(path)
     assert_one_line(caught)
+
+
+def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:
+    model, names = pycolmap.Reconstruction(), [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    for key, name in enumerate(names, start=1):
+        model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(key, name, 80.0, 96, 64))
+    model.write_binary(tmp_path)
+    check_whole(tmp_path)
+    model.write_text(tmp_path)
+    check_text(tmp_path)
 
 
 def test_distorted_camera_that_no_image_uses_does_not_matter(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def check_arguments(prediction: Tensor, target: Tensor, ssim_weight: float) -> None:
-    """Check what `photometric_loss` is given, on any device.
+    """Check the arguments of `photometric_loss`, on any device.
 
     Raises:
         UserInputError: the images differ in shape, the target requires a gradient, or the weight leaves [0, 1].

@@ -36,7 +36,7 @@ FAR_PLANE = 1e10
 
 
 class Intermediates(NamedTuple):
-    """Hold what the backward pass of a render needs; n Gaussians, c cameras."""
+    """Hold the results that the backward pass of a render needs; n Gaussians, c cameras."""
 
     given: ToBlend
     blended: Blended

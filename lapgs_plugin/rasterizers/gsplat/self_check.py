@@ -65,7 +65,7 @@ def direct_works(device: torch.device) -> float:
 
 @matches_reference("rendering the fields of a view together with gsplat's functions, which takes longer", 1e-4)
 def stacking_works(device: torch.device) -> float:
-    """Return the largest difference of what one field writes to a stack; values are about 1."""
+    """Return the largest difference of the numbers that one field writes to a stack; values are about 1."""
     from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
 
     means, rotations, scales, depths, sh = (

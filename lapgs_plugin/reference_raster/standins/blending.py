@@ -1,4 +1,4 @@
-"""Sum per Gaussian what the CUDA rasterizers of forks add up in their pixel loops, tile by tile in NumPy.
+"""Compute the sums per Gaussian of forks' CUDA rasterizers, tile by tile in NumPy.
 
 Slower than the Numba kernels, and only done where a fork's module returns such sums.
 """

@@ -1,4 +1,4 @@
-"""Choose the stand-in for a checkout's rasterizer from what the checkout imports and how it calls that."""
+"""Choose the stand-in for a checkout's rasterizer from the checkout's imports and calls."""
 
 from __future__ import annotations
 

@@ -33,6 +33,17 @@ _VIEW = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
     "sh_degree", "campos",
 )  # fmt: skip
+_FAMILY = (*_VIEW, "prefiltered", "debug")
+
+
+def _no_options(settings: Any) -> Options:
+    """Ask for nothing but an image."""
+    return Options()
+
+
+def _image_and_radii(settings: Any, output: Output) -> tuple[Tensor, ...]:
+    """Return the image (3, h, w) and the radii (n,) int32."""
+    return output.image, output.radii
 
 
 @dataclass(frozen=True)
@@ -42,21 +53,21 @@ class Variant:
     Attributes:
         description: of its module.
         settings: fields of its `GaussianRasterizationSettings`, in their order.
-        options: from the settings of a call to what it asks of the engine.
-        outputs: from these settings and the engine's output to what `forward` returns.
+        options: from the settings of a call to its options of the engine.
+        outputs: from these settings and the engine's output to the result of `forward`.
         module: name that checkouts import.
         binding: `GaussianRasterizer` without its `variant`; its `forward` has the arguments of the CUDA module's.
         sparse_adam: whether the module has `SparseGaussianAdam`.
         fused_ssim: whether its binding `_C` has SSIM.
-        functions: what its module has besides the rasterizer.
+        functions: other functions and classes of its module.
         beside: variants of other modules that the same checkouts import.
         needs_logs: whether these checkouts cannot do without TensorBoard.
     """
 
     description: str
-    settings: tuple[str, ...]
-    options: Callable[[Any], Options]
-    outputs: Callable[[Any, Output], tuple[Tensor, ...]]
+    settings: tuple[str, ...] = _FAMILY
+    options: Callable[[Any], Options] = _no_options
+    outputs: Callable[[Any, Output], tuple[Tensor, ...]] = _image_and_radii
     module: str = "diff_gaussian_rasterization"
     binding: type[Rasterizer] = WholeSh
     sparse_adam: bool = False
@@ -64,11 +75,6 @@ class Variant:
     functions: tuple[Any, ...] = ()
     beside: tuple[str, ...] = ()
     needs_logs: bool = False
-
-
-def _image_and_radii(settings: Any, output: Output) -> tuple[Tensor, ...]:
-    """Return the image (3, h, w) and the radii (n,) int32."""
-    return output.image, output.radii
 
 
 def _with_inverse_depths(settings: Any, output: Output) -> tuple[Tensor, ...]:
@@ -132,43 +138,35 @@ def _weight_rows(settings: Any) -> int:
 
 
 BACKBONES = {
-    "graphdeco": Variant(
-        "Stand in for graphdeco's rasterizer, branch main.",
-        (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(),
-        _image_and_radii,
-    ),
+    "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main."),
     "graphdeco-aa": Variant(
         "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
-        (*_VIEW, "prefiltered", "debug", "antialiasing"),
-        lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
-        _with_inverse_depths,
+        (*_FAMILY, "antialiasing"),
+        options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
+        outputs=_with_inverse_depths,
     ),
     # Two faults of the copies in circulation are left out: their backward pass counts a background that is not black
     # twice, and skips Gaussians at random after a reduction over the wrong number of threads.
     "graphdeco-accel": Variant(
         "Stand in for graphdeco's accelerated rasterizer: as branch dr_aa, with DC apart and sparse Adam.",
-        (*_VIEW, "prefiltered", "debug", "antialiasing"),
-        lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
-        _with_inverse_depths,
+        (*_FAMILY, "antialiasing"),
+        options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
+        outputs=_with_inverse_depths,
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
     ),
     "taming": Variant(
         "Stand in for the rasterizer of Taming-3DGS, branch main: with the sums that Gaussians are scored by.",
-        (*_VIEW, "prefiltered", "debug", "pixel_weights"),
+        (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
-        lambda settings: Options(pixel_weights=settings.pixel_weights if _weight_rows(settings) > 1 else None),
-        _with_sums,
+        options=lambda settings: Options(pixel_weights=settings.pixel_weights if _weight_rows(settings) > 1 else None),
+        outputs=_with_sums,
         binding=DcApart,
         sparse_adam=True,
     ),
     "taming-rasterizer": Variant(
         "Stand in for the rasterizer of Taming-3DGS, branch rasterizer: with DC apart and sparse Adam.",
-        (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(),
-        _image_and_radii,
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
@@ -176,10 +174,10 @@ BACKBONES = {
     "fastgs": Variant(
         "Stand in for the rasterizer of FastGS: with the compact box and the count of marked pixels.",
         (*_VIEW, "mult", "prefiltered", "debug", "get_flag", "metric_map"),
-        lambda settings: Options(
+        options=lambda settings: Options(
             mult=settings.mult, pixel_weights=(settings.metric_map == 1).float() if settings.get_flag else None
         ),
-        _with_marked_pixels,
+        outputs=_with_marked_pixels,
         module="diff_gaussian_rasterization_fastgs",
         binding=DcApart,
         sparse_adam=True,
@@ -189,26 +187,20 @@ BACKBONES = {
 
 FORKS = {
     "speedy-splat": Variant(
-        "Stand in for the rasterizer of Speedy-Splat: with the scores that it prunes by.",
-        (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(),
-        _image_and_radii,
-        binding=forks.SpeedySplat,
+        "Stand in for the rasterizer of Speedy-Splat: with the scores that it prunes by.", binding=forks.SpeedySplat
     ),
     "mini-splatting": Variant(
         "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
-        (*_VIEW, "prefiltered", "debug"),
-        partial(forks.summing, blending=True),
-        forks.with_shares,
+        options=partial(forks.summing, blending=True),
+        outputs=forks.with_shares,
         module="diff_gaussian_rasterization_ms",
         binding=forks.MiniSplatting,
         beside=("graphdeco",),
     ),
     "mini-splatting2": Variant(
         "Stand in for the rasterizer of Mini-Splatting2: as Mini-Splatting's, with culling.",
-        (*_VIEW, "prefiltered", "debug"),
-        partial(forks.summing, blending=True),
-        forks.with_shares,
+        options=partial(forks.summing, blending=True),
+        outputs=forks.with_shares,
         module="diff_gaussian_rasterization_ms",
         sparse_adam=True,
         fused_ssim=True,
@@ -217,53 +209,43 @@ FORKS = {
     ),
     "3dgs-mcmc": Variant(
         "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",
-        (*_VIEW, "prefiltered", "debug"),
-        forks.summing,
-        _with_blended,
+        options=forks.summing,
+        outputs=_with_blended,
         functions=(forks.compute_relocation,),
     ),
     "absgs": Variant(
         "Stand in for the rasterizer of AbsGS: with absolute gradients and the sum of shares.",
-        (*_VIEW, "prefiltered", "debug"),
-        forks.summing,
-        _with_total_share,
+        options=forks.summing,
+        outputs=_with_total_share,
         module="diff_gaussian_rasterization_abs",
     ),
     "mip-splatting": Variant(
         "Stand in for the rasterizer of Mip-Splatting: with antialiasing of 0.3 px^2.",
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
-        lambda settings: Options(antialiasing=True),
-        _image_and_radii,
+        options=lambda settings: Options(antialiasing=True),
         binding=forks.MipSplatting,
     ),
     "efficientgs": Variant(
         "Stand in for the rasterizer of EfficientGS: with the largest shares, and SH degrees of each Gaussian.",
-        (*_VIEW, "prefiltered", "debug", "use_train_speedup", "ignored_rate", "lambda_dssim", "use_hwc"),
-        lambda settings: Options(),
-        _image_and_radii,
+        (*_FAMILY, "use_train_speedup", "ignored_rate", "lambda_dssim", "use_hwc"),
         binding=forks.EfficientGS,
         needs_logs=True,
     ),
     "pixel-gs": Variant(
         "Stand in for the rasterizer of Pixel-GS: with the pixels of each Gaussian, and gradients scaled by depth.",
         (*_VIEW[:6], "depth_threshold", *_VIEW[6:], "prefiltered", "debug"),
-        forks.summing,
-        _with_pixels,
+        options=forks.summing,
+        outputs=_with_pixels,
         binding=forks.PixelGS,
     ),
     "2dgs": Variant(
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
-        (*_VIEW, "prefiltered", "debug"),
-        lambda settings: Options(),
-        _image_and_radii,
         module="diff_surfel_rasterization",
         binding=forks.Surfels,
     ),
     "faster-gs": Variant(
         "Stand in for the rasterizer of Faster-GS: a function of raw parameters, and its Adam.",
         (),
-        lambda settings: Options(),
-        _image_and_radii,
         module="FasterGSCudaBackend.torch_bindings",
         functions=(forks.diff_rasterize, forks.RasterizerSettings, forks.FusedAdam),
         beside=("graphdeco-aa",),

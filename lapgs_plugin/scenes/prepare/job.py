@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -95,8 +94,7 @@ class Job:
     def each_photo(self, title: str, work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
         """Apply `work` to all items in threads and record the time."""
         with self.timed(title):
-            threads = min(MAX_DECODERS, os.cpu_count() or 1)
-            return in_threads(title, "photos", work, items, threads=threads, progress=self.progress)
+            return in_threads(title, "photos", work, items, most=MAX_DECODERS, progress=self.progress)
 
 
 @contextmanager

@@ -59,7 +59,11 @@ def find_photos(source: Path) -> Photos:
         return Photos(source.parent, {}, source)
     if not source.is_dir():
         raise SceneError(f"{source}: no such folder of photos or video")
-    present = sorted(file for file in source.rglob("*") if file.is_file() and not file.name.startswith("."))
+    present = sorted(
+        file
+        for file in source.rglob("*")
+        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(source).parts)
+    )
     heic = [file for file in present if file.suffix.lower() in HEIC]
     if heic and find_spec("pillow_heif") is None:
         raise MissingExtraError(
@@ -123,9 +127,9 @@ def convert_heic(source: Path, target: Path) -> None:
             PHOTO_PIXELS.check(width * height, f"{source}: {width}x{height} pixels", "make it smaller", SceneError)
             exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
             photo.convert("RGB").save(target, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", exif=exif)
+    except SceneError:
+        raise
     except (OSError, SyntaxError, ValueError, RuntimeError) as error:
-        if isinstance(error, SceneError):
-            raise
         raise SceneError(f"{source}: the photo cannot be decoded ({error}); copy or convert it again") from error
 
 

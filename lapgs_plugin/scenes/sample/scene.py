@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -103,8 +102,7 @@ def _write_images(folder: Path, world: World, cameras: Sequence[Camera], progres
         image = torch.from_numpy(render(world, cameras[view]))  # (h, w, 3)
         write_image(folder / f"{view:04d}.png", image.permute(2, 0, 1))
 
-    threads = os.cpu_count() or 1
-    in_threads("Rendering images", "images", write, range(len(cameras)), threads=threads, progress=progress)
+    in_threads("Rendering images", "images", write, range(len(cameras)), progress=progress)
 
 
 def _write_model(folder: Path, cameras: Sequence[Camera], points: SparsePoints) -> None:
