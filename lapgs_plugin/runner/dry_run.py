@@ -332,4 +332,4 @@ def _silent_writer(train: Any) -> Any:
     """Replace TensorBoard's writer in a script, whose thread would outlive the folder."""
     if "SummaryWriter" not in vars(train):
         return nullcontext()
-    return Attachment([Replacement(train, "SummaryWriter", lambda _: NoLog, None, "training()")])
+    return Attachment([Replacement(train, "SummaryWriter", lambda _: NoLog, "training()")])
