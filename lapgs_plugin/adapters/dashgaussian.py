@@ -52,15 +52,15 @@ class Adapter(generic.Adapter):
                 scheduler,
                 "get_res_scale",
                 lambda original: _full_size_after_the_base(original, window_of),
-                ("self", "iteration"),
                 "training() when it densifies",
+                ("self", "iteration"),
             ),
             Replacement(
                 scheduler,
                 "__init__",
                 lambda original: _budget_of_inherited(original, window_of),
-                ("self", "opt", "pipe", "gaussians"),
                 "training() at its start",
+                ("self", "opt", "pipe", "gaussians"),
             ),
         ]
 

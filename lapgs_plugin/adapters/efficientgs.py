@@ -50,7 +50,7 @@ class Adapter(generic.Adapter):
 
     def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
         return [
-            Replacement(self.train, "prepare_output_and_logger", _in_any_folder, ("args",), "training() at its start")
+            Replacement(self.train, "prepare_output_and_logger", _in_any_folder, "training() at its start", ("args",))
         ]
 
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:

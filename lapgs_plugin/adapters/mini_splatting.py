@@ -59,21 +59,21 @@ class Adapter(generic.Adapter):
         model = self.profile.model
         return [
             Replacement(
-                model, "reinitial_pts", lambda original: _unless(original, signed), ("self", "pts", "rgb"), "training()"
+                model, "reinitial_pts", lambda original: _unless(original, signed), "training()", ("self", "pts", "rgb")
             ),
             Replacement(
                 model,
                 "create_from_pcd",
                 lambda original: self._with_sh(original, signed),
-                ("self", "pcd"),
                 "Scene, and fields that inherit",
+                ("self", "pcd"),
             ),
             Replacement(
                 model,
                 "update_learning_rate",
                 lambda original: _unlocking_sh(original, signed),
-                ("self", "iteration"),
                 "training() at the start of every iteration",
+                ("self", "iteration"),
             ),
         ]
 

@@ -34,10 +34,10 @@ class Adapter(generic.Adapter):
                 self.train,
                 "score_func",
                 lambda original: self._scores_alone,
-                ("view", "gaussians", "pipeline", "background", "scores"),
                 "prune()",
+                ("view", "gaussians", "pipeline", "background", "scores"),
             ),
-            Replacement(torch.cuda.Event, "elapsed_time", _when_complete, None, "prune()"),
+            Replacement(torch.cuda.Event, "elapsed_time", _when_complete, "prune()"),
         ]
 
     def _scores_alone(self, view: Any, gaussians: Any, pipeline: Any, background: Any, scores: Any) -> None:

@@ -64,17 +64,13 @@ class Adapter(generic.Adapter):
         model = self.profile.model
         return [
             Replacement(
-                sys.modules["utils.taming_utils"],
-                "get_loss_map",
-                _with_edges_of_the_level,
-                None,
-                "compute_gaussian_score()",
+                sys.modules["utils.taming_utils"], "get_loss_map", _with_edges_of_the_level, "compute_gaussian_score()"
             ),
             Replacement(
-                model, "densify_with_score", _unless_none_qualifies, ("self", "scores"), "training() when it densifies"
+                model, "densify_with_score", _unless_none_qualifies, "training() when it densifies", ("self", "scores")
             ),
             *(
-                Replacement(model, name, _unless_nothing, ("self", "grads", "budget", "filter"), consumer)
+                Replacement(model, name, _unless_nothing, consumer, ("self", "grads", "budget", "filter"))
                 for name in ("densify_and_clone_taming", "densify_and_split_taming")
             ),
         ]

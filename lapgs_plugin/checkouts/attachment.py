@@ -22,15 +22,15 @@ class Replacement:
         owner: module or class that holds it.
         name: name of the attribute.
         make: returns the replacement, given the original.
-        parameters: names of the original's first parameters; None checks only that it exists.
         consumed_by: code that uses it, for the log.
+        parameters: names of the original's first parameters; empty checks only that it exists.
     """
 
     owner: Any
     name: str
     make: Callable[[Any], Any]
-    parameters: tuple[str, ...] | None
     consumed_by: str
+    parameters: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -43,7 +43,7 @@ class Replacement:
 def of_class(kind: type, name: str, make: Callable[[Any], Any], consumer: str) -> list[Replacement]:
     """Return the replacement of a method where a class or its nearest base defines it, if there is one."""
     owner = next((each for each in kind.__mro__ if name in vars(each)), None)
-    return [] if owner is None else [Replacement(owner, name, make, None, consumer)]
+    return [] if owner is None else [Replacement(owner, name, make, consumer)]
 
 
 class Attachment:
@@ -95,7 +95,7 @@ def _verify(replacement: Replacement) -> None:
             f"{replacement.label} is missing, expected the symbol that {replacement.consumed_by} uses; {changed}: "
             "choose another with --backbone, or train with `lapgs run --off`"
         )
-    if replacement.parameters is None:
+    if not replacement.parameters:
         return
     original = vars(replacement.owner)[replacement.name]
     try:

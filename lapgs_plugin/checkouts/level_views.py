@@ -7,7 +7,7 @@ import inspect
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any, SupportsIndex, cast
 
@@ -180,7 +180,7 @@ def make_level_view(camera: Any, size: tuple[int, int], image: Callable[[], Tens
         image: returns the image (3, height, width).
     """
     view = copy.copy(camera)
-    view.__class__ = _level_class(type(camera))
+    view.__class__ = _level_class(type(camera))  # type: ignore[arg-type]  # classes are hashable
     full = int(camera.image_width), int(camera.image_height)
     for name, value in list(vars(camera).items()):
         at_level = _at_level(name, value, full, size)
@@ -258,16 +258,11 @@ class PrefetchingViews(list[Any]):
 _PEEK = random.Random()
 """Generator that takes on the state of Python's own to compute its next number."""
 
-_LEVEL_CLASSES: dict[type, type] = {}
 
-
+@cache
 def _level_class(kind: type) -> type:
-    if kind not in _LEVEL_CLASSES:
-        image = property(
-            lambda view: view.lapgs_image(), _keep_image, doc="(3, h, w) the level's ground truth, float32."
-        )
-        _LEVEL_CLASSES[kind] = type(f"Level{kind.__name__}", (kind,), {"original_image": image})
-    return _LEVEL_CLASSES[kind]
+    image = property(lambda view: view.lapgs_image(), _keep_image, doc="(3, h, w) the level's ground truth, float32.")
+    return type(f"Level{kind.__name__}", (kind,), {"original_image": image})
 
 
 def _keep_image(view: Any, image: Tensor) -> None:

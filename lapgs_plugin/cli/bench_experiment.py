@@ -275,7 +275,7 @@ def _write_rows(
     try:
         exports.write_parquet(folder / exports.PARQUET, rows)
     except MissingExtraError as error:
-        make_console(stderr=True).print(f"[yellow]{escape(str(error))}[/yellow]", highlight=False)
+        make_console(stderr=True).print(f"[yellow]{escape(str(error))}[/yellow]")
 
 
 def _name_versions(records: Mapping[str, dict[str, Any]]) -> None:

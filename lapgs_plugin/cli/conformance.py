@@ -137,9 +137,9 @@ def _print(subject: Subject, outcomes: Sequence[Outcome]) -> None:
     for outcome in failed:
         kind = "signed" if outcome.signed else "clamped"
         for problem in outcome.problems:
-            console.print(f"  [red]{outcome.case}, {kind}:[/red] {escape(problem)}", highlight=False, soft_wrap=True)
+            console.print(f"  [red]{outcome.case}, {kind}:[/red] {escape(problem)}", soft_wrap=True)
     for case, reason in subject.semantics.departures.items():
-        console.print(f"  not compared, by design: {case}: {reason}", highlight=False, soft_wrap=True)
+        console.print(f"  not compared, by design: {case}: {reason}", soft_wrap=True)
     if subject.semantics.note:
-        console.print(f"  by design: {subject.semantics.note}", highlight=False, soft_wrap=True)
-    console.print(f"  {len(outcomes) - len(failed)} of {len(outcomes)} passed\n", highlight=False)
+        console.print(f"  by design: {subject.semantics.note}", soft_wrap=True)
+    console.print(f"  {len(outcomes) - len(failed)} of {len(outcomes)} passed\n")

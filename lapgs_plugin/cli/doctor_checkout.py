@@ -28,6 +28,8 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             and none of them is `train.py` in its root.
     """
     source, others = _source(path)
+    more = [f"{', '.join(others)}; describe one with `lapgs doctor {path / others[0]}`"] if others else []
+    unused = f"none of the {len(source.modules)} modules that the script imports uses one"
     adapter = adapter_class(source.root)
     parameters = ", ".join(argument.arg for argument in source.training.args.args)
     return {
@@ -35,10 +37,10 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             Finding("Root", "ok", str(source.root)),
             Finding("Adapter", "ok", f"{adapter.info.title} (--backbone {adapter.info.name})"),
             Finding("Training", "ok", f"{source.place(source.training)}: {source.training.name}({parameters})"),
-            *_others(path, others),
+            *(Finding("Other scripts", "ok", text) for text in more),
             Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
         ],
-        "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [_no_rasterizer(source)],
+        "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
         "lapgs run": [*_kinds(source), _stand_in(source)],
@@ -69,24 +71,12 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     return found[names[0]], names[1:]
 
 
-def _others(path: Path, scripts: list[str]) -> list[Finding]:
-    if not scripts:
-        return []
-    return [
-        Finding("Other scripts", "ok", f"{', '.join(scripts)}; describe one with `lapgs doctor {path / scripts[0]}`")
-    ]
-
-
 def _rasterizer(use: RasterizerUse) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
     if is_installed(use.module):
         return Finding(use.module, "ok", detail)
     return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
-
-
-def _no_rasterizer(source: CheckoutSource) -> Finding:
-    return Finding("none", "problem", f"none of the {len(source.modules)} modules that the script imports uses one")
 
 
 def _packages(source: CheckoutSource) -> list[Finding]:

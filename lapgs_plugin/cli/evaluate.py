@@ -120,7 +120,6 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
         f"[bold]Flicker[/bold] along {trajectory}: {figures['frames']} frames of {width}x{height}, each against the "
         f"one before, where both show the same surface ({100 * figures['compared']:.0f} % of the pixels)",
         table,
-        highlight=False,
     )
     print(f"{archive.path(STABILITY)} holds these figures")
 
@@ -148,7 +147,7 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
         figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
-    console.print(f"[bold]Views, worst first[/bold]{more}", table, highlight=False)
+    console.print(f"[bold]Views, worst first[/bold]{more}", table)
 
 
 def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
@@ -163,7 +162,6 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
     console.print(
         "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels",
         table,
-        highlight=False,
     )
 
 
@@ -174,7 +172,7 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
     for part, seconds in metrics["breakdown_seconds"].items():
         each = [f"{1e3 * f['breakdown_seconds'][part] / f['iterations']:.2f} ms" for _, f in levels]
         table.add_row(part, *each, f"{seconds:.1f} s, {seconds / total:.1%}")
-    console.print("[bold]Where the time of iterations went[/bold], an iteration of each level", table, highlight=False)
+    console.print("[bold]Where the time of iterations went[/bold], an iteration of each level", table)
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
@@ -189,24 +187,21 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
         f"{metrics['num_views']} {kind} views{where}; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
-        highlight=False,
     )
     console.print(
         f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR of the right half of each view after a colour fit on its "
         "left half; compare this one where photos differ in exposure or white balance"
         + (", as they do here" if metrics["exposure_compensated"] else ""),
-        highlight=False,
     )
     if metrics["exposure_predicted"]:
         console.print(
             "all other figures give each view the exposure of its neighbours by name among the training photos",
-            highlight=False,
         )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]
-        console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images", highlight=False)
+        console.print(f"GPU memory at most {peak / 1e9:.2f} GB, {bare / 1e9:.2f} GB without images")
     if (busy := metrics["gpu_busy_seconds"]) is not None:
-        console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization", highlight=False)
-    console.print(f"beside the optimization: {overhead or 'nothing'}", highlight=False)
+        console.print(f"the GPU executed kernels for {busy:.1f} s of the optimization")
+    console.print(f"beside the optimization: {overhead or 'nothing'}")
     for line in missing_lines(metrics["lpips_missing"]):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, markup=False, soft_wrap=True)

@@ -22,7 +22,7 @@ def make_console(*, stderr: bool = False) -> Console:
     """
     from rich.console import Console
 
-    made = Console(stderr=stderr)
+    made = Console(stderr=stderr, highlight=False)
     if not made.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
         made.width = UNLIMITED
     return made

@@ -99,6 +99,6 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     console = make_console()
     console.print(table)
     for line in missing_lines({name: why for each in runs for name, why in each.metrics["lpips_missing"].items()}):
-        console.print(f"{line}; then repeat lapgs eval", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"{line}; then repeat lapgs eval", markup=False, soft_wrap=True)
     if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
-        console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}", highlight=False)
+        console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}")

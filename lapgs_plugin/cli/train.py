@@ -303,7 +303,7 @@ def _run(
     _say_masked(console, scene, manifest.scene.masks)
     placed = training_rasterizer(manifest.rasterizer, settings)
     if placed.device.type == "cpu" and (hint := long_on_a_cpu(scene.smallest_size, settings.iterations)):
-        console.print(hint, highlight=False, soft_wrap=True)
+        console.print(hint, soft_wrap=True)
     with one_pool(), ExitStack() as opened:
         monitor: Monitor = opened.enter_context(ProgressMonitor(console, manifest.levels))
         if control.log is not None:
@@ -336,7 +336,6 @@ def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:
     if any(mask is not None for mask in masks):
         console.print(
             f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured",
-            highlight=False,
             markup=False,
         )
 

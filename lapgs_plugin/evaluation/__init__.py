@@ -1,1 +1,1 @@
-"""Metrics of runs, conformance of rasterizers, and the raster benchmark."""
+"""Measure runs and their flicker, check rasterizers, and time them."""

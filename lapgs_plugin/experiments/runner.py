@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from lapgs_plugin.experiments.schema import Experiment
 from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
+
+logger = logging.getLogger(__name__)
 
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
 MISSING = Path("SCENE")
@@ -188,10 +191,13 @@ def execute(
                     time.sleep(POLL_SECONDS)
                     look()
                 look()
-                if len(known) == before and (failures := launcher.failures()):
+                failures = launcher.failures()
+                if failures and len(known) == before:
                     raise UserInputError(
                         f"workers end without finishing a run: {failures[0]}; the runs wait in the store"
                     )
+                for failure in failures:
+                    logger.warning("a worker failed, the others continue: %s", failure)
             finally:
                 launcher.stop()
         time.sleep(POLL_SECONDS)

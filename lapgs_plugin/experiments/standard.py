@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ class Preset:
     source: str
     common: tuple[str, ...]
     scenes: Mapping[str, tuple[str, ...]]
-    options: Mapping[str, Any]
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def arguments(self, scene: str) -> list[str]:
         """Return the script's arguments for a scene; unknown scenes have the common ones."""
@@ -124,32 +124,15 @@ def _figures(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split("/"))
 
 
-def _read(name: str) -> dict[str, Any]:
-    values: dict[str, Any] = read_toml(DATA / name, advice="install lapgs_plugin again")
-    return values
+def _read(name: str, kind: Any) -> Any:
+    return read_toml(DATA / name, kind, advice="install lapgs_plugin again")
 
 
-def _datasets() -> dict[str, Dataset]:
-    return {
-        name: Dataset(values["title"], {scene: about["downscaled"] for scene, about in values["scenes"].items()})
-        for name, values in _read("datasets.toml").items()
-    }
-
-
-def _presets() -> dict[str, Preset]:
-    return {
-        f"{backbone}.{name}": Preset(
-            preset["source"],
-            tuple(preset["common"]),
-            {s: tuple(words) for s, words in preset["scenes"].items()},
-            preset.get("options", {}),
-        )
-        for backbone, presets in _read("presets.toml").items()
-        for name, preset in presets.items()
-    }
-
-
-DATASETS = _datasets()
+DATASETS: Mapping[str, Dataset] = _read("datasets.toml", dict[str, Dataset])
 """Data sets by their names in experiments."""
-PRESETS = _presets()
+PRESETS: Mapping[str, Preset] = {
+    f"{backbone}.{name}": preset
+    for backbone, presets in _read("presets.toml", dict[str, dict[str, Preset]]).items()
+    for name, preset in presets.items()
+}
 """Presets by backbone and name, such as "backbone.big"."""

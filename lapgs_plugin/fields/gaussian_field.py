@@ -110,7 +110,7 @@ class GaussianField:
 
         Args:
             path: of the file.
-            comments: lines of the header; non-ASCII characters are written as question marks.
+            comments: lines of the header; non-ASCII characters are written as question marks, line breaks as spaces.
 
         Raises:
             OSError: the folder cannot be written, or the disk is full.
@@ -130,7 +130,7 @@ class GaussianField:
             for column, name in zip(columns.T, names[attribute], strict=True):
                 rows[name] = column
         lines = [SIGNED_COMMENT] if self.signed else []
-        lines += [comment.encode("ascii", errors="replace").decode() for comment in comments]
+        lines += [" ".join(comment.encode("ascii", errors="replace").decode().splitlines()) for comment in comments]
         ply = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=lines)
         with atomic_write(Path(path)) as stream:
             ply.write(stream)

@@ -24,8 +24,9 @@ def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> T
         level: 0 is full resolution.
 
     Returns:
-        (..., 3, 3) with the type and device of `intrinsics`.
+        (..., 3, 3) with the type and device of `intrinsics`; float32 of integers.
     """
+    intrinsics = intrinsics if intrinsics.is_floating_point() else intrinsics.float()
     width, height = level_size(size, level)
     factors = intrinsics.new_tensor([width / size[0], height / size[1], 1.0])
     return intrinsics * factors[:, None]

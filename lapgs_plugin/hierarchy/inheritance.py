@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
-from lapgs_plugin.hierarchy.settings import parse_inheritance
+from lapgs_plugin.hierarchy.settings import INHERIT_MODES, parse_inheritance
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
@@ -83,7 +83,9 @@ def inherit(
         UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians, or "full" with another
             `sh_degree`.
     """
-    parse_inheritance(mode if ratio == 1.0 else f"{mode}:{ratio}")  # raises for an unknown mode or ratio
+    if mode not in INHERIT_MODES:
+        raise UserInputError(f"--inherit {mode!r}: expected {', '.join(INHERIT_MODES)}; the ratio is another argument")
+    parse_inheritance(f"{mode}:{ratio}")  # raises for a ratio outside (0, 1]
     if len(field) == 0:
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _sample_rows(len(field), ratio, generator).to(field.means.device)

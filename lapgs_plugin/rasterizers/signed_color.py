@@ -101,6 +101,7 @@ def precomputed_colors(field: GaussianField, camera: Camera, degree: int) -> Ten
     return sh_to_color(field.sh, directions, degree, signed=field.signed)
 
 
+@torch.inference_mode(False)  # whatever mode the caller is in: it takes gradients
 def has_signed_color(extension: CudaExtension) -> bool:
     """Test whether the installed extension renders and differentiates signed colour."""
     field, camera, degree = _probe_scene(extension.device)

@@ -37,7 +37,7 @@ class HookCaller:
 
     def __init__(self, hooks: Sequence[StageHook] = ()) -> None:
         found = (*entry_point_hooks(), *hooks)
-        self._hooks = HookDispatcher(found) if found else None
+        self._hooks, self._any = HookDispatcher(found), bool(found)
         self._stage: Stage | None = None
         self._rendering: StageRendering | None = None
         self._iteration = 0
@@ -45,18 +45,16 @@ class HookCaller:
         self._paused = False
 
     def __bool__(self) -> bool:
-        return self._hooks is not None
+        return self._any
 
     def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
         """Call `on_stage_start`."""
-        self._stage, self._rendering = stage, rendering
-        if self._hooks is not None:
-            self._hooks.on_stage_start(stage)
+        self._stage, self._rendering, self._context = stage, rendering, None
+        self._hooks.on_stage_start(stage)
 
     def stage_ends(self, stage: Stage) -> None:
         """Call `on_stage_end`."""
-        if self._hooks is not None:
-            self._hooks.on_stage_end(stage)
+        self._hooks.on_stage_end(stage)
 
     def iteration_begins(self, iteration: int) -> None:
         """Note the number of the iteration."""
@@ -87,7 +85,6 @@ class HookCaller:
             image: (3, h, w) image for the loop without hooks.
             below: (3, h, w) upsampled prediction in the image; None if the image is not composed.
         """
-        assert self._hooks is not None
         if self._paused:
             return image
         context = self._context = self._make_context(key, below)
@@ -120,11 +117,10 @@ class HookCaller:
 
     def densified(self) -> None:
         """Call `on_densify`."""
-        if self._hooks is not None and self._context is not None:
+        if self._context is not None:
             self._hooks.on_densify(self._context)
 
     def _after_backward(self) -> None:
-        assert self._hooks is not None
         assert self._context is not None
         self._hooks.after_backward(self._context)
 

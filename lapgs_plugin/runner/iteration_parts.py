@@ -59,8 +59,8 @@ class IterationParts:
         control = [(profile.model, name) for name in profile.density_control]
         consumer = "training() when it densifies and prunes"
         return [
-            Replacement(torch.Tensor, "backward", self._backward, ("self",), "training() after its loss"),
-            *(Replacement(owner, name, self._densifying, None, consumer) for owner, name in (*scores, *control)),
+            Replacement(torch.Tensor, "backward", self._backward, "training() after its loss", ("self",)),
+            *(Replacement(owner, name, self._densifying, consumer) for owner, name in (*scores, *control)),
         ]
 
     @contextmanager

@@ -82,8 +82,8 @@ class BareRunRecorder:
                 "would be counted; leave it out"
             )
         return [
-            Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
-            *(Replacement(profile.script.module, name, self._make_scene, None, "training()") for name in scenes),
+            Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
+            *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
             *of_class(profile.model, "update_learning_rate", self._make_update_learning_rate, "every iteration"),
             *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
@@ -193,7 +193,7 @@ class BareRunRecorder:
         wrapper = RasterizerWrapper()
         wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
         found = wrapper.entries(self._adapter.profile)
-        with Attachment([Replacement(owner, name, make, None, "render()") for owner, name, make in found]):
+        with Attachment([Replacement(owner, name, make, "render()") for owner, name, make in found]):
             return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
 
     def _rendered(

@@ -49,9 +49,7 @@ class StageReplacements:
         return [
             *self._in_training(profile),
             *(
-                Replacement(
-                    camera, "__init__", self._context.images.adopting, None, "the scene's loader, for every image"
-                )
+                Replacement(camera, "__init__", self._context.images.adopting, "the scene's loader, for every image")
                 for camera in profile.cameras
             ),
             *self._in_rendering(profile),
@@ -69,8 +67,8 @@ class StageReplacements:
     def _in_training(self, profile: Profile) -> list[Replacement]:
         scenes = profile.script_names(profile.scene)
         return [
-            Replacement(profile.script.module, profile.training.__name__, self._make_training, None, "the main block"),
-            *(Replacement(profile.script.module, name, self._make_scene, None, "training()") for name in scenes),
+            Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
+            *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
             *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
 
@@ -82,7 +80,7 @@ class StageReplacements:
             for name in rasterizer.settings:
                 found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]
         found += wrapper.entries(profile)
-        return [Replacement(owner, name, make, None, consumer) for owner, name, make in found]
+        return [Replacement(owner, name, make, consumer) for owner, name, make in found]
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
         start = "training() at the start of every iteration"
@@ -110,7 +108,7 @@ class StageReplacements:
         hooks, names = self._context.hooks, self._context.adapter.info.density_scores
         consumer = "training() when it densifies and prunes"
         found = profile.named(names) if hooks else []
-        return [Replacement(owner, name, hooks.pausing, None, consumer) for owner, name in found]
+        return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in found]
 
     def _make_training(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)

@@ -231,30 +231,16 @@ class ImageStore:
         """One of `PLACES`."""
         return self._where
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the images in the order in which they were first stored."""
-        return tuple(self._images)
-
     def __len__(self) -> int:
         return len(self._images)
 
-    def __contains__(self, name: object) -> bool:
-        return name in self._images
-
     @property
     def bytes_on_device(self) -> int:
-        """Bytes on the GPU: images stored there and prefetched ones."""
-        return self._bytes_kept("gpu") + (0 if self._stream is None else self._bytes_prefetched())
-
-    @property
-    def bytes_in_memory(self) -> int:
-        """Bytes in the computer's memory: images stored there, and for a CPU prefetched ones."""
-        return self._bytes_kept("memory") + (self._bytes_prefetched() if self._stream is None else 0)
-
-    @property
-    def bytes_on_disk(self) -> int:
-        return self._bytes_kept("disk")
+        """Bytes on the GPU: images stored there, or prefetched ones."""
+        if self._stream is None:
+            return 0
+        there = self._images if self._where == "gpu" else self._coming
+        return sum(self._num_bytes(self._images[name]) for name in there)
 
     def close(self) -> None:
         """Drop all images and remove the files."""
@@ -292,12 +278,6 @@ class ImageStore:
     def _at_hand(self, image: _Image) -> bool:
         """Return whether the stored bytes are on the device already."""
         return image.stored is not None and (self._where == "gpu" or self._stream is None)
-
-    def _bytes_kept(self, where: str) -> int:
-        return sum(self._num_bytes(image) for image in self._images.values()) if where == self._where else 0
-
-    def _bytes_prefetched(self) -> int:
-        return sum(self._num_bytes(self._images[name]) for name in self._coming)
 
     def _num_bytes(self, image: _Image) -> int:
         return math.prod(image.shape) * self._dtype.itemsize

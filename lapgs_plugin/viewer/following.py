@@ -63,7 +63,7 @@ class FollowedRun:
     """
 
     def __init__(self, folder: Path, device: str, rasterizer: str) -> None:
-        self._folder = folder
+        self._folder = folder.absolute()  # whose name is shown
         self._device, self._rasterizer = device, rasterizer
         self._fields: dict[int, tuple[Stamp, GaussianField]] = {}
         self._placed: PlacedRasterizer | None = None

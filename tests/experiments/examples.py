@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,12 @@ def copying_jobs(folder: Path, count: int, seconds: float = 0.0, code: str = COP
     return [
         _job(folder, run_spec(number), (*_python(code), *_paths(folder, number, seconds))) for number in range(count)
     ]
+
+
+def starts(folder: Path) -> Counter[str]:
+    """Count the starts of each run, whichever attempt."""
+    path = folder / "started"
+    return Counter(name.partition("-attempt")[0] for name in path.read_text().split()) if path.exists() else Counter()
 
 
 def _job(folder: Path, spec: RunSpec, command: Sequence[str]) -> Job:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments import launchers
+from lapgs_plugin.experiments import launchers, worker
 from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
 from lapgs_plugin.experiments.runner import execute
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
 from lapgs_plugin.experiments.worker import Slot, gpu_name
-from tests.experiments.examples import COPY, START, copying_jobs
+from tests.experiments.examples import COPY, START, copying_jobs, starts
 
 NOTE_ENVIRONMENT = START + (
     "import os; stream = open(started + '-gpus', 'a'); "
@@ -42,10 +42,6 @@ def run_all(order: WorkOrder, start: Callable[[], Launcher]) -> list[Outcome]:
     outcomes = execute(ResultStore(order.store), order.run_ids, start, said.append)
     assert sorted(each.run_id for each in said) == sorted(order.run_ids), "each is told of once"
     return outcomes
-
-
-def starts(tmp_path: Path) -> Counter[str]:
-    return Counter(name.partition("-attempt")[0] for name in (tmp_path / "started").read_text().split())
 
 
 def test_local_workers_get_a_gpu_each(tmp_path: Path) -> None:
@@ -86,6 +82,20 @@ def test_workers_that_do_nothing_are_an_error(tmp_path: Path, monkeypatch: pytes
     work_order = order(tmp_path, 1, 1)
     with pytest.raises(UserInputError, match=r"workers end without finishing a run: .*no space left"):
         run_all(work_order, lambda: launch(work_order))
+
+
+def test_a_worker_that_fails_beside_others_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def work(store: Path, run_ids: Sequence[str], slot: Slot, stop: threading.Event) -> int:
+        if slot.gpu == "5":
+            raise OSError("no space left")
+        return worker.work(store, run_ids, slot, stop)
+
+    monkeypatch.setattr(launchers, "work", work)
+    work_order = order(tmp_path, 2, 2, gpus="3,5")
+    assert [outcome.state for outcome in run_all(work_order, lambda: launch(work_order))] == [DONE] * 2
+    assert caplog.messages == ["a worker failed, the others continue: worker on 5: OSError: no space left"]
 
 
 def test_jobs_through_submitit(tmp_path: Path) -> None:

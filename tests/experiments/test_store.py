@@ -19,7 +19,7 @@ from lapgs_plugin.experiments import store as store_module
 from lapgs_plugin.experiments.commands import defaults_of
 from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDING, RUNNING, ResultStore
 from lapgs_plugin.experiments.worker import work
-from tests.experiments.examples import COPY, START, copying_jobs
+from tests.experiments.examples import COPY, START, copying_jobs, starts
 from tests.waiting import wait_for
 
 WORKER = "import sys; from pathlib import Path; from lapgs_plugin.experiments.worker import work; "
@@ -28,17 +28,6 @@ WORKER += "print(work(Path(sys.argv[1]), sys.argv[2:]))"
 
 def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", WORKER, str(store), *run_ids], stdout=subprocess.DEVNULL)
-
-
-def starts(folder: Path) -> Counter[str]:
-    """Count the starts of each run."""
-    path = folder / "started"
-    return Counter(without_attempt(name) for name in path.read_text().split()) if path.exists() else Counter()
-
-
-def without_attempt(name: str) -> str:
-    """Return a run's id from the folder name of an attempt."""
-    return name.partition("-attempt")[0]
 
 
 @pytest.fixture

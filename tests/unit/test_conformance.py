@@ -114,6 +114,14 @@ MUTANTS: dict[str, tuple[Mutant, bool, str]] = {
     "no screen gradient": (
         Mutant(after=lambda r: replace(r, means2d=r.means2d.detach())), False, "gradient of means2d is missing",
     ),
+    "absolute screen gradient not finite": (
+        Mutant(after=lambda r: replace(r, absgrad2d=torch.full_like(r.means2d, torch.nan))), False,
+        "gradient of absgrad2d has 120 values that are not finite",
+    ),
+    "absolute screen gradient without x and y": (
+        Mutant(after=lambda r: replace(r, absgrad2d=r.means2d.detach()[:, 0])), False,
+        "gradient of absgrad2d has shape (60,), expected (60, 2)",
+    ),
     "a tile without gradient": (Mutant(after=image_of(first_tile_without_gradient)), False, "gradient of sh is off"),
     "background counted twice": (
         Mutant(after=lambda r: replace(r, image=r.image + 0.5 * (r.transmittance - r.transmittance.detach()))),

@@ -296,3 +296,10 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, mon
 def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...], message: str) -> None:
     with pytest.raises(FieldError, match=message):
         random_field(5, 1).with_parameters({name: torch.zeros(shape)})
+
+
+def test_a_comment_of_several_lines_is_one(tmp_path: Path) -> None:
+    field = GaussianField(*(torch.zeros(2, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    field.save_ply(tmp_path / "f.ply", ["of the run a\nlapgs_signed 1", "caf\u00e9"])
+    assert PlyData.read(str(tmp_path / "f.ply")).comments == ["of the run a lapgs_signed 1", "caf?"]
+    assert not GaussianField.load_ply(tmp_path / "f.ply").signed

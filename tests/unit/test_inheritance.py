@@ -171,8 +171,9 @@ def test_ratios_outside_the_unit_interval_are_refused(ratio: float) -> None:
 
 
 def test_what_cannot_be_inherited() -> None:
-    with pytest.raises(UserInputError, match="--inherit 'everything': expected geometry, xyz, full"):
-        inherit(base_field(), "everything")
+    for mode in ("everything", "0.5", "geometry:0.5", ""):  # the command line's other forms would not be obeyed
+        with pytest.raises(UserInputError, match=f"--inherit '{mode}': expected geometry, xyz, full; the ratio is"):
+            inherit(base_field(), mode)
     with pytest.raises(UserInputError, match="no Gaussians left to inherit"):
         inherit(base_field(0))
     with pytest.raises(UserInputError, match="SH degree 2 cannot give degree 3"):

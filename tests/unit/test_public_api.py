@@ -39,6 +39,12 @@ def test_intrinsics_of_a_level_are_those_of_its_camera(width: int, height: int, 
     torch.testing.assert_close(torch.linalg.solve(found, size), torch.linalg.solve(camera.intrinsics, full))
 
 
+def test_intrinsics_of_whole_numbers_are_not_rounded() -> None:
+    found = lapgs.level_intrinsics(torch.tensor([[90, 0, 51], [0, 90, 25], [0, 0, 1]]), (102, 51), 1)
+    expected = torch.tensor([[45.0, 0.0, 25.5], [0.0, 90 * 26 / 51, 25 * 26 / 51], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(found, expected)
+
+
 def test_splats_and_fields_are_the_same_tensors() -> None:
     field = replace(blob_field(7), sh=torch.randn(7, 4, 3), signed=True)
     splats = lapgs.splats_from_field(field)

@@ -91,6 +91,12 @@ def test_an_image_that_is_not_half_of_the_size_is_refused() -> None:
         upsample(Pyramid(), torch.zeros(3, 16, 25), (33, 50))
 
 
+@pytest.mark.parametrize("shape", [(1, 2, 3), (4, 3, 2, 3)])
+def test_images_of_other_channels_are_refused_and_not_read_out_of_bounds(shape: tuple[int, ...]) -> None:
+    with pytest.raises(UserInputError, match="expected images of as many channels"):
+        upsample_add(Pyramid(), torch.zeros(shape), torch.zeros(3, 4, 6))
+
+
 def test_gradients_go_through() -> None:
     coarse, fine, _ = images("camera", (3, 8, 9), torch.float32)
     coarse.requires_grad_()

@@ -187,6 +187,15 @@ def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: b
     empty.image.sum().backward()
 
 
+@pytest.mark.usefixtures("kernels")
+def test_a_camera_that_inference_mode_saw_first_can_be_trained_on() -> None:
+    rasterizer, field = GsplatOnCpu(True), leaves(blob_field(20))
+    with torch.inference_mode():
+        rasterizer.render_image(field, CAMERAS[0], background=BACKGROUND)
+    rasterizer.render_image(field, CAMERAS[0], background=BACKGROUND).sum().backward()
+    assert field.means.grad is not None
+
+
 def test_packed_renders_have_no_batches() -> None:
     assert not GsplatRasterizer("cpu", packed=True).can_batch
     assert not GsplatRasterizer("cpu").can_batch

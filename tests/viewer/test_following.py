@@ -81,6 +81,8 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     before = len(read)
     assert not run.refresh()
     assert len(read) == before
+    monkeypatch.chdir(folder)
+    assert FollowedRun(Path(), "cpu", "auto").status() == "run: 2 levels", "of `lapgs view .`"
 
 
 def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
@@ -23,9 +24,14 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
         coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images; float16 is taken, too.
         fine: (c, h, w) or (b, c, h, w), on the same device.
         clamped: clamp the sum to [0, 1], to show it; without gradient.
+
+    Raises:
+        UserInputError: `coarse` is not half of `fine`, or has other channels.
     """
     size = fine.shape[-2], fine.shape[-1]
     require_half(coarse, size)
+    if coarse.shape[:-2] != fine.shape[:-2]:
+        raise UserInputError(f"{tuple(coarse.shape)} and {tuple(fine.shape)}: expected images of as many channels")
     if triton_works(fine):
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 

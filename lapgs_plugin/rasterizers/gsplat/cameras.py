@@ -44,7 +44,8 @@ class CameraCache:
     def _one(self, camera: Camera, like: Tensor) -> DeviceCameras:
         known, copied = self._copied.get(id(camera), (None, None))
         if known is None or copied is None or known() is not camera or copied.poses.device != like.device:
-            poses, intrinsics, centres = (value.contiguous() for value in cameras_on_device([camera], like))
+            with torch.inference_mode(False):  # cached for later calls, which may need gradients
+                poses, intrinsics, centres = (value.contiguous() for value in cameras_on_device([camera], like))
             copied = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
             key, cache = id(camera), self._copied
             cache[key] = (weakref.ref(camera, lambda _: cache.pop(key, None)), copied)
