@@ -56,19 +56,6 @@ def pixel_weights(case: Case, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=generator, dtype=torch.float64).to(case.field.means)
 
 
-def gradients(rasterizer: Rasterizer, case: Case, weights: Tensor) -> dict[str, Tensor]:
-    """Return the gradients of sum(weights * image), by parameter name, "means2d" and, where offered, "absgrad2d"."""
-    case = case.with_leaves()
-    result = case.render(rasterizer)
-    (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
-    found = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
-    if result.absgrad2d is not None:
-        found["absgrad2d"] = result.absgrad2d.clone()
-    missing = [name for name, value in found.items() if value is None]
-    assert not missing, f"no gradient for {missing}"
-    return {name: value for name, value in found.items() if value is not None}
-
-
 # ----------------------------------------------------------------------------------------------------- cameras
 
 

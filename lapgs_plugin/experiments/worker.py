@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import socket
 import subprocess
@@ -104,15 +103,16 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
             if code := _execute(step, stream, store, claim, slot, stop):
                 stream.flush()
                 raise RunFailedError(f"exit code {code}; {log} ends with\n{last_lines(log)}")
+    installed = versions()
     return {
         **result_row(job),
         "wall_seconds": time.perf_counter() - clock,
         "lapgs_version": __version__,
-        "torch": versions()["torch"],
+        "torch": installed["torch"],
         "gpu": gpu_name(slot),
-        "processor": versions()["processor"],
+        "processor": installed["processor"],
         "host": socket.gethostname(),
-        "python": platform.python_version(),
+        "python": installed["python"],
         "started": started,
         "attempt": claim.number,
         "folder": job.folder,

@@ -30,6 +30,7 @@ from lapgs_plugin.hierarchy.plan import StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.raster_settings import fields_of, with_values
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
@@ -307,9 +308,11 @@ class _Nothing:
 
 def _some(points: Any) -> Any:
     """Return some of a scene's points."""
-    step = len(points.points) // MOST_POINTS + 1
-    names = ("points", "colors", "normals")
-    return points if step == 1 else points._replace(**{name: getattr(points, name)[::step] for name in names})
+    count = len(points.points)
+    if count <= MOST_POINTS:
+        return points
+    rows = {name: v for name, v in fields_of(points).items() if hasattr(v, "__len__") and len(v) == count}
+    return with_values(points, {name: value[:: count // MOST_POINTS + 1] for name, value in rows.items()})
 
 
 @contextmanager

@@ -121,12 +121,8 @@ class JointLevels:
 
     def export_fields(self) -> dict[int, GaussianField]:
         """Return the fields for the archive by level, on the CPU; see `BackboneAdapter.export_field`."""
-        adapter = self._context.adapter
-        exported = {}
-        for one in self._fields:
-            stage = one.of.stage
-            exported[stage.level] = adapter.export_field(one.gaussians, signed=stage.signed).to("cpu")
-        return exported
+        export, stages = self._context.adapter.export_field, [(one, one.of.stage) for one in self._fields]
+        return {stage.level: export(one.gaussians, stage.signed).to("cpu") for one, stage in stages}
 
 
 class _Follow:

@@ -13,14 +13,14 @@ from torch import Tensor
 
 
 def fields_of(settings: Any) -> dict[str, Any]:
-    """Return settings by name: those of a named tuple, a dataclass or any other object."""
+    """Return the values of a named tuple, a dataclass or any other object by name."""
     if hasattr(settings, "_asdict"):
         return dict(zip(settings._fields, settings, strict=True))
     return dict(vars(settings)) if hasattr(settings, "__dict__") else {}
 
 
 def with_values(settings: Any, changes: Mapping[str, Any]) -> Any:
-    """Return settings of the same kind with other values by name."""
+    """Return an object of the same kind with other values by name."""
     if hasattr(settings, "_replace"):
         return settings._replace(**changes)
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):

@@ -102,7 +102,7 @@ class StageEvaluation:
             found = fmean(self._psnr(run, view)[fitted] for view in aside)
             if self.best is None or found > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
                 state = run.state()
-                parts = {name: copied(state[name]) for name in ("model", "joint", "exposure", "poses")}
+                parts = {name: copied(state[name]) for name in ("model", "joint", *run.transforms)}
                 self.best = {"psnr": found, "iteration": iteration, **parts}
             if last and self.best["iteration"] < iteration:
                 self.context.monitor.say(

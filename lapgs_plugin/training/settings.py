@@ -180,6 +180,7 @@ class TrainSettings(HierarchySettings):
         "Learn an affine colour transform for each training photo, for photos whose exposure or white balance change: "
         "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
         panel=SCHEDULE,
+        choices=(AUTO, ON, OFF),
     )
     refine_poses: bool = option(
         False,
@@ -191,6 +192,7 @@ class TrainSettings(HierarchySettings):
         LAST,
         "State that each level archives: last, or best by a few training views, which are then not trained on.",
         panel=SCHEDULE,
+        choices=(LAST, BEST),
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
     extended: int = 0  # iterations of the finest stage after its schedule's end, by --resume --iterations
@@ -216,9 +218,9 @@ class TrainSettings(HierarchySettings):
         self._check_base()
         self._check_unused()
         self._check_exposure()
+        _ = self.asked_views
         if self.gather < 1:
             raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
-        _ = self.asked_views
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
         if not 0.0 <= self.ssim_weight <= 1.0:
@@ -263,11 +265,7 @@ class TrainSettings(HierarchySettings):
             )
 
     def _check_exposure(self) -> None:
-        """Refuse unknown choices, and transforms of an image that is not compared with the photo."""
-        if self.exposure not in (AUTO, ON, OFF):
-            raise UserInputError(f"--exposure {self.exposure}: expected {AUTO}, {ON} or {OFF}")
-        if self.keep not in (LAST, BEST):
-            raise UserInputError(f"--keep {self.keep}: expected {LAST} or {BEST}")
+        """Refuse transforms of an image that is not compared with the photo."""
         if self.exposure == ON and not SUPERVISIONS[self.supervision].composes:
             raise UserInputError(
                 f"--exposure on with --supervision {self.supervision}: that compares residuals, which have no "

@@ -237,8 +237,8 @@ class StageRun:
         self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
         if self.coarser.joint is not None:
             self.coarser.joint.step(means_rate, rest, scale)
-        for transforms in self._transforms:
-            transforms.after_step(last, len(iterations))
+        for learned in filter(None, self.transforms.values()):
+            learned.after_step(last, len(iterations))
         self.breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
@@ -277,13 +277,13 @@ class StageRun:
         for model in (self.model, *self.coarser.models):
             for param in model.params.values():
                 param.grad = None
-        for transforms in self._transforms:
-            transforms.forget_gradients()
+        for learned in filter(None, self.transforms.values()):
+            learned.forget_gradients()
 
     @property
-    def _transforms(self) -> list[ViewTransforms]:
-        """What is learned of the training views."""
-        return [transforms for transforms in (self.exposures, self.poses) if transforms is not None]
+    def transforms(self) -> dict[str, ViewTransforms | None]:
+        """What is learned of the training views, by its name in checkpoints."""
+        return {"exposure": self.exposures, "poses": self.poses}
 
     def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
         """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
@@ -393,8 +393,7 @@ class StageRun:
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "joint": None if self.coarser.joint is None else self.coarser.joint.state(),
-            "exposure": None if self.exposures is None else self.exposures.state(),
-            "poses": None if self.poses is None else self.poses.state(),
+            **{name: None if learned is None else learned.state() for name, learned in self.transforms.items()},
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
@@ -415,7 +414,7 @@ class StageRun:
 
     def restore_transforms(self, state: Mapping[str, Any]) -> None:
         """Take what is learned of the training views from a result of `state`."""
-        for transforms, name in ((self.exposures, "exposure"), (self.poses, "poses")):
+        for name, learned in self.transforms.items():
             if (found := state.get(name)) is not None:
-                assert transforms is not None, "the trainer looks for it"
-                transforms.restore(found)
+                assert learned is not None, "the trainer looks for it"
+                learned.restore(found)

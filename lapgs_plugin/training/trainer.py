@@ -310,7 +310,7 @@ class Trainer:
         """Check a checkpoint against the stage, and continue from it."""
         path = self.archive.path(CHECKPOINT)
         check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
-        for name, learned in (("exposure", run.exposures), ("poses", run.poses)):
+        for name, learned in run.transforms.items():
             shape = None if learned is None else learned.transforms.shape
             check_transforms(checkpoint.get(name), shape, name, path)
         run.restore(checkpoint)

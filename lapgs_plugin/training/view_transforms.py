@@ -94,6 +94,7 @@ class ViewTransforms(ABC):
         with torch.no_grad():
             self.transforms.copy_(state["transforms"])
         self.transforms.grad = None if state["gradient"] is None else state["gradient"].to(device, copy=True)
-        moments = {key: value if key == "step" else value.to(device) for key, value in state["moments"].items()}
-        if moments:
-            self._adam.state[self.transforms] = {key: value.clone() for key, value in moments.items()}
+        if moments := state["moments"]:
+            self._adam.state[self.transforms] = {
+                key: value.clone() if key == "step" else value.to(device, copy=True) for key, value in moments.items()
+            }

@@ -4,16 +4,34 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runner import dry_run
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runs.archive import RunArchive
 from tests.contract.stub_runs import CHECKOUTS, NAMES, STUBS, Result, captured, drive, loaded, run_bare
 
 SHORT = ("--iterations", 15)
+
+
+class Points(NamedTuple):
+    """Points of a fork that has no normals, and a number of each point besides."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    normals: None
+    seen: list[int]
+
+
+def test_it_starts_from_some_points_whatever_a_fork_has_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dry_run, "MOST_POINTS", 3)
+    points = Points(np.arange(21).reshape(7, 3), np.ones((7, 3)), None, list(range(7)))
+    some = dry_run._some(points)
+    assert (some.points[:, 0].tolist(), len(some.colors), some.normals, some.seen) == ([0, 9, 18], 3, None, [0, 3, 6])
 
 
 @pytest.mark.parametrize("name", NAMES)

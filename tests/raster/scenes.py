@@ -1,14 +1,29 @@
-"""Hypothesis strategies over the cases of `lapgs_plugin.evaluation.cases`, whose names this module also exports."""
+"""Hypothesis strategies over the cases of `lapgs_plugin.evaluation.cases`, which this module exports too; gradients."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from hypothesis import strategies as st
+from torch import Tensor
 
 from lapgs_plugin.evaluation.cases import *  # noqa: F403 - one place to import cases and strategies from
 from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, make_camera, random_case
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.rasterizer import Rasterizer
+
+
+def gradients(rasterizer: Rasterizer, case: Case, weights: Tensor) -> dict[str, Tensor]:
+    """Return the gradients of sum(weights * image), by parameter name, "means2d" and, where offered, "absgrad2d"."""
+    case = case.with_leaves()
+    result = case.render(rasterizer)
+    (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+    found = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
+    if result.absgrad2d is not None:
+        found["absgrad2d"] = result.absgrad2d.clone()
+    missing = [name for name, value in found.items() if value is None]
+    assert not missing, f"no gradient for {missing}"
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def backgrounds() -> st.SearchStrategy[tuple[float, float, float]]:

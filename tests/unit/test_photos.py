@@ -242,6 +242,10 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
 
     with pytest.raises(UserInputError, match=r"--masks .*nowhere: no such folder of masks"):
         prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=tmp_path / "nowhere"), progress=False)
+    shutil.copytree(masks, noise / "masks")
+    assert list(find_photos(noise, noise / "masks").files) == ["0.jpg", "1.jpg", "2.jpg"]
+    assert len(find_photos(noise, noise).files) == 5
+    shutil.rmtree(noise / "masks")
     refused(r"1 of 3 photos have no mask, the first is 2\.jpg; expected 2\.jpg\.png, 2\.png or 2_mask\.png")
     write_image(masks / "2.png", torch.ones(3, 80, 64))
     refused(r"2\.png: the mask is 64x80 pixels, its photo 80x64 \(EXIF turns .*\); expected the same size")

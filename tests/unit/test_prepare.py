@@ -357,7 +357,7 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
     refused(SceneError, r"00\.png and 00\.tif would both become 00\.png", empty)
     refused(
         UserInputError,
-        "--matcher 'vocabulary': expected auto, exhaustive, sequential or retrieval",
+        "--matcher vocabulary: expected auto, exhaustive, sequential or retrieval",
         matcher="vocabulary",
     )
     refused(UserInputError, "--camera-model 'LENS': expected auto or one of SIMPLE_PINHOLE", camera_model="LENS")

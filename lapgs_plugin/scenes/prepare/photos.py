@@ -44,8 +44,8 @@ class Photos:
         return self.clip is not None or any(path.suffix.lower() in HEIC for path in self.files.values())
 
 
-def find_photos(source: Path) -> Photos:
-    """Return the photos in a folder and below, or the video.
+def find_photos(source: Path, masks: Path | None = None) -> Photos:
+    """Return the photos in a folder and below, or the video. Hidden files and a folder of masks are left out.
 
     Raises:
         SceneError: there are fewer than two photos, or two would have the same name after undistortion.
@@ -59,10 +59,13 @@ def find_photos(source: Path) -> Photos:
         return Photos(source.parent, {}, source)
     if not source.is_dir():
         raise SceneError(f"{source}: no such folder of photos or video")
+    aside = None if masks is None or masks.resolve() == source.resolve() else masks.resolve()
     present = sorted(
         file
         for file in source.rglob("*")
-        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(source).parts)
+        if file.is_file()
+        and not any(part.startswith(".") for part in file.relative_to(source).parts)
+        and not (aside is not None and file.resolve().is_relative_to(aside))
     )
     heic = [file for file in present if file.suffix.lower() in HEIC]
     if heic and find_spec("pillow_heif") is None:

@@ -100,7 +100,7 @@ def _checked_photos(photos: Path, out: Path, settings: PrepareSettings, overwrit
     masks, frames = settings.masks, settings.frames
     if masks is not None and not masks.is_dir():
         raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
-    found = find_photos(photos)
+    found = find_photos(photos, masks)
     if frames is not None and found.clip is None:
         raise UserInputError(f"--frames {frames}: it picks frames from a video, and {photos} is a folder; leave it out")
     return found

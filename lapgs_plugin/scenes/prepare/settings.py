@@ -10,9 +10,7 @@ from lapgs_plugin.options import check_values, option
 
 AUTO = "auto"
 EXHAUSTIVE, SEQUENTIAL, RETRIEVAL = "exhaustive", "sequential", "retrieval"
-MATCHERS = (AUTO, EXHAUSTIVE, SEQUENTIAL, RETRIEVAL)
 INCREMENTAL, GLOBAL = "incremental", "global"
-MAPPERS = (INCREMENTAL, GLOBAL)
 CAMERA_MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
@@ -33,8 +31,13 @@ class PrepareSettings:
         "Pairs of photos to match. exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours in "
         "name order, for frames of a video. retrieval: each photo with those that look most like it. auto: sequential "
         "for a video, retrieval for more than 500 photos, else exhaustive.",
+        choices=(AUTO, EXHAUSTIVE, SEQUENTIAL, RETRIEVAL),
     )
-    mapper: str = option(INCREMENTAL, "How cameras are placed. incremental: one after the other. global: all at once.")
+    mapper: str = option(
+        INCREMENTAL,
+        "How cameras are placed. incremental: one after the other. global: all at once.",
+        choices=(INCREMENTAL, GLOBAL),
+    )
     camera_model: str = option(
         AUTO,
         "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
@@ -57,10 +60,6 @@ class PrepareSettings:
     frames: int | None = option(None, "Frames to pick from a video. Default: two a second, 40 to 240.", least=2)
 
     def __post_init__(self) -> None:
-        if self.matcher not in MATCHERS:
-            raise UserInputError(f"--matcher {self.matcher!r}: expected {', '.join(MATCHERS[:-1])} or {MATCHERS[-1]}")
-        if self.mapper not in MAPPERS:
-            raise UserInputError(f"--mapper {self.mapper!r}: expected {' or '.join(MAPPERS)}")
         if self.camera_model != AUTO:
             object.__setattr__(self, "camera_model", self.camera_model.upper())
             if self.camera_model not in CAMERA_MODELS:
