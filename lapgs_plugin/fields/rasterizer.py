@@ -80,7 +80,7 @@ class Rasterizer(Protocol):
             sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
 
         Raises:
-            UserInputError: the field has no such `sh_degree`.
+            UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
         """
         ...
 
@@ -177,6 +177,12 @@ def degree_to_evaluate(field: GaussianField, sh_degree: int | None) -> int:
     if not 0 <= degree <= field.sh_degree:
         raise UserInputError(f"sh_degree {degree}: expected 0 to {field.sh_degree}, the degree of the field")
     return degree
+
+
+def require_color(background: Tensor) -> None:
+    """Raise a UserInputError unless a background is one colour: CUDA code reads three numbers, whatever its shape."""
+    if background.shape != (3,):
+        raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
 
 
 def render_image(

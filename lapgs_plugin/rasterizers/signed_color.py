@@ -20,7 +20,7 @@ from torch import Tensor
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.patching import State, Target, find_targets, status
 from lapgs_plugin.rasterizers.extensions import CudaExtension
@@ -78,6 +78,7 @@ class SignedColorRasterizer:
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
         """Render `field`; see `fields.rasterizer.Rasterizer`."""
+        require_color(background)
         degree = degree_to_evaluate(field, sh_degree)
         colors = None
         if field.signed:

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
@@ -158,8 +158,7 @@ def _zeros(rows: int, columns: int, kind: np.dtype[Any]) -> Tensor:
 
 def _check(field: GaussianField, background: Tensor) -> None:
     kind = field.means.dtype
-    if background.shape != (3,):
-        raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
+    require_color(background)
     if kind not in (torch.float32, torch.float64):
         raise UserInputError(f"the field's tensors are {kind}, expected float32 or float64; convert with field.to()")
     for name, tensor in {**field.parameters, "background": background}.items():

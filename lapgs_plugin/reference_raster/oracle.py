@@ -27,10 +27,9 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate
+from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
@@ -111,8 +110,7 @@ class OracleRasterizer:
             UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
         """
         degree = degree_to_evaluate(field, sh_degree)
-        if background.shape != (3,):
-            raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
+        require_color(background)
         camera = camera.to(field.means.device, field.means.dtype)
         background = background.to(field.means)  # (3,)
 

@@ -10,7 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer, footprint_radii, tile_rectangles
 from lapgs_plugin.reference_raster.thresholds import threshold_mask
@@ -247,12 +246,6 @@ def test_blending_ends_before_the_transmittance_falls_under_its_limit() -> None:
 
 
 # ------------------------------------------------------------------------------------------------- bad input
-
-
-def test_refuses_a_background_that_is_no_color() -> None:
-    case = scenes.one_gaussian()
-    with pytest.raises(UserInputError, match=r"background has shape \(1,\), expected \(3,\)"):
-        ORACLE(case.field, case.camera, background=torch.zeros(1))
 
 
 def test_a_gaussian_with_numbers_that_are_not_finite_is_culled() -> None:

@@ -342,7 +342,7 @@ def test_gsplat_is_the_oracle_where_their_semantics_agree(signed: bool, without_
 
 
 @pytest.mark.parametrize("degree", [-1, 2])
-def test_a_degree_that_the_field_lacks_is_refused_before_anything_is_rendered(
+def test_a_degree_that_the_field_lacks_and_half_a_colour_are_refused_before_anything_is_rendered(
     degree: int, without_cuda: WithoutCuda
 ) -> None:
     case = random_case(20, 20, 20, seed=3, sh_degree=1).to(torch.float32)
@@ -352,6 +352,8 @@ def test_a_degree_that_the_field_lacks_is_refused_before_anything_is_rendered(
         for rasterizer in rasterizers:
             with pytest.raises(UserInputError, match=f"sh_degree {degree}: expected 0 to 1"):
                 rasterizer(case.field, case.camera, background=torch.zeros(3), sh_degree=degree)
+            with pytest.raises(UserInputError, match=r"background has shape \(1,\), expected \(3,\)"):
+                rasterizer(case.field, case.camera, background=torch.zeros(1))
     assert without_cuda.asked == {}
 
 

@@ -19,7 +19,7 @@ from lapgs_plugin.environment import gsplat_built
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics, degree_to_evaluate
+from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics, degree_to_evaluate, require_color
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
@@ -177,6 +177,7 @@ class GsplatRasterizer:
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
     ) -> RenderResult:
         """Render cameras of one size with radii and centres."""
+        require_color(background)
         degree, absgrad = degree_to_evaluate(field, sh_degree), self._absgrad
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad)
@@ -189,6 +190,7 @@ class GsplatRasterizer:
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
     ) -> Tensor:
         """Render images alone, (3, h, w) of one camera and (b, 3, h, w) of several."""
+        require_color(background)
         degree = degree_to_evaluate(field, sh_degree)
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad=False).image
