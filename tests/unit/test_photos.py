@@ -27,7 +27,7 @@ from lapgs_plugin.scenes.prepare import clip as clip_module
 from lapgs_plugin.scenes.prepare import left_out, pipeline
 from lapgs_plugin.scenes.prepare import photos as photos_module
 from lapgs_plugin.scenes.prepare.clip import judge, pick_frames, sharp_and_moving, write_frames
-from lapgs_plugin.scenes.prepare.colmap import chosen_matcher
+from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, chosen_matcher
 from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.prepare.inputs import one_camera
 from lapgs_plugin.scenes.prepare.job import Job
@@ -47,8 +47,8 @@ def _pixels(index: int) -> NDArray[np.uint8]:
     return np.rint(render(WORLD, _arc(SIZE, FOCAL)[index]).clip(0, 1) * 255).astype(np.uint8)
 
 
-def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
-    """One in HEIC, one upside down by EXIF, masks over a third of each, pairs by retrieval, all at once."""
+def test_photos_of_a_phone_become_a_scene(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """One in HEIC, one upside down by EXIF, two of fog, masks over a third of each, pairs by retrieval, all at once."""
     photos, masks = tmp_path / "photos", tmp_path / "masks"
     photos.mkdir()
     hidden = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
@@ -67,9 +67,20 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path) -> None:
             picture.save(photos / f"{index:02d}.png")
         name = "01.HEIC.png" if index == 1 else f"{index:02d}_mask.png"
         write_image(masks / name, torch.from_numpy(mask.copy()).permute(2, 0, 1))
+    for name in ("fog.png", "more/fog.jpg"):
+        write_image(photos / name, torch.full((3, SIZE[1], SIZE[0]), 0.7))
+        write_image(masks / name, torch.from_numpy(hidden).permute(2, 0, 1))
+    (photos / "._00.png").write_bytes(b"what some file managers leave")
     out = tmp_path / "scene"
-    result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
+    with caplog.at_level(logging.WARNING):
+        result = prepare_scene(photos, out, PrepareSettings(matcher="retrieval", masks=masks), progress=False)
+    assert result.left_out == ("fog.png", "more/fog.jpg")
+    assert "2 of 6 photos could not be placed: fog.png, more/fog.jpg" in caplog.text
     assert len(result.registered) == 4
+    assert [title for title in result.seconds if title.startswith(("Matching", "Placing"))] == [
+        *("Matching pairs", "Placing cameras", "Placing again", "Matching more", "Placing (incremental)"),
+        *(["Placing (global)"] if HAS_GLOBAL else []),
+    ]
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     assert _centre_errors(model).max() < 0.02  # seen 7.4e-4
     scene = load_scene(out, progress=False)

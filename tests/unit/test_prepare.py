@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import shutil
 import sqlite3
 import subprocess
@@ -292,24 +291,6 @@ def test_few_features_are_mapped_by_one_thread(
     job = {"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed"), "mapper": "incremental"}
     colmap_worker._map(job)
     assert used == [threads]
-
-
-def test_photos_that_do_not_fit_are_named(few: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    mixed = tmp_path / "mixed"
-    shutil.copytree(few, mixed)
-    for name in ("fog.png", "more/fog.jpg"):
-        _save(mixed / name, np.full((SIZE[1], SIZE[0], 3), 0.7, np.float32))
-    (mixed / "._00.png").write_bytes(b"what some file managers leave")
-    with caplog.at_level(logging.WARNING):
-        result = prepare_scene(mixed, tmp_path / "scene", progress=False)
-    assert result.left_out == ("fog.png", "more/fog.jpg")
-    assert len(result.registered) == 4
-    assert [title for title in result.seconds if title.startswith(("Matching", "Placing"))] == [
-        *("Matching pairs", "Placing cameras", "Placing again", "Matching more", "Placing (incremental)"),
-        *(["Placing (global)"] if colmap.HAS_GLOBAL else []),
-    ]
-    assert "2 of 6 photos could not be placed: fog.png, more/fog.jpg" in caplog.text
-    assert len(list((tmp_path / "scene" / "images").rglob("*.*"))) == 4
 
 
 @pytest.fixture
