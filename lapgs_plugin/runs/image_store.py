@@ -234,6 +234,9 @@ class ImageStore:
     def __len__(self) -> int:
         return len(self._images)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._images
+
     @property
     def bytes_on_device(self) -> int:
         """Bytes on the GPU: images stored there, or prefetched ones."""
