@@ -73,3 +73,8 @@ FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
 
 LONGEST_NAME = 255
 """Longest file name in bytes on common file systems."""
+
+
+def usable_processors() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -56,11 +56,6 @@ def processor_name() -> str:
     return model[1] if model else platform.machine()
 
 
-def usable_processors() -> int:
-    """Return the number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def gpus_are_hidden() -> bool:
     """Return whether CUDA_VISIBLE_DEVICES hides all GPUs."""
     return os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")

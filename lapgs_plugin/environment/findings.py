@@ -22,10 +22,10 @@ from lapgs_plugin.environment import (
     installed_version,
     processor_name,
     run_program,
-    usable_processors,
 )
 from lapgs_plugin.environment.probes import Probe, run_probe
 from lapgs_plugin.errors import typed_line
+from lapgs_plugin.limits import usable_processors
 
 OLDEST_PYTHON = (3, 10)
 DEVELOPMENT_EXTRA = "dev"

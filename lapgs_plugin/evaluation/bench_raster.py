@@ -22,11 +22,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.environment import installed_version, usable_processors, versions
+from lapgs_plugin.environment import installed_version, versions
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.limits import usable_processors
 from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_plugin.ops.composition import Composition
@@ -21,13 +20,6 @@ if TYPE_CHECKING:
 def around_grey(signed: Tensor) -> Tensor:
     """Map a signed image to [0, 1]: zero is mid-grey, -1 black, 1 white."""
     return 0.5 + 0.5 * signed
-
-
-def as_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Convert an image (3, h, w) in [0, 1] to (h, w, 3) pixels of 8 bits."""
-    planes = image.mul(255.0).add_(0.5).to(torch.uint8)
-    # Stacking planes is faster than copying a permuted image, which jumps between planes for each byte.
-    return np.asarray(torch.stack(planes.unbind(0), dim=-1).cpu().numpy())
 
 
 def view_images(composition: Composition, photo: Tensor | None, raw: bool, nested: bool = False) -> dict[str, Tensor]:

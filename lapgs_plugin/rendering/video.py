@@ -15,7 +15,7 @@ from pathlib import Path
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError
-from lapgs_plugin.rendering.images import as_bytes
+from lapgs_plugin.scenes.images import as_bytes
 
 QUALITY = 8
 """Quality from 0 to 10 for imageio-ffmpeg, at a variable bit rate."""

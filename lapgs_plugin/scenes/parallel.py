@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -10,6 +9,7 @@ from typing import TypeVar
 
 import torch
 
+from lapgs_plugin.limits import usable_processors
 from lapgs_plugin.progress import item_progress
 
 ProgressCallback = Callable[[int, int], None]
@@ -40,7 +40,7 @@ def in_threads(
     bar = item_progress(unit) if progress is True else None
     task = bar.add_task(title, total=len(items)) if bar else None
     results = []
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    usable = usable_processors()
     # One thread an item: torch's own threads would compete with these.
     pool = ThreadPoolExecutor(min(usable, most or usable), initializer=torch.set_num_threads, initargs=(1,))
     with bar or nullcontext():

@@ -60,7 +60,7 @@ def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> No
         start: the initial view.
     """
     with _logged(archive.path()):
-        from lapgs_plugin.rendering.images import as_bytes
+        from lapgs_plugin.scenes.images import as_bytes
         from lapgs_plugin.viewer.pictures import PictureSettings, draw
 
         picture = draw(shown, None, start.camera(*SIZE), PictureSettings(), distance=1.0, zoom=1.0)

@@ -16,7 +16,7 @@ import viser
 from numpy.typing import NDArray
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.rendering.images import as_bytes
+from lapgs_plugin.scenes.images import as_bytes
 from lapgs_plugin.viewer.controls import Controls
 from lapgs_plugin.viewer.pacing import TARGET_SECONDS, Pacing
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw

@@ -18,7 +18,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.rendering.images import as_bytes
+from lapgs_plugin.scenes.images import as_bytes
 from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun, draw, side_by_side
 from lapgs_plugin.viewer.poses import InitialView, Pose
 from tests.training_scene import blob_field, ring_camera
