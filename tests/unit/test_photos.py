@@ -253,6 +253,9 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
 
     with pytest.raises(UserInputError, match=r"--masks .*nowhere: no such folder of masks"):
         prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=tmp_path / "nowhere"), progress=False)
+    with pytest.raises(SceneError, match=r"--masks .*: 0\.jpg is the photo itself, expected its mask"):
+        prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=noise), progress=False)
+    assert not (tmp_path / "scene").exists()
     shutil.copytree(masks, noise / "masks")
     assert list(find_photos(noise, noise / "masks").files) == ["0.jpg", "1.jpg", "2.jpg"]
     assert len(find_photos(noise, noise).files) == 5
