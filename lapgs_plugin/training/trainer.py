@@ -11,7 +11,7 @@ import torch
 
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, batching
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
@@ -249,7 +249,7 @@ class Trainer:
     @property
     def _batches(self) -> bool:
         """Whether the rasterizer renders several views together; poses are refined with each view alone."""
-        return not self.settings.refine_poses and batching(self.rasterizer) is not None
+        return not self.settings.refine_poses and self.rasterizer.can_batch
 
     def _stage_run(
         self,
