@@ -238,7 +238,7 @@ def test_a_rasterizer_needs_no_more_than_a_call(signed: bool) -> None:
     alone = minimal.render_image(leaves, cameras[1], background=background)
     torch.testing.assert_close(alone.detach(), expected[1], rtol=0, atol=1e-5)
     assert alone.requires_grad
-    assert not (minimal.can_batch or minimal.can_stack or minimal.in_current_stream)
+    assert [minimal.can_batch, minimal.can_stack, minimal.in_current_stream] == [False] * 3
 
 
 # ----------------------------------------------------------------------------------------------------------- gsplat
