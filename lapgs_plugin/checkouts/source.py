@@ -154,6 +154,18 @@ def training_scripts(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
 
 
+def readable_source(folder: Path) -> CheckoutSource | None:
+    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+    for script in training_scripts(folder):
+        try:
+            source = CheckoutSource.read(script)
+        except UserInputError:
+            continue
+        if source.root == folder.absolute():
+            return source
+    return None
+
+
 def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
     """Yield the checkout's modules that a script imports, the script itself first, with their files."""
     waiting, seen = [("__main__", script)], {"__main__"}

@@ -40,7 +40,8 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             *(Finding("Other scripts", "ok", text) for text in more),
             Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
         ],
-        "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [Finding("none", "problem", unused)],
+        "Rasterizers": [_rasterizer(use, use.module in source.modules) for use in source.rasterizers]
+        or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
         "lapgs run": [*_kinds(source), _stand_in(source)],
@@ -71,9 +72,11 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     return found[names[0]], names[1:]
 
 
-def _rasterizer(use: RasterizerUse) -> Finding:
+def _rasterizer(use: RasterizerUse, own: bool) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
+    if own:
+        return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):
         return Finding(use.module, "ok", detail)
     return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")

@@ -54,7 +54,7 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
     assert {"antialiasing", "viewmatrix"} < use.settings
     assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
     with pytest.raises(
-        MissingExtraError, match=f"no CPU stand-in for {OTHER}, which gaussian_renderer/__init__.py:"
+        MissingExtraError, match=f"no CPU stand-in for {OTHER}, imported in gaussian_renderer/__init__.py:"
     ) as e:
         adapter_class(fork).stand_in_for(fork, ())
     assert "\n" not in str(e.value)
