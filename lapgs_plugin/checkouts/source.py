@@ -133,6 +133,15 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
+    def unknown_attributes(self, names: Iterable[str]) -> list[str]:
+        """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
+        trees = [parsed_quietly(path) for path in self.modules.values()]
+        classes = {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
+        if not _methods(classes[self.model[0]], classes)[1]:
+            return []
+        known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        return [name for name in names if name not in known]
+
     @property
     def rasterizer_modules(self) -> tuple[str, ...]:
         """Modules of rasterizers, in the order in which they are imported."""

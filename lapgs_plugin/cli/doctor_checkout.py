@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
@@ -99,6 +100,10 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:
+    own = adapter_class(source.root).snapshot is not BackboneAdapter.snapshot
+    if not own and (absent := source.unknown_attributes(PARAMETERS)):
+        why = f"its Gaussians ({source.model[1]}) have no {', '.join(absent)}, from which fields are archived"
+        return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     if (several := source.image_scales) is not None:
         why = f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
+from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
@@ -101,6 +102,7 @@ class DryRun:
                 self._context, self._scratch_call(folder), self._scene, self._view, rendering, self._window
             )
             self._iterate(stage, works)
+            self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
             with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
                 image = self._render(view, stage.gaussians)
@@ -121,6 +123,7 @@ class DryRun:
         with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            self._require_parameters(gaussians)
             self._require_three_axes(gaussians)
             gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
@@ -216,6 +219,16 @@ class DryRun:
         logger.warning(
             "%s: lapgs eval, render and view show other images than the checkout's own render; %s", problem, mend
         )
+
+    def _require_parameters(self, gaussians: Any) -> None:
+        """Refuse a model that lacks what a field has, unless its adapter makes fields otherwise."""
+        if type(self._adapter).snapshot is not BackboneAdapter.snapshot:
+            return
+        if absent := [name for name in PARAMETERS if not hasattr(gaussians, name)]:
+            raise UserInputError(
+                f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(PARAMETERS)}; the model "
+                f"has no {', '.join(absent)}; {OFF}"
+            )
 
     def _require_three_axes(self, gaussians: Any) -> None:
         place, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]

@@ -129,3 +129,20 @@ def test_what_is_rendered_has_to_be_what_is_archived(
     warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
     assert [bool(re.match(message, each)) for each in warnings] == ([] if signed else [True])
     assert (tmp_path / "run").exists() != signed
+
+
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_a_model_without_the_parameters_of_a_field(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+    """As of forks whose colours come from a network; their models have none of SH."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    for path in (*(checkouts / "graphdeco").rglob("*.py"), *(checkouts / "shared").rglob("*.py")):
+        path.write_text(path.read_text(encoding="utf-8").replace("_features_rest", "_table"), encoding="utf-8")
+    script = checkouts / "graphdeco" / "train.py"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        pytest.raises(UserInputError, match=r"the model has no _features_rest; `lapgs run --off`") as caught,
+    ):
+        drive(adapter, dry_run=True, hierarchy=hierarchy)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
