@@ -150,6 +150,20 @@ class Event:
         """Iterations in lists that are written out."""
         return tuple(element for each in self.operands for element in each.listed)
 
+    def last(self, end: int, number: Callable[[Operand], int | None]) -> int:
+        """Return the last iteration, up to `end`, at which it happens by its period; 0 if there is none."""
+        period = None if self.period is None else number(self.period)
+        for bound in (*self.bounds, *self.around):
+            value = None if bound.periodic or bound.is_list else number(bound)
+            if value is not None and bound.operator in (ast.Lt, ast.LtE):
+                end = min(end, value - (bound.operator is ast.Lt))
+        return end // period * period if period else 0
+
+    @property
+    def harmful(self) -> bool:
+        """Whether Gaussians need iterations to recover from it."""
+        return any(HARMFUL.search(name) for name in self.calls)
+
     def describe(self, variables: Mapping[str, Any]) -> str:
         """Return one line: the condition, with the values of options that are known, and the functions it calls."""
         known = {_place(each.node): each.value(variables) for each in self.operands if each.option is not None}
@@ -183,6 +197,24 @@ class Schedule:
         known = variables or {}
         return [event.describe(known) for event in self.events if event.matters and not event.never(known)]
 
+    def before_harm(self, end: int, variables: Mapping[str, Any], total: int) -> int:
+        """Return `end`, or the iteration before a rare harmful event that comes there or shortly before.
+
+        Args:
+            end: iteration after which a field is archived.
+            variables: those that the function sees, by name.
+            total: iterations of the run.
+        """
+
+        def number(operand: Operand) -> int | None:
+            return operand.number(variables)
+
+        for event in self.events:
+            if event.period is not None and event.harmful and (number(event.period) or 0) >= total / RARE:
+                last = event.last(end, number)
+                end = last - 1 if last and end - last < total / RARE**2 else end
+        return end
+
     def for_stage(
         self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: StageWindow, keep: Collection[str] = ()
     ) -> StageSchedule:
@@ -213,7 +245,7 @@ class Schedule:
                 continue
             if spread and event.period.name not in KEPT:
                 changed.set(event.period, period, max(1, window.scaled(period)))
-            if any(HARMFUL.search(name) for name in event.calls):
+            if event.harmful:
                 changed.keep_clear(event, {**whole, **stage}, window.scaled(window.total))
         return changed
 
@@ -253,14 +285,10 @@ class StageSchedule:
             return self._numbers.get(_place(operand.node), operand.number(variables))
 
         assert event.period is not None
-        period, limit, start = now(event.period), end, end - end // RARE
-        for bound in (*event.bounds, *event.around):
-            value = None if bound.periodic or bound.is_list else now(bound)
-            if value is not None and bound.operator in (ast.Lt, ast.LtE):
-                limit = min(limit, value - (bound.operator is ast.Lt))
-        if period and limit // period * period > start:
+        last, start = event.last(end, now), end - end // RARE
+        if last > start:
             self._moved[_place(event.period.comparison)] = start
-            self.notes.append(f"{', '.join(event.calls)} at {limit // period * period} -> {start}")
+            self.notes.append(f"{', '.join(event.calls)} at {last} -> {start}")
 
     def arguments(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return a function's arguments with the options that changed; objects that hold them are copied."""

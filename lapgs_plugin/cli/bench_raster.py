@@ -100,7 +100,7 @@ def _print_results(results: Sequence[CaseResult]) -> None:
     from lapgs_plugin.evaluation.bench_raster import FAST, machine
 
     times = Table(title="A training iteration, medians", box=box.SIMPLE, pad_edge=False)
-    for heading in ("size", "Gaussians", "a pixel", "contender", "ms", "times cpu", "required"):
+    for heading in ("size", "Gaussians", "blended\nper pixel", "contender", "ms", "times cpu", "required"):
         times.add_column(heading, justify="right", no_wrap=True)
     parts = Table(title=f"Where the time of {FAST} goes, medians in ms", box=box.SIMPLE, pad_edge=False)
     for heading in ("size", *(name.replace("_", "\n") for name in results[0].parts), "loss\nadds", "MB"):

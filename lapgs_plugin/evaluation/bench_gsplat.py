@@ -25,25 +25,23 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.reference_raster.layout import MIN_ALPHA, MIN_TRANSMITTANCE, NEAR_DEPTH, TILE
 
 MAX_ALPHA = 0.999
 
 
-class GsplatTorchRasterizer:
-    """Render unsigned float32 fields on the CPU with gsplat's `_torch_impl`, as a `fields.rasterizer.Rasterizer`.
+class GsplatTorchRasterizer(Rasterizer):
+    """Render unsigned float32 fields on the CPU with gsplat's `_torch_impl`.
 
     Attributes:
         tile_loop_seconds: seconds that the last call spent in gsplat's Python loop over Gaussians and tiles.
     """
 
+    name = "gsplat, PyTorch"
+
     def __init__(self) -> None:
         self.tile_loop_seconds = 0.0
-
-    @property
-    def name(self) -> str:
-        return "gsplat, PyTorch"
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -60,45 +61,8 @@ class Semantics:
     note: str = ""
 
 
-class Rasterizer(Protocol):
-    """Render a field from a camera."""
-
-    @property
-    def name(self) -> str:
-        """Its name in logs, manifests and tables."""
-        ...
-
-    def __call__(
-        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
-    ) -> RenderResult:
-        """Render `field`, differentiably by its parameters.
-
-        Args:
-            field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
-            camera: size, intrinsics and pose.
-            background: (3,) colour behind everything; zero for residual fields.
-            sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
-
-        Raises:
-            UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
-        """
-        ...
-
-
-@runtime_checkable
-class ImageRasterizer(Protocol):
-    """Render images alone, without radii and centres, and several views together.
-
-    On a GPU all its work goes to PyTorch's current stream, so that fields can be rendered concurrently.
-    """
-
-    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Render b cameras of one size, (b, 3, height, width), to the images that `Rasterizer` gives one by one."""
-        ...
-
-
 class FieldStack(Protocol):
-    """Hold finished fields on a device, to render them together; see `StackingRasterizer`."""
+    """Hold finished fields on a device, to render them together; see `Rasterizer.stack`."""
 
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         """Render the first fields, each from its own camera.
@@ -114,28 +78,50 @@ class FieldStack(Protocol):
         ...
 
 
-@runtime_checkable
-class StackingRasterizer(Protocol):
-    """Render several fields together, with hardly more launches than one field takes."""
+class Rasterizer(ABC):
+    """Render a field from a camera. A subclass has a name and a `__call__`; it overrides the rest where that is faster.
 
-    @property
-    def can_stack(self) -> bool:
-        """Whether it can with the options it was made with."""
-        ...
+    Attributes:
+        name: in logs, manifests and tables.
+        in_current_stream: whether all its work on a GPU goes to PyTorch's current stream, so that fields can be
+            rendered concurrently.
+    """
 
-    def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
-        """Copy fields from any device to a stack on its own; only if `can_stack`."""
-        ...
+    name: str
+    in_current_stream: bool = False
 
+    @abstractmethod
+    def __call__(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> RenderResult:
+        """Render `field`, differentiably by its parameters.
 
-@runtime_checkable
-class BatchRasterizer(Protocol):
-    """Render several views of one size differentiably with as many launches as one view takes."""
+        Args:
+            field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
+            camera: size, intrinsics and pose.
+            background: (3,) colour behind everything; zero for residual fields.
+            sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
+
+        Raises:
+            UserInputError: the field has no such `sh_degree`, or `background` is not a colour.
+        """
+
+    def render_image(
+        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
+    ) -> Tensor:
+        """Render `RenderResult.image` alone, (3, height, width), with its gradients."""
+        return self(field, camera, background=background, sh_degree=sh_degree).image
+
+    @torch.no_grad()
+    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
+        """Render images alone from b cameras of one size, (b, 3, height, width), without gradients."""
+        images = [self(field, camera, background=background).image for camera in cameras]
+        return images[0][None] if len(images) == 1 else torch.stack(images)
 
     @property
     def can_batch(self) -> bool:
-        """Whether it can with the options it was made with."""
-        ...
+        """Whether `render_batch` is available with the options that the rasterizer was made with."""
+        return False
 
     def render_batch(
         self,
@@ -146,25 +132,25 @@ class BatchRasterizer(Protocol):
         sh_degree: int | None = None,
         describes: bool = True,
     ) -> RenderResult:
-        """Render b cameras of one size differentiably; every tensor of the result has a leading dimension b.
+        """Render b cameras of one size differentiably, with as many launches as one camera takes.
+
+        Every tensor of the result has a leading dimension b.
 
         Args:
-            field, background, sh_degree: as a `Rasterizer` takes them.
-            cameras: two or more; only if `can_batch`.
+            field, background, sh_degree: as `__call__` takes them.
+            cameras: two or more.
             describes: fill in radii and centres; False leaves them empty and is faster.
         """
-        ...
+        raise NotImplementedError
 
+    @property
+    def can_stack(self) -> bool:
+        """Whether `stack` is available with the options that the rasterizer was made with."""
+        return False
 
-@runtime_checkable
-class PlainRasterizer(Protocol):
-    """Render faster without radii and centres."""
-
-    def render_image(
-        self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
-    ) -> Tensor:
-        """Return `RenderResult.image` of the same call, (3, height, width), with its gradients."""
-        ...
+    def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
+        """Copy fields from any device to its own, to render them with hardly more launches than one field takes."""
+        raise NotImplementedError
 
 
 def degree_to_evaluate(field: GaussianField, sh_degree: int | None) -> int:
@@ -185,33 +171,8 @@ def require_color(background: Tensor) -> None:
         raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
 
 
-def render_image(
-    rasterizer: Rasterizer, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int | None = None
-) -> Tensor:
-    """Render the image (3, height, width) alone with any rasterizer, differentiably, in its fastest way."""
-    if isinstance(rasterizer, PlainRasterizer):
-        return rasterizer.render_image(field, camera, background=background, sh_degree=sh_degree)
-    return rasterizer(field, camera, background=background, sh_degree=sh_degree).image
-
-
-@torch.no_grad()
-def render_images(
-    rasterizer: Rasterizer, field: GaussianField, cameras: Sequence[Camera], background: Tensor
-) -> Tensor:
-    """Render b cameras of one size, (b, 3, height, width), with any rasterizer in its fastest way."""
-    if isinstance(rasterizer, ImageRasterizer):
-        return rasterizer.render_images(field, cameras, background=background)
-    images = [rasterizer(field, camera, background=background).image for camera in cameras]
-    return images[0][None] if len(images) == 1 else torch.stack(images)
-
-
 @torch.no_grad()
 def render_transmittance(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> Tensor:
     """Compute `RenderResult.transmittance` with any rasterizer: render black Gaussians over white."""
     black = replace(field.with_parameters({"sh": torch.zeros_like(field.sh[:, :1])}), signed=True)
     return rasterizer(black, camera, background=torch.ones(3).to(field.means), sh_degree=0).image[0]
-
-
-def batching(rasterizer: Rasterizer) -> BatchRasterizer | None:
-    """Return the rasterizer if it renders several views together, else None. Checking a protocol is slow."""
-    return rasterizer if isinstance(rasterizer, BatchRasterizer) and rasterizer.can_batch else None

@@ -31,6 +31,11 @@ def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:
     return most
 
 
+def unpruned_line(share: float, level: int) -> str:
+    """Return the line that tells a user that --prune leaves a level as it is."""
+    return f"--prune {share}: level {level} is not pruned: no densification ends in its iterations"
+
+
 def least_blended(pixels: Tensor, share: float) -> Tensor:
     """Return a mask (n,) of the least visible Gaussians that together have at most a share of total visibility.
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.patching import State, Target, find_targets, status
 from lapgs_plugin.rasterizers.extensions import CudaExtension
@@ -47,8 +47,8 @@ def signed_degree(degree: int) -> int:
     return degree | SIGNED_COLOR_BIT
 
 
-class SignedColorRasterizer:
-    """Render with an extension as a `Rasterizer`, signed fields on its fastest path.
+class SignedColorRasterizer(Rasterizer):
+    """Render with an extension, signed fields on its fastest path.
 
     Args:
         extension: that renders.
@@ -58,11 +58,8 @@ class SignedColorRasterizer:
 
     def __init__(self, extension: CudaExtension, *, path: ColorPath | None = None) -> None:
         self._extension = extension
+        self.name = extension.name
         self._forced = path
-
-    @property
-    def name(self) -> str:
-        return self._extension.name
 
     @cached_property
     def path(self) -> ColorPath:

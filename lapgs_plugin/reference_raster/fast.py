@@ -14,13 +14,13 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
 
 
-class CpuRasterizer:
+class CpuRasterizer(Rasterizer):
     """Render and differentiate on the CPU, fast enough to train with.
 
     The semantics are those of `oracle`, gradients included. It runs on `torch.get_num_threads()` threads (see
@@ -30,9 +30,7 @@ class CpuRasterizer:
     Gaussians whose position or covariance on the image is not finite are culled: they get radius 0 and no gradient.
     """
 
-    @property
-    def name(self) -> str:
-        return "cpu"
+    name = "cpu"
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
@@ -69,7 +67,7 @@ class CpuRasterizer:
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Render images without anything else; see `fields.rasterizer.ImageRasterizer`.
+        """Render images without anything else; see `fields.rasterizer.Rasterizer`.
 
         Raises:
             UserInputError: as `__call__`.

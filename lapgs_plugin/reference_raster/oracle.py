@@ -29,7 +29,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, degree_to_evaluate, require_color
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
@@ -84,7 +84,7 @@ class TileLists:
     rows: int
 
 
-class OracleRasterizer:
+class OracleRasterizer(Rasterizer):
     """Render in plain PyTorch, on the device and in the precision (float32 or float64) of the field's tensors.
 
     The backward pass computes each tile again, so that memory holds the intermediates of one tile at a time.
@@ -94,12 +94,10 @@ class OracleRasterizer:
             front of the camera is then in every tile and has a radius.
     """
 
+    name = "oracle"
+
     def __init__(self, *, three_sigma_cut: bool = True) -> None:
         self._three_sigma_cut = three_sigma_cut
-
-    @property
-    def name(self) -> str:
-        return "oracle"
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None

@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import FieldStack, ImageRasterizer, Rasterizer, StackingRasterizer, render_images
+from lapgs_plugin.fields.rasterizer import FieldStack, Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 
 
@@ -98,7 +98,8 @@ class FieldRenderer:
         """Render one field in the current stream; arguments and errors as `render`."""
         at_level = [level_camera(camera, level) for camera in cameras]
         with self._full_memory_explained([level], at_level[0]):
-            images = render_images(self.rasterizer, self.field(level), at_level, self.background_of(level))
+            background = self.background_of(level)
+            images = self.rasterizer.render_images(self.field(level), at_level, background=background)
             return self._within_range(level, images)
 
     def zeros(self, cameras: Sequence[Camera], level: int) -> Tensor:
@@ -109,13 +110,12 @@ class FieldRenderer:
     @cached_property
     def can_stack(self) -> bool:
         """Whether all fields of a view can be rendered in one set of launches, whatever `stack_pixels` is."""
-        keeps = self.offload is not None and self.offload.keep
-        return keeps and isinstance(self.rasterizer, StackingRasterizer) and self.rasterizer.can_stack
+        return self.offload is not None and self.offload.keep and self.rasterizer.can_stack
 
     @property
     def can_use_streams(self) -> bool:
         """Whether several fields can be rendered concurrently, each in its own stream."""
-        return self.device.type == "cuda" and len(self.fields) > 1 and isinstance(self.rasterizer, ImageRasterizer)
+        return self.device.type == "cuda" and len(self.fields) > 1 and self.rasterizer.in_current_stream
 
     def background_of(self, level: int) -> Tensor:
         """Return the background (3,) of a level's field: black for a residual, which would add the colour again."""
@@ -139,7 +139,6 @@ class FieldRenderer:
         """Return a stack that begins with the fields of these levels; finer ones may follow."""
         wanted = tuple(levels)
         if all(stacked[: len(wanted)] != wanted for stacked in self._stacks):
-            assert isinstance(self.rasterizer, StackingRasterizer)
             self._stacks.clear()  # before making another, so that the fields are not on the device twice
             self._stacks[wanted] = self.rasterizer.stack([self.fields[level] for level in wanted])
         return next(iter(self._stacks.values()))

@@ -12,7 +12,6 @@ from statistics import median
 import torch
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.rasterizer import render_images
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 
@@ -137,8 +136,8 @@ def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
     field, background = renderer.field(level), renderer.by_field.background_of(level)
-    return lambda cameras: render_images(
-        renderer.rasterizer, field, [level_camera(camera, size_level) for camera in cameras], background
+    return lambda cameras: renderer.rasterizer.render_images(
+        field, [level_camera(camera, size_level) for camera in cameras], background=background
     )
 
 

@@ -13,6 +13,7 @@ import torch
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError, first_line, typed_line
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.stage_model import StageModel
@@ -211,10 +212,7 @@ class ActiveStage:
             *(self.stage.level, self.stage.iterations, width, height, place),
         )
         if self._options.prune and self._prune_at is None:
-            logger.warning(
-                "--prune %s: level %d is not pruned: no densification ends in its iterations",
-                *(self._options.prune, self.stage.level),
-            )
+            logger.warning("%s", unpruned_line(self._options.prune, self.stage.level))
 
     def _archived_levels(self) -> str:
         return ", ".join(map(str, self._archive.available_levels)) or "none"

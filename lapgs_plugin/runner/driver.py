@@ -13,6 +13,7 @@ are one field: a single call trains them (`single_call`). Everything between ren
 from __future__ import annotations
 
 import inspect
+import itertools
 import logging
 import os
 import shutil
@@ -139,6 +140,8 @@ class HierarchyDriver:
                 self._options.shares,
                 self._options.kind,
             )
+            if self._signs_nothing:
+                plan = self._between_events(plan, call)
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
             path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
             if self._options.dry_run:
@@ -161,6 +164,19 @@ class HierarchyDriver:
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
         logger.info("run folder: %s", folder)
+
+    def _between_events(self, plan: StagePlan, call: TrainingCall) -> StagePlan:
+        """Return a plan in which no nested level is archived right after a reset of opacities or hard pruning."""
+        before, stages = 0, list(plan)
+        for i, (stage, finer) in enumerate(itertools.pairwise(plan)):
+            end = before + stage.iterations
+            clear = self._schedule.before_harm(end, _variables(call), plan.iterations)
+            if before < clear < end:
+                logger.info("level %d ends after iteration %d: the script acts at %d", stage.level, clear, clear + 1)
+                stages[i] = replace(stages[i], iterations=clear - before)
+                stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
+            before += stages[i].iterations
+        return replace(plan, stages=tuple(stages))
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""

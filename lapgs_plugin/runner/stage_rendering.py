@@ -66,7 +66,7 @@ class StageRendering:
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
     inputs: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    _by_matrix: dict[bytes, str] = field(default_factory=dict, repr=False)
+    _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 
     def key(self, noted: str | None, settings: Any) -> str | None:
         """Return the key of a view; None for any other camera.
@@ -74,17 +74,35 @@ class StageRendering:
         Args:
             noted: key of the view that a renderer was called with; None if it was called with none.
             settings: of the rasterizer, whose matrices are compared if no view was noted and this matters.
+
+        Raises:
+            UserInputError: several photos have these matrices, and it matters which one is rendered.
         """
         if noted is not None and noted in self.views:
             return noted
         if noted is not None or not self.views or not (self._needs_views or self.on_image is not None):
             return None
+        keys = self._keys_by_matrix(settings)
+        # Photos of one camera have the same prediction, but not the same mask or target.
+        differ = self.weights is not None or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
+        if len(keys) > 1 and differ:
+            names = " and ".join(view_name(key) for key in sorted(keys)[:2])
+            raise UserInputError(
+                f"{names} have the same camera, and the checkout's rasterizer gets only that: which photo it renders "
+                "is unknown; leave one of them out, or train with --hierarchy nested, without --masks and hooks"
+            )
+        return min(keys, default=None)
+
+    def _keys_by_matrix(self, settings: Any) -> set[str]:
+        """Return the keys of the views that have the settings' matrices: poses, and projections where they have any."""
         if not self._by_matrix:
             for key, camera in self.views.items():
-                for matrix in matrix_keys(camera.world_view_transform):
-                    self._by_matrix[matrix] = key
-        found = (self._by_matrix.get(m) for value in view_matrices(settings) for m in matrix_keys(value))
-        return next((key for key in found if key is not None), None)
+                for whole in (camera.world_view_transform, getattr(camera, "full_proj_transform", None)):
+                    for matrix in () if whole is None else matrix_keys(whole):
+                        self._by_matrix.setdefault(matrix, set()).add(key)
+        keys = (self._by_matrix.get(m) for value in view_matrices(settings) for m in matrix_keys(value))
+        found = [each for each in keys if each]
+        return set.intersection(*found) if found else set()
 
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""

@@ -3,8 +3,8 @@
     RUN/manifest.json              everything needed to render the run again
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
-    RUN/level_<l>/exposure.json    colour transforms of the training photos after that level, if exposure is compensated
-    RUN/level_<l>/poses.json       corrections of the training photos' poses after that level, if these are refined
+    RUN/level_<l>/view_colors.json colour transforms of the training photos after that level, if exposure is compensated
+    RUN/level_<l>/view_poses.json  corrections of the training photos' poses after that level, if these are refined
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
     RUN/run.toml                   the options of `lapgs train` that made the run
@@ -36,7 +36,8 @@ from lapgs_plugin.untrusted import read_json
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
-PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "exposure.json", "poses.json"
+PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
+"""Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning."""
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 FORGET_EXTENSION = "delete it to extend the run anew"

@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, render_image
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
@@ -71,9 +71,9 @@ class JointFields:
             background = self.background.new_zeros(3) if model.signed else self.background
             if len(cameras) == 1:
                 field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
-                return render_image(self.rasterizer, field, cameras[0], background)
-            rasterizer = cast(BatchRasterizer, self.rasterizer)  # who asks has looked; a protocol takes long to
-            return rasterizer.render_batch(model.field, cameras, background=background, describes=False).image
+                return self.rasterizer.render_image(field, cameras[0], background=background)
+            result = self.rasterizer.render_batch(model.field, cameras, background=background, describes=False)
+            return result.image
 
         return compose(self.pyramid, ((level, render(level, model)) for level, model in self.models.items())).image
 

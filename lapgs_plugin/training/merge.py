@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import render_image
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -170,7 +169,7 @@ def _measured(
     to_photo = color_fitted_psnr if colors_fitted else psnr
     kept, against_photos = [], []
     for view in teacher.test:
-        image = render_image(placed.rasterizer, on_device, view.camera, background).cpu()
+        image = placed.rasterizer.render_image(on_device, view.camera, background=background).cpu()
         kept.append(psnr(image, view.image))
         if (photo := photos.get(view.name)) is not None:
             run_and_field = (to_photo(each, photo.image, photo.mask) for each in (view.image, image))

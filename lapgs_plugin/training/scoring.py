@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, render_image
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.ops.photometric_loss import photometric_loss
@@ -57,13 +57,13 @@ class FieldScoring:
 
         def asked(view: LevelView) -> ScoredView:
             with torch.no_grad():
-                image = render_image(self.rasterizer, field, at_pose(view, self.poses).camera, self.background, degree)
+                image = self._render(field, view, degree)
                 below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
                 self.breakdown.mark("densification")
                 composed = self.losses.exposed([view.name], image if below is None else image + below)
                 whole = fill_outside(composed, target, images.get_weights([view.name]))
                 loss = photometric_loss(whole, target, ssim_weight)
-            return ScoredView(self._render(plain, view), whole, target, loss)
+            return ScoredView(self._render(plain, view, 0), whole, target, loss)
 
         views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS])
         return view_scores(views, grey, threshold)
@@ -71,10 +71,11 @@ class FieldScoring:
     def least_visible(self, field: GaussianField, share: float) -> Tensor:
         """Return a mask (n,) of Gaussians with negligible visibility in the training views; see `least_blended`."""
         plain, grey = _grey(field)
-        return least_blended(blended_pixels((self._render(plain, view) for view in self.views), grey), share)
+        return least_blended(blended_pixels((self._render(plain, view, 0) for view in self.views), grey), share)
 
-    def _render(self, plain: GaussianField, view: LevelView) -> Tensor:
-        return render_image(self.rasterizer, plain, at_pose(view, self.poses).camera, self.background, 0)
+    def _render(self, field: GaussianField, view: LevelView, degree: int) -> Tensor:
+        camera = at_pose(view, self.poses).camera
+        return self.rasterizer.render_image(field, camera, background=self.background, sh_degree=degree)
 
 
 def _grey(field: GaussianField) -> tuple[GaussianField, Tensor]:

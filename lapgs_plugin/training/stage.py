@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import BatchRasterizer, Rasterizer, RenderResult, batching, render_image
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
@@ -192,13 +191,10 @@ class StageRun:
         """Number of losses that are read together."""
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
-    @cached_property
-    def _batching(self) -> BatchRasterizer | None:
-        """The rasterizer if it renders several views together, else None. Cached: checking a protocol is slow.
-
-        The gradient by a pose follows from the Gaussians' gradients of that view alone.
-        """
-        return batching(self.rasterizer) if self.poses is None else None
+    @property
+    def _batches(self) -> bool:
+        """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
+        return self.poses is None and self.rasterizer.can_batch
 
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""
@@ -206,7 +202,7 @@ class StageRun:
 
     def _launches(self, iterations: range) -> list[list[int]]:
         """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
-        if self._batching is None or len(iterations) == 1:
+        if not self._batches or len(iterations) == 1:
             return [[iteration] for iteration in iterations]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for iteration in iterations:
@@ -328,15 +324,15 @@ class StageRun:
         """Return the image, or images of several cameras, and the whole result if density control needs it."""
         needed, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
         if len(cameras) > 1:
-            assert self._batching is not None
-            result = self._batching.render_batch(
+            result = self.rasterizer.render_batch(
                 gaussians, cameras, background=self.background, sh_degree=degree, describes=needed
             )
             return result.image, result if needed else None
         if needed:
             result = self.rasterizer(gaussians, cameras[0], background=self.background, sh_degree=degree)
             return result.image, result
-        return render_image(self.rasterizer, gaussians, cameras[0], self.background, degree), None
+        image = self.rasterizer.render_image(gaussians, cameras[0], background=self.background, sh_degree=degree)
+        return image, None
 
     def _view(self, iteration: int) -> LevelView:
         index = view_index(iteration, len(self.views), self.settings.seed, self.stage.level)

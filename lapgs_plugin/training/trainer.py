@@ -11,8 +11,9 @@ import torch
 
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, batching
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.runs.archive import RunArchive
@@ -149,7 +150,7 @@ class Trainer:
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
         for level in unpruned_levels(self._context.plan, self.settings):
-            say(f"--prune {self.settings.prune}: level {level} is not pruned: no densification ends in its iterations")
+            say(unpruned_line(self.settings.prune, level))
         if self.settings.refine_poses and self.device.type == "cuda":
             say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 
@@ -249,7 +250,7 @@ class Trainer:
     @property
     def _batches(self) -> bool:
         """Whether the rasterizer renders several views together; poses are refined with each view alone."""
-        return not self.settings.refine_poses and batching(self.rasterizer) is not None
+        return not self.settings.refine_poses and self.rasterizer.can_batch
 
     def _stage_run(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.rasterizer import Rasterizer, batching, render_image
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops import densification_statistics
@@ -34,7 +34,7 @@ def warm_up(
     on_gpu = torch.device(device).type == "cuda"
     target_types = (torch.uint8, torch.float16) if on_gpu else (result.image.dtype,)
     coarse = torch.zeros(3, 8, 8, device=device)
-    rendered = [result.image, render_image(rasterizer, model.field, camera, black)]
+    rendered = [result.image, rasterizer.render_image(model.field, camera, background=black)]
     if residuals:
         rendered.append(upsample_add(Pyramid(), coarse.to(target_types[-1]), rendered[1]))
     if joint:
@@ -44,8 +44,8 @@ def warm_up(
     losses = [photometric_loss(image, target) for image in rendered for target in targets]
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
-    if (able := batching(rasterizer)) is not None:
-        images = able.render_batch(model.field, [camera, camera], background=black).image
+    if rasterizer.can_batch:
+        images = rasterizer.render_batch(model.field, [camera, camera], background=black).image
         none = torch.zeros(images.shape, dtype=target_types[0], device=device)
         photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_images
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
@@ -21,16 +21,13 @@ from lapgs_plugin.rendering.rig import Rig
 DIVIDER_PIXELS = 2
 
 
-class TimedRasterizer:
+class TimedRasterizer(Rasterizer):
     """A rasterizer that records the milliseconds of each field, in the order of rendering."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._rasterizer = rasterizer
+        self.name = rasterizer.name
         self.laps: list[float] = []
-
-    @property
-    def name(self) -> str:
-        return self._rasterizer.name
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
@@ -39,9 +36,9 @@ class TimedRasterizer:
         return self._rasterizer(field, camera, background=background, sh_degree=sh_degree)
 
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Render and record the time, see `ImageRasterizer`."""
+        """Render and record the time, see `Rasterizer`."""
         begin = time.perf_counter()
-        images = render_images(self._rasterizer, field, cameras, background)
+        images = self._rasterizer.render_images(field, cameras, background=background)
         if images.is_cuda:
             torch.cuda.synchronize(images.device)
         self.laps.append(1e3 * (time.perf_counter() - begin))

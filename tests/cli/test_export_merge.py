@@ -20,6 +20,7 @@ from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.training import merge, stage_start
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
@@ -58,7 +59,7 @@ def test_a_run_that_compensates_exposure_is_compared_with_photos_after_a_colour_
     scene = write_scene(tmp_path / "scene")
     run = write_run(tmp_path / "run", scene)
     identity = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-    (run / "level_0" / "exposure.json").write_text(json.dumps({"0.png": identity}))
+    (run / "level_0" / EXPOSURE).write_text(json.dumps({"0.png": identity}))
     output = lapgs_export(run, "--merge", "--iterations", 2)
     (before,) = re.findall(r"where the run has ([0-9.]+), both after a colour fit", output)
     archive = RunArchive.open(run)

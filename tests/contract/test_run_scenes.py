@@ -203,6 +203,7 @@ def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> Non
         drive_residuals(adapter)
     assert at_first == base
     assert np.abs(np.array(list(base.values())) - np.eye(3, 4)).max() > 0.01, "they were trained"
+    assert archive.exposure(1) is None, "the checkout's, which its render applies, not a compensation of lapgs train"
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)

@@ -9,11 +9,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
-from tests.contract.stub_runs import CHECKOUTS, KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_residuals
+from tests.contract.stub_runs import (
+    CHECKOUTS,
+    KINDS,
+    NAMES,
+    STUBS,
+    THIRDS,
+    captured,
+    drive,
+    loaded,
+    run_hierarchy,
+    run_residuals,
+)
 
 TOTAL = 30_000
 BASE = StageWindow(Stage(1, (400, 300), 10_000, False), 0, TOTAL, 2, 4.0, 1.5)
@@ -222,6 +234,14 @@ def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Pa
     assert given["iterations"] == 90
     for threshold in thresholds:
         assert seen[30][threshold] == 2 * seen[31][threshold]
+
+
+def test_a_nested_level_ends_before_the_reset_that_comes_at_its_end(scene: Path, tmp_path: Path) -> None:
+    more = ("--opacity_reset_interval", 30, "--densify_until_iter", 60)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *more, **THIRDS)
+    assert [record.iterations for record in archive.manifest.records] == [29, 61]
+    opacities = torch.sigmoid(archive.field(1).opacity_logits)
+    assert float(opacities.max()) > 0.05, "a reset leaves 0.01"
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)

@@ -148,6 +148,7 @@ def test_command_writes_everything_it_measured(tmp_path: Path) -> None:
     )
     assert outcome.exit_code == 0, outcome.output
     assert "48x32" in outcome.output
+    assert "per pixel" in outcome.output, "the unit of what is blended"
     written = json.loads(target.read_text())
     assert set(written) == {"machine", "dtype", "cases"}
     assert {"processor", "cores", "threads", "torch", "numba", "gsplat"} <= set(written["machine"])

@@ -172,7 +172,7 @@ def test_match_needs_every_expected_name(gradient: Tensor) -> None:
         assertions.assert_gradients_match({}, {"g": gradient}, BOUNDS)
 
 
-class _Painter:
+class _Painter(scenes.Rasterizer):
     """Rasterize without rendering, with known gradients: the image is the sum of all inputs."""
 
     name = "painter"

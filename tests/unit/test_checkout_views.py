@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -166,6 +167,40 @@ def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo(
     assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), place))[1].unique().tolist() == [0.75]
     assert read == [images.key(camera)]
     assert function(torch.zeros(2, 3), settings(6, 8, torch.ones(3), place))[1].unique().tolist() == [GREY]
+
+
+class WithProjection(NamedTuple):
+    image_height: int
+    image_width: int
+    bg_color: Tensor
+    w2c: Tensor
+    projection: Tensor
+
+
+def test_photos_of_one_pose_are_told_apart_by_their_lenses() -> None:
+    cameras = {key: SimpleNamespace(world_view_transform=torch.eye(4)) for key in ("0-wide", "1-tele")}
+    for factor, camera in enumerate(cameras.values(), 2):
+        camera.full_proj_transform = torch.eye(4) * factor
+    stage = StageRendering(True, ColorPath.NATIVE, cameras, on_image=lambda key, image, below: image)
+    for key, camera in cameras.items():
+        settings = WithProjection(3, 4, torch.ones(3), torch.eye(4), camera.full_proj_transform.clone())
+        assert stage.key(None, settings) == key
+
+
+def test_photos_of_one_camera_are_composed_alike_and_not_mistaken_for_each_other() -> None:
+    cameras = {key: SimpleNamespace(world_view_transform=torch.eye(4)) for key in ("0-day", "1-night")}
+    settings, matters = Settings(3, 4, torch.ones(3), torch.eye(4)), r"day and night have the same camera, .*--masks"
+    stage = StageRendering(True, ColorPath.NATIVE, cameras, composed=frozenset(cameras))
+    assert stage.key(None, settings) in cameras, "their predictions are the same"
+    for options in (
+        {"weights": SimpleNamespace()},
+        {"on_image": lambda key, image, below: image},
+        {"composed": frozenset({"1-night"})},
+    ):
+        stage = replace(stage, **{"weights": None, "on_image": None, **options})
+        with pytest.raises(UserInputError, match=matters):
+            stage.key(None, settings)
+        assert stage.key("0-day", settings) == "0-day", "a renderer was called with it"
 
 
 def test_training_on_a_view_that_is_not_recognised_stops() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, replace
 from typing import Any
@@ -14,7 +14,7 @@ from torch import Tensor
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import compose, to_full_size
@@ -40,7 +40,7 @@ def blobs(seed: int, signed: bool) -> GaussianField:
     )
 
 
-class Constant:
+class Constant(Rasterizer):
     """Render the first SH value of a field's first Gaussian everywhere, and record the calls."""
 
     name = "constant"
@@ -343,11 +343,8 @@ def test_the_level_of_detail_is_the_coarsest_that_is_not_smaller(size: tuple[int
     assert HierarchyRenderer(fields, 3, Pyramid(), OracleRasterizer()).level_for_size(CAMERA, size) == max(level, 1)
 
 
-class ConstantImages(Constant):
-    """The same as an `ImageRasterizer`, which works in the current stream."""
-
-    def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        return torch.stack([self(field, camera, background=background).image for camera in cameras])
+class InCurrentStream(Constant):
+    in_current_stream = True
 
 
 class Streams:
@@ -380,7 +377,7 @@ class Stream:
 
 def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pytest.MonkeyPatch) -> None:
     fields = {2: constant_field(0.4, False), 1: constant_field(-0.25, True), 0: constant_field(0.125, True)}
-    rasterizer, streams = ConstantImages(), Streams()
+    rasterizer, streams = InCurrentStream(), Streams()
     renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
     expected = renderer.render(CAMERA)
     monkeypatch.setattr(FieldRenderer, "device", torch.device("cuda"))

@@ -19,7 +19,7 @@ from lapgs_plugin.evaluation.cases import Case
 from lapgs_plugin.evaluation.conformance import Outcome, Subject, check, check_case
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics
 from lapgs_plugin.reference_raster import OracleRasterizer, oracle
 
 ORACLE = OracleRasterizer()
@@ -45,7 +45,7 @@ def ordinary(signed: bool = False) -> Case:
     return replace(case, field=replace(case.field.with_parameters({"sh": sh}), signed=signed))
 
 
-class Mutant:
+class Mutant(Rasterizer):
     """An oracle with an error: `before` changes its input, `after` its output."""
 
     name = "mutant"

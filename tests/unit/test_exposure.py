@@ -22,6 +22,7 @@ from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.exposure import measure_exposure
@@ -165,9 +166,9 @@ class StopAt(Monitor):
 def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
     settings = TrainSettings(iterations=12, exposure="on", levels=1)
     archive = train(ring_scene(), settings, tmp_path / "run")
-    path = archive.path("level_0", "exposure.json")
+    path = archive.path("level_0", EXPOSURE)
     path.write_text(json.dumps({"view_1.png": [[1.0, 0.0]]}))
-    with pytest.raises(RunFolderError, match=r"exposure\.json.*train again with --overwrite"):
+    with pytest.raises(RunFolderError, match=r"view_colors\.json.*train again with --overwrite"):
         RunArchive.open(tmp_path / "run").exposure(0)
 
 
@@ -269,7 +270,7 @@ def test_evaluation_measures_renders_with_the_predicted_exposure(tmp_path: Path)
     run = write_run(tmp_path / "run", scene)
     plain = evaluate_run(RunArchive.open(run), rasterizer="cpu", lpips=LpipsRequest(()))
     learned = {f"photos/{name}.png": (1.25 * np.eye(3, 4)).tolist() for name in ("01", "07", "09", "10")}
-    (run / "level_0" / "exposure.json").write_text(json.dumps(learned))
+    (run / "level_0" / EXPOSURE).write_text(json.dumps(learned))
     archive = RunArchive.open(run)
     brighter = evaluate_run(archive, rasterizer="cpu", lpips=LpipsRequest(()))
     assert brighter["exposure_predicted"]

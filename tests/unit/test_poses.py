@@ -23,6 +23,7 @@ from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import refined, run_cameras, run_scene
 from lapgs_plugin.runs.archive import Poses, RunArchive
+from lapgs_plugin.runs.layout import POSES
 from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import poses
@@ -174,7 +175,7 @@ def test_archived_corrections_move_training_cameras_and_no_others(tmp_path: Path
     train_before, test_before = run_cameras(RunArchive.open(run))
     name = sorted(train_before)[1]
     moved = {each: [0.0] * 6 for each in train_before} | {name: [0.0, 0.0, 0.0, 0.5, -0.25, 1.0]}
-    (run / "level_0" / "poses.json").write_text(json.dumps(moved))
+    (run / "level_0" / POSES).write_text(json.dumps(moved))
     archive = RunArchive.open(run)
     train_after, test_after = run_cameras(archive)
     shift = train_after[name].position - train_before[name].position
@@ -207,7 +208,7 @@ def test_held_out_views_move_with_their_neighbours_where_corrections_change_slow
 
 def test_damaged_corrections_are_refused(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path))
-    (run / "level_0" / "poses.json").write_text(json.dumps({"01.png": [0.0, 0.0]}))
+    (run / "level_0" / POSES).write_text(json.dumps({"01.png": [0.0, 0.0]}))
     with pytest.raises(RunFolderError, match=r"poses\.json.*train again with --overwrite"):
         run_cameras(RunArchive.open(run))
 

@@ -19,7 +19,7 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import render_transmittance
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_transmittance
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
@@ -218,6 +218,27 @@ def test_the_transmittance_is_there_for_who_asks(signed: bool) -> None:
 def test_settings_that_an_extension_does_not_have_are_refused() -> None:
     with install("taming"), pytest.raises(UserInputError, match="has no setting mult; expected some of"):
         CudaExtension(GRAPHDECO, "cpu", settings={"mult": 0.5})
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_rasterizer_needs_no_more_than_a_call(signed: bool) -> None:
+    class Minimal(Rasterizer):
+        name = "minimal"
+
+        def __call__(self, *inputs: Any, **options: Any) -> RenderResult:
+            return OracleRasterizer()(*inputs, **options)
+
+    case, minimal = scene(signed), Minimal()
+    background, leaves = torch.tensor(case.background), case.with_leaves().field
+    cameras = [case.camera, replace(case.camera, cx=case.camera.cx + 3.0)]
+    expected = CpuRasterizer().render_images(case.field, cameras, background=background)
+    images = minimal.render_images(leaves, cameras, background=background)
+    torch.testing.assert_close(images, expected, rtol=0, atol=1e-5)  # worst seen 1.2e-6
+    assert not images.requires_grad
+    alone = minimal.render_image(leaves, cameras[1], background=background)
+    torch.testing.assert_close(alone.detach(), expected[1], rtol=0, atol=1e-5)
+    assert alone.requires_grad
+    assert [minimal.can_batch, minimal.can_stack, minimal.in_current_stream] == [False] * 3
 
 
 # ----------------------------------------------------------------------------------------------------------- gsplat

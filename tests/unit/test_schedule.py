@@ -121,6 +121,15 @@ def test_a_rare_harmful_event_leaves_the_last_tenth_of_a_stage_alone() -> None:
     assert moved["prune_hard"][-1] == 13_500
 
 
+def test_a_level_does_not_end_right_after_a_rare_harmful_event() -> None:
+    definition = ast.parse(LOOP).body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    schedule, variables = Schedule(definition), {"opt": SimpleNamespace(**OPT)}
+    ends = {end: schedule.before_harm(end, variables, 30_000) for end in (200, 8000, 9000, 9299, 9300, 12_000, 15_000)}
+    # Opacities are reset, or Gaussians pruned, every 3000 iterations, and simplified every 5000.
+    assert ends == {200: 200, 8000: 8000, 9000: 8999, 9299: 8999, 9300: 9300, 12_000: 11_999, 15_000: 14_999}
+
+
 def test_a_stage_as_long_as_the_run_changes_nothing_but_its_last_tenth() -> None:
     as_it_is, _ = trained(None)
     whole, notes = trained(30_000)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering import speed
@@ -20,7 +20,7 @@ from tests.training_scene import blob_field, ring_camera
 SECONDS = {False: 0.002, True: 0.006}
 
 
-class Slow:
+class Slow(Rasterizer):
     """Takes a known time for a base and for a residual."""
 
     name = "slow"

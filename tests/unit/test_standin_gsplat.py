@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.fields.rasterizer import render_image
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as on_cpu
@@ -117,14 +116,14 @@ def test_an_image_alone_has_the_pixels_and_gradients_of_a_call(signed: bool, mon
     background = torch.tensor([0.2, 0.4, 0.6])
     whole, plain = faint(signed).with_leaves(), faint(signed).with_leaves()
     expected = rasterizer(whole.field, whole.camera, background=background, sh_degree=1).image
-    image = render_image(rasterizer, plain.field, plain.camera, background, 1)
+    image = rasterizer.render_image(plain.field, plain.camera, background=background, sh_degree=1)
     assert torch.equal(image, expected)
     for each in (expected, image):
         each.square().sum().backward()
     for name, value in plain.field.parameters.items():
         assert torch.equal(value.grad, whole.field.parameters[name].grad), name
     nobody = plain.field.with_parameters({name: value[:0] for name, value in plain.field.parameters.items()})
-    empty = render_image(rasterizer, nobody, plain.camera, background)
+    empty = rasterizer.render_image(nobody, plain.camera, background=background)
     assert torch.equal(empty, background[:, None, None].expand_as(image))
 
 

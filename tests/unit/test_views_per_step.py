@@ -440,13 +440,16 @@ def test_views_of_several_sizes_are_rendered_by_size(tmp_path: Path) -> None:
         train=(*lying.train[:4], *(replace(view, name="up_" + view.name) for view in upright.train[:2])),
     )
     settings = replace(
-        SETTINGS, levels=1, views_per_step="6", iterations=24, sh_every=99, densification=Densification(until=0)
+        SETTINGS,
+        **{"levels": 1, "views_per_step": "6", "iterations": 24, "sh_every": 99, "prune": 0.01},
+        densification=Densification(until=0),
     )
     lines, batching = Lines(), Batching()
     train(tmp_path / "run", mixed, settings, batching, monitor=lines)
     # Two whole epochs come before anything ends a step early.
     assert {(count, size) for count, size, _ in batching.asked[:4]} == {(4, (56, 40)), (2, (40, 56))}
     assert any("the training views have 2 sizes, and those of one size are rendered together" in x for x in lines.lines)
+    assert "--prune 0.01: level 0 is not pruned: no densification ends in its iterations" in lines.lines
 
 
 def test_launches_stay_small_where_images_are_large(

@@ -43,9 +43,9 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
     if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
         return upsample(pyramid, coarse, size) + fine
     if _fits_numba(fine):
-        from lapgs_plugin.ops.upsample.in_numba import upsample_add_cpu
+        from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
 
-        return upsample_add_cpu(pyramid, coarse, fine)
+        return upsample_cpu(pyramid, coarse, size, fine)
     return pyramid.up(coarse, size) + fine
 
 

@@ -121,21 +121,13 @@ def _kernel(
     keep_alive(padded)
 
 
-def upsample_add_cpu(pyramid: Pyramid, coarse: Tensor, fine: Tensor) -> Tensor:
-    """Do `upsample_add` for float32 or float64; the same bits for any number of threads."""
-    added = _planes(fine)
-    out = empty(added.size, added.dtype).reshape(added.shape)
-    rows, columns = (_taps(pyramid.grid, side, fine.dtype) for side in fine.shape[-2:])
-    _launch(_planes(coarse), added, True, rows, columns, out)
-    return torch.from_numpy(out).view(fine.shape)
-
-
-def upsample_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """Do `upsample` without its gradient; the same bits for any number of threads."""
+def upsample_cpu(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int], fine: Tensor | None = None) -> Tensor:
+    """Do `upsample`, or `upsample_add` given `fine`, without gradient; the same bits for any number of threads."""
     source = _planes(coarse)
     out = empty(len(source) * size[0] * size[1], source.dtype).reshape(len(source), *size)
+    added = out if fine is None else _planes(fine)
     rows, columns = (_taps(pyramid.grid, side, coarse.dtype) for side in size)
-    _launch(source, out, False, rows, columns, out)
+    parallel(_kernel, source, added, fine is not None, rows.first, rows.weights, columns.across, out)
     return torch.from_numpy(out).view(*coarse.shape[:-2], *size)
 
 
@@ -157,7 +149,3 @@ def _taps(grid: str, size: int, dtype: torch.dtype) -> _Taps:
     first, weights = Pyramid(grid).up_taps(size)
     values = weights.to(dtype).numpy()
     return _Taps(first.numpy(), values, across_weights(first.numpy(), values))
-
-
-def _launch(coarse: Floats, fine: Floats, adds: bool, rows: _Taps, columns: _Taps, out: Floats) -> None:
-    parallel(_kernel, coarse, fine, adds, rows.first, rows.weights, columns.across, out)

@@ -19,7 +19,14 @@ from lapgs_plugin.environment import gsplat_built
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import FieldStack, RenderResult, Semantics, degree_to_evaluate, require_color
+from lapgs_plugin.fields.rasterizer import (
+    FieldStack,
+    Rasterizer,
+    RenderResult,
+    Semantics,
+    degree_to_evaluate,
+    require_color,
+)
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
@@ -59,7 +66,7 @@ def missing() -> str:
     return "" if built or CUDA_HOME else "gsplat's CUDA part is not built, and there is no nvcc to build it"
 
 
-class GsplatRasterizer:
+class GsplatRasterizer(Rasterizer):
     """Render float32 fields on a CUDA device with gsplat and the conventions of the 3DGS family.
 
     If its CUDA part is not built yet, gsplat compiles it in the first call, which takes minutes.
@@ -77,6 +84,9 @@ class GsplatRasterizer:
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
     """
+
+    name = NAME
+    in_current_stream = True
 
     def __init__(
         self,
@@ -96,10 +106,6 @@ class GsplatRasterizer:
         self._may_be_direct = self._device.type == "cuda" and not (packed or antialiasing) and direct is not False
         self._must_be_direct = bool(direct)
         self._cameras = CameraCache()
-
-    @property
-    def name(self) -> str:
-        return NAME
 
     @property
     def semantics(self) -> Semantics:
@@ -123,7 +129,7 @@ class GsplatRasterizer:
 
     @property
     def can_batch(self) -> bool:
-        """See `fields.rasterizer.BatchRasterizer`. Packed results have no row for each camera and Gaussian."""
+        """See `fields.rasterizer.Rasterizer`. Packed results have no row for each camera and Gaussian."""
         return self._device.type == "cuda" and not self._stock.packed
 
     def render_batch(
@@ -135,7 +141,7 @@ class GsplatRasterizer:
         sh_degree: int | None = None,
         describes: bool = True,
     ) -> RenderResult:
-        """Render several cameras in one set of launches; see `fields.rasterizer.BatchRasterizer`."""
+        """Render several cameras in one set of launches; see `fields.rasterizer.Rasterizer`."""
         if describes:
             return self._render(field, cameras, background, sh_degree)
         image = self._images(field, cameras, background, sh_degree)
@@ -145,12 +151,12 @@ class GsplatRasterizer:
     def render_image(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> Tensor:
-        """Render the image without radii, centres and transmittance; see `fields.rasterizer.PlainRasterizer`."""
+        """Render the image without radii, centres and transmittance; see `fields.rasterizer.Rasterizer`."""
         return self._images(field, [camera], background, sh_degree)
 
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
-        """Render images of several cameras together; see `fields.rasterizer.ImageRasterizer`."""
+        """Render images of several cameras together; see `fields.rasterizer.Rasterizer`."""
         if len(field) == 0 or (len(cameras) == 1 and self._calls_kernels(field)):
             images = self._images(field, cameras, background, None)
             return images[None] if len(cameras) == 1 else images
@@ -158,13 +164,13 @@ class GsplatRasterizer:
 
     @property
     def can_stack(self) -> bool:
-        """See `fields.rasterizer.StackingRasterizer`. The stack calls functions of gsplat 1.5."""
+        """See `fields.rasterizer.Rasterizer`. The stack calls functions of gsplat 1.5."""
         from gsplat import spherical_harmonics
 
         return self._device.type == "cuda" and not self._stock.packed and not takes_viewmats(spherical_harmonics)
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
-        """Copy several fields to render them together; see `fields.rasterizer.StackingRasterizer`."""
+        """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
         direct = self._calls_kernels(*fields) and stacking_works()
         return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
 
