@@ -220,7 +220,7 @@ def test_a_heic_photo_that_is_cut_short_is_one_line(tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole.heic", tmp_path / "cut.heic"
     Image.fromarray(WALL[:64, :96]).save(whole)
     cut.write_bytes(whole.read_bytes()[:-200])
-    with pytest.raises(SceneError, match=r"cut\.heic: the photo cannot be decoded \([^\\]+\); copy"):  # no escaped newline
+    with pytest.raises(SceneError, match=r"cut\.heic: the photo cannot be decoded \([^\\]+\); copy"):  # no newline
         photos_module.convert_heic(cut, tmp_path / "cut.jpg")
 
 
