@@ -237,13 +237,26 @@ def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypa
         find_photos(noise)
 
 
+def test_webp_photos_become_jpeg_files_which_colmap_reads(
+    tmp_path: Path, noise: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.fromarray(WALL[:64, :96]).save(noise / "3.webp", quality=95)
+    _stopping_before_colmap(noise, tmp_path / "scene", monkeypatch)
+    photo = tmp_path / "scene" / ".prepare" / "photos" / "3.jpg"
+    read = pycolmap.Bitmap.read(str(photo), as_rgb=True)
+    assert np.abs(read.to_array().astype(np.float64) - WALL[:64, :96]).mean() < 16  # seen 8.4
+    Image.new("RGBA", (96, 64), (9, 9, 9, 0)).save(noise / "4.webp")
+    with pytest.raises(SceneError, match=r"4\.webp: a WebP photo with transparency"):
+        photos_module.convert_photo(noise / "4.webp", tmp_path / "4.jpg")
+
+
 def test_a_heic_photo_that_is_cut_short_is_one_line(tmp_path: Path) -> None:
     pillow_heif.register_heif_opener()
     whole, cut = tmp_path / "whole.heic", tmp_path / "cut.heic"
     Image.fromarray(WALL[:64, :96]).save(whole)
     cut.write_bytes(whole.read_bytes()[:-200])
     with pytest.raises(SceneError, match=r"cut\.heic: the photo cannot be decoded \([^\\]+\); copy"):  # no newline
-        photos_module.convert_heic(cut, tmp_path / "cut.jpg")
+        photos_module.convert_photo(cut, tmp_path / "cut.jpg")
 
 
 def test_files_that_are_no_photos_are_named(noise: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,16 +11,16 @@ from typing import Any
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size
-from lapgs_plugin.scenes.masks import HEIC, alpha_mask, find_masks, read_mask, refuse_photos, write_mask
+from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_photos, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import camera_of, convert_heic
+from lapgs_plugin.scenes.prepare.photos import CONVERTED, camera_of, convert_photo
 
 logger = logging.getLogger(__name__)
 
 
 def make_photos(job: Job) -> None:
-    """Write frames of the video, or copies of the photos with JPEG files for those in HEIC, if COLMAP needs them."""
+    """Write frames of the video, or copies of the photos with HEIC and WebP as JPEG files, if COLMAP needs them."""
     found, folder = job.found, job.work / "photos"
     if not found.made or folder.is_dir():
         return
@@ -34,12 +34,12 @@ def make_photos(job: Job) -> None:
             write_frames(found.clip, numbers, partial, seen)
         logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
     else:
-        heic = [name for name, source in found.files.items() if source.suffix.lower() in HEIC]
+        others = [name for name, source in found.files.items() if source.suffix.lower() in CONVERTED]
         for name, source in found.files.items():
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
-            if name not in heic:
+            if name not in others:
                 shutil.copy2(source, partial / name)
-        job.each_photo("Reading HEIC photos", lambda name: convert_heic(found.files[name], partial / name), heic)
+        job.each_photo("Converting photos", lambda name: convert_photo(found.files[name], partial / name), others)
     partial.rename(folder)
 
 
@@ -82,7 +82,7 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
 
     def size(name: str) -> tuple[int, int]:
         photo = job.found.files.get(name, job.photos / name)  # errors name the user's file, not our copy
-        if photo.suffix.lower() in HEIC:
+        if photo.suffix.lower() in CONVERTED:
             photo = job.photos / name
         width, height = check_image(photo)
         longest = max(width, height)

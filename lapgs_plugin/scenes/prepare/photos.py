@@ -21,6 +21,9 @@ SHOWN = 10
 MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 271, 272, 0x8769, 37386, 41989
 """Tags of EXIF."""
 
+CONVERTED = (*HEIC, ".webp")
+"""Photos that COLMAP, as pycolmap brings it, does not read."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -30,7 +33,7 @@ class Photos:
 
     Attributes:
         folder: of the files.
-        files: by the name that COLMAP gets, sorted: relative to the folder; of HEIC photos that of their JPEG.
+        files: by the name that COLMAP gets, sorted: relative to the folder; of HEIC and WebP photos that of their JPEG.
         clip: the video, if frames are to be picked from one; `files` is empty then.
     """
 
@@ -41,7 +44,7 @@ class Photos:
     @property
     def made(self) -> bool:
         """Whether COLMAP cannot read the files where they are."""
-        return self.clip is not None or any(path.suffix.lower() in HEIC for path in self.files.values())
+        return self.clip is not None or any(path.suffix.lower() in CONVERTED for path in self.files.values())
 
 
 def find_photos(source: Path, masks: Path | None = None) -> Photos:
@@ -87,7 +90,7 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     files: dict[str, Path] = {}
     for file in chosen:
         place = file.relative_to(source)
-        name = (place.with_suffix(".jpg") if file.suffix.lower() in HEIC else place).as_posix()
+        name = (place.with_suffix(".jpg") if file.suffix.lower() in CONVERTED else place).as_posix()
         if (other := files.setdefault(name, file)) != file:
             raise _same_name(source, other, file, name)
     by_target: dict[str, Path] = {}
@@ -114,20 +117,23 @@ def listed(names: list[str]) -> str:
     return printable(", ".join(names[:SHOWN])) + more
 
 
-def convert_heic(source: Path, target: Path) -> None:
-    """Write a HEIC photo as JPEG, upright, with its EXIF data, which hold the focal length.
+def convert_photo(source: Path, target: Path) -> None:
+    """Write a HEIC or WebP photo as JPEG, HEIC upright, with its EXIF data, which hold the focal length.
 
     Raises:
-        SceneError: it cannot be decoded.
+        SceneError: it cannot be decoded, or is a WebP file with transparent pixels, which JPEG cannot keep.
     """
-    import pillow_heif
+    if source.suffix.lower() in HEIC:
+        import pillow_heif
 
-    pillow_heif.register_heif_opener()
+        pillow_heif.register_heif_opener()
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with Image.open(source) as photo:
             width, height = photo.size
             PHOTO_PIXELS.check(width * height, f"{source}: {width}x{height} pixels", "make it smaller", SceneError)
+            if photo.format == "WEBP" and photo.has_transparency_data:
+                raise SceneError(f"{source}: a WebP photo with transparency, expected none in WebP; convert it to PNG")
             exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
             photo.convert("RGB").save(target, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", exif=exif)
     except SceneError:
