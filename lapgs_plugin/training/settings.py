@@ -47,6 +47,10 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that are fields of the manifest itself."""
 
 
+PASSES = 300
+"""Passes over few training photos in a run whose iterations are left open; more of them gain little."""
+
+
 @dataclass(frozen=True)
 class LearningRates:
     """Set Adam's step sizes, by default 3DGS's. Those of positions are in units of the scene's extent."""
@@ -146,7 +150,10 @@ class TrainSettings(HierarchySettings):
     __pydantic_config__: ClassVar[Any] = STRICT
 
     iterations: int = option(
-        REFERENCE_ITERATIONS, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS,
+        "Views trained on, all stages together. The 3DGS schedule shrinks with it. If it is left out, fewer than "
+        f"{REFERENCE_ITERATIONS // PASSES} training photos get {PASSES} for each, but at least {LONG_RUN}.",
+        least=1,
     )
     gather: int = option(
         8,
@@ -289,6 +296,17 @@ class TrainSettings(HierarchySettings):
             for each in fields(owner)
             if each.name in strategy.unused and getattr(owner, each.name) not in (each.default, 0)
         ]
+
+    def for_photos(self, count: int) -> TrainSettings:
+        """Return settings with `PASSES` over few training photos, but no shorter than a long run.
+
+        Settings of the paper, and of a schedule in iterations of the run, stay.
+        """
+        enough, control = max(LONG_RUN, PASSES * count), self.densification
+        timed = any(each is not None for each in (control.start, control.until, control.reset_every))
+        if enough >= self.iterations or timed or self.protocol == "paper":
+            return self
+        return replace(self, iterations=enough)
 
     @property
     def scheduled(self) -> int:
