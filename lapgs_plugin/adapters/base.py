@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.script import Script
+from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError, typed_line
 from lapgs_plugin.hierarchy.plan import Hierarchy
@@ -166,8 +167,15 @@ class BackboneAdapter(ABC):
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        """Return whether `folder` is the root of a checkout of this backbone."""
-        return cls.info.recognises(folder)
+        """Return whether `folder` is the root of a checkout of this backbone.
+
+        A fork that kept a file of this one but renders with other settings is not.
+        """
+        if not cls.info.recognises(folder):
+            return False
+        source = readable_source(folder)
+        passed = set[str]() if source is None else {name for use in source.rasterizers for name in use.settings}
+        return not passed or passed >= cls.info.raster_defaults.keys()
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
@@ -176,8 +184,14 @@ class BackboneAdapter(ABC):
         Args:
             checkout: root of the checkout.
             arguments: arguments of its script.
+
+        Raises:
+            MissingExtraError: there is none; the line says what the checkout's calls have that stand-ins lack.
         """
-        return cls.info.stand_in
+        from lapgs_plugin.checkouts.stand_in import require_stand_in
+        from lapgs_plugin.reference_raster.standins import variant_for
+
+        return require_stand_in(cls.info.stand_in or variant_for(checkout), checkout)
 
     @classmethod
     def rasterizer_semantics(cls) -> Semantics | None:

@@ -5,14 +5,10 @@ Other adapters derive from this one and say only what is particular about their 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
-from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,26 +26,6 @@ class Adapter(BackboneAdapter):
     info = BackboneInfo(
         name="generic", title="3DGS, a checkout of its own", rasterizer="diff_gaussian_rasterization", stand_in=""
     )
-
-    @classmethod
-    def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        """Return the stand-in that offers what the checkout imports, and takes what it passes.
-
-        Raises:
-            MissingExtraError: there is none; the line names the rasterizer, and the place where it is imported.
-        """
-        from lapgs_plugin.reference_raster.standins import variant_for
-
-        found = cls.info.stand_in or variant_for(checkout)
-        if found:
-            return found
-        source = readable_source(checkout)
-        assert source is not None, "recognised by it"
-        raise MissingExtraError(
-            f"no CPU stand-in for {', '.join(source.rasterizer_modules) or 'a rasterizer'}, which "
-            f"{', '.join(use.where for use in source.rasterizers) or 'the checkout'} imports, with the settings and "
-            "inputs that the checkout passes; it needs a CUDA device"
-        )
 
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
         # Exposure is left out: images are taken before it is applied.
@@ -70,15 +46,3 @@ class Adapter(BackboneAdapter):
         import torch
 
         return {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
-
-
-def readable_source(folder: Path) -> CheckoutSource | None:
-    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
-    for script in training_scripts(folder):
-        try:
-            source = CheckoutSource.read(script)
-        except UserInputError:
-            continue
-        if source.root == folder.absolute():
-            return source
-    return None

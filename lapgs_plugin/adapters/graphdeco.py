@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from lapgs_plugin.adapters import generic
 from lapgs_plugin.adapters.base import BackboneInfo
-from lapgs_plugin.adapters.generic import readable_source
+from lapgs_plugin.checkouts.source import readable_source
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.rasterizer import Semantics
@@ -61,12 +61,14 @@ class Adapter(generic.Adapter):
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
+        from lapgs_plugin.checkouts.stand_in import require_stand_in
         from lapgs_plugin.reference_raster.standins import FORKS, variant_for
 
         renderer = checkout / "gaussian_renderer" / "__init__.py"
         newer = "antialiasing" in renderer.read_text(encoding="utf-8", errors="replace")
         found = variant_for(checkout)
         if found in FORKS:
-            return found
+            return require_stand_in(found, checkout)
         wants_sparse_adam = any(argument.rpartition("=")[2] == "sparse_adam" for argument in arguments)
-        return "graphdeco" if not newer else "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in
+        chosen = "graphdeco" if not newer else "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in
+        return require_stand_in(chosen, checkout)

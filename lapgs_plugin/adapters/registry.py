@@ -11,7 +11,7 @@ from pathlib import Path
 from lapgs_plugin import adapters
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.generic import Adapter as GenericAdapter
-from lapgs_plugin.adapters.generic import readable_source
+from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.registry import Registry
 

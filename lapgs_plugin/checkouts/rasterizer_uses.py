@@ -44,13 +44,24 @@ def uses_of_rasterizers(name: str, path: Path, root: Path, modules: Mapping[str,
     found: dict[str, RasterizerUse] = {}
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         local = _aliases(ast.walk(function))
-        scope = {key: alias for key, alias in {**top, **local}.items() if alias.module not in modules}
+        scope = {key: alias for key, alias in {**top, **local}.items() if not _wraps(modules.get(alias.module))}
         used = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and node.id in scope}
         for module in dict.fromkeys(scope[key].module for key in sorted(used)):
             own = {key: scope[key] for key in used if scope[key].module == module}
             use = _use(name, path, root, function, own, any(key in local for key in own))
             found[module] = _merged(found[module], use) if module in found else use
     return list(found.values())
+
+
+def _wraps(path: Path | None) -> bool:
+    """Return whether a module, whose file is that if it is one of the checkout's, only uses rasterizers.
+
+    The binding of a rasterizer that the checkout contains, and compiles when it is imported, is one.
+    """
+    if path is None:
+        return False
+    imports = (node for node in ast.walk(parsed_quietly(path)) if isinstance(node, ast.ImportFrom))
+    return not any(alias.name == "_C" for node in imports for alias in node.names)
 
 
 @dataclass(frozen=True)

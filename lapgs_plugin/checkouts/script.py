@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, ModuleType, TracebackType
 
 from lapgs_plugin.checkouts.syntax import parsed
 from lapgs_plugin.errors import UserInputError
@@ -33,6 +33,16 @@ class Script:
     def run_main(self) -> None:
         """Execute the main block. Its exceptions, including SystemExit and KeyboardInterrupt, are passed on."""
         exec(self._main, self.module.__dict__)
+
+
+def frames_of_script(error: BaseException) -> TracebackType | None:
+    """Return the part of an exception's traceback that begins in a script; None if no script was executed."""
+    frames = error.__traceback__
+    while frames is not None and frames.tb_frame.f_code.co_filename != __file__:
+        frames = frames.tb_next
+    while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
+        frames = frames.tb_next
+    return frames
 
 
 def require_script(path: Path) -> Path:

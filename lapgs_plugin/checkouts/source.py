@@ -133,6 +133,15 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
+    def unknown_attributes(self, names: Iterable[str]) -> list[str]:
+        """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
+        trees = [parsed_quietly(path) for path in self.modules.values()]
+        classes = {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
+        if not _methods(classes[self.model[0]], classes)[1]:
+            return []
+        known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        return [name for name in names if name not in known]
+
     @property
     def rasterizer_modules(self) -> tuple[str, ...]:
         """Modules of rasterizers, in the order in which they are imported."""
@@ -152,6 +161,18 @@ def training_scripts(folder: Path) -> list[Path]:
     """Return files of a folder, and of the folders in it, that may be training scripts: `train.py` first."""
     found = [*folder.glob("train*.py"), *folder.glob("*/train*.py")]
     return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
+
+
+def readable_source(folder: Path) -> CheckoutSource | None:
+    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+    for script in training_scripts(folder):
+        try:
+            source = CheckoutSource.read(script)
+        except UserInputError:
+            continue
+        if source.root == folder.absolute():
+            return source
+    return None
 
 
 def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:

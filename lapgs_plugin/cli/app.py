@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+import traceback
 from typing import Annotated, Any
 
 import typer
@@ -101,9 +102,20 @@ _flowing_help(app)
 
 
 def run() -> None:
-    """Run the command line; a `LapgsError` becomes one line on stderr and its exit code."""
+    """Run the command line; a `LapgsError` becomes one line on stderr and its exit code.
+
+    The traceback of an exception in a checkout's script begins there, as if Python ran the script.
+    """
     try:
         app(prog_name="lapgs")
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
         sys.exit(interrupt.exit_code(error.exit_code))
+    except Exception as error:
+        from lapgs_plugin.checkouts.script import frames_of_script
+
+        frames = frames_of_script(error)
+        if frames is None:
+            raise
+        traceback.print_exception(type(error), error, frames)
+        sys.exit(1)

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, require_place
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
-from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
     from lapgs_plugin.experiments.commands import Locations
@@ -92,7 +91,7 @@ def _run(
 
     if not settings.dry_run:
         check_launcher(settings.engine)
-        _require_place(folder.path)
+        require_place(folder.path)
     selection = settings.selection
     scenes = scenes_of(experiment, selection)
     measuring = _measuring(settings)
@@ -117,24 +116,6 @@ def _option_names() -> dict[str, set[str]]:
         name: {p for p in function.__annotations__ if p not in ("return", "context")} - SET_BY_EXPERIMENTS
         for name, function in functions.items()
     }
-
-
-def _require_place(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written.
-
-    Raises:
-        UserInputError: it is a file or below one, or it is not writable.
-    """
-    existing = str(folder.absolute())
-    # Not Path.exists, which raises where a name is too long for the file system.
-    while not os.path.lexists(existing):
-        if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
-            raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
-        existing = os.path.dirname(existing)  # noqa: PTH120
-    if not os.path.isdir(existing):  # noqa: PTH112
-        raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
 def _measuring(settings: BenchSettings) -> list[str] | None:

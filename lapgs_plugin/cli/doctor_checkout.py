@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
@@ -40,7 +41,8 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             *(Finding("Other scripts", "ok", text) for text in more),
             Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
         ],
-        "Rasterizers": [_rasterizer(use) for use in source.rasterizers] or [Finding("none", "problem", unused)],
+        "Rasterizers": [_rasterizer(use, use.module in source.modules) for use in source.rasterizers]
+        or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
         "lapgs run": [*_kinds(source), _stand_in(source)],
@@ -71,9 +73,11 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     return found[names[0]], names[1:]
 
 
-def _rasterizer(use: RasterizerUse) -> Finding:
+def _rasterizer(use: RasterizerUse, own: bool) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
+    if own:
+        return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):
         return Finding(use.module, "ok", detail)
     return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
@@ -96,6 +100,10 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:
+    own = adapter_class(source.root).snapshot is not BackboneAdapter.snapshot
+    if not own and (absent := source.unknown_attributes(PARAMETERS)):
+        why = f"its Gaussians ({source.model[1]}) have no {', '.join(absent)}, from which fields are archived"
+        return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     if (several := source.image_scales) is not None:
         why = f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.cli.output import require_place
 from lapgs_plugin.cli.rendering import refuse
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
@@ -90,6 +91,7 @@ def export(
 
     archive = RunArchive.open(run)
     folder = archive.path(EXPORT) if settings.out is None else settings.out
+    require_place(folder)
     if settings.html or settings.merge:
         _write_one(archive, settings, folder)
     else:

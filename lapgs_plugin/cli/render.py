@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, require_place
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
@@ -153,6 +153,7 @@ def _write_clip(
         raise UserInputError(f"--out {out}: expected an {VIDEO} file or a folder for images")
     if is_video(out) and settings.image_format != PNG:
         raise UserInputError(f"--format {settings.image_format}: a video has 8 bits; give --out a folder")
+    require_place(out.parent if is_video(out) else out)
     if not is_video(out):
         refuse({"--frame-rate": settings.frame_rate}, f"needs an {VIDEO} file as --out")
     render_clip(
@@ -216,6 +217,7 @@ def _write_views(
     from lapgs_plugin.runs.layout import RENDERS
 
     folder = archive.path(RENDERS) if settings.out is None else settings.out
+    require_place(folder)
     for split, chosen in _choose(run_scene(archive, scene), settings.views).items():
         _write_split(renderer, chosen, level, folder / split, settings)
     print(f"{folder} holds the images")

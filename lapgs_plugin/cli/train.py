@@ -13,10 +13,10 @@ import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import ConfigOption, extend_config, write_config
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import make_console, require_place
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option, option_values
 from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
@@ -113,7 +113,7 @@ def train(
         write_config(archive.path(RUN_CONFIG), context, masks=reference.masks, iterations=settings.iterations)
     with archive:
         _run(archive, loaded, settings, control, resume=start.resume, watcher=watcher)
-    _finish(out)
+    _finish(out, scene)
 
 
 def _reference(scene: Path, photos: SceneOptions) -> SceneReference:
@@ -140,11 +140,11 @@ def _require_measuring(settings: TrainSettings, control: TrainingControl) -> Non
         require_cuda(training_rasterizer(choose_rasterizer(control.rasterizer), settings).device)
 
 
-def _finish(out: Path) -> None:
-    """Render a preview of the run, and say what can be done with it."""
+def _finish(out: Path, scene: Path) -> None:
+    """Render a preview of the run from its scene's folder, and say what can be done with it."""
     from rich.markup import escape
 
-    keep_preview(out.absolute())
+    keep_preview(out.absolute(), scene=scene)
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
@@ -182,12 +182,16 @@ def _resume(
     Raises:
         UserInputError: the scene or an option differs from those that the run was started with.
     """
-    from lapgs_plugin.files import MANIFEST
+    from lapgs_plugin.files import MANIFEST, one_line_errors
     from lapgs_plugin.rendering.run import load_reference, require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
     from lapgs_plugin.training.planning import check_storage
 
+    with one_line_errors(out, "read"):
+        begun = (out / MANIFEST).is_file()
+    if not begun:
+        raise RunFolderError(f"{out} is not a run, so there is nothing to continue; leave --resume out to start one")
     archive = RunArchive.open(out, resume=True)
     try:
         manifest = archive.manifest
@@ -273,6 +277,7 @@ def _create(
     from lapgs_plugin.training.planning import check_storage, make_plan, require_pruning
 
     RunArchive.require_room(out, overwrite)
+    require_place(out)
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = load_reference(reference)

@@ -94,15 +94,16 @@ def watching(options: ViewOptions, label: str, device: str = "auto") -> Iterator
         yield LiveView(page, device)
 
 
-def keep_preview(run: Path, device: str = "auto") -> None:
+def keep_preview(run: Path, device: str = "auto", scene: Path | None = None) -> None:
     """Render a preview of a trained run, which `lapgs view` shows first. A failure is only logged.
 
     Args:
         run: the run folder.
         device: where to render.
+        scene: the scene's folder, if it was moved.
     """
     from lapgs_plugin.jit.threads import one_pool
     from lapgs_plugin.viewer.preview import save_run_preview
 
     with one_pool():
-        save_run_preview(run, device)
+        save_run_preview(run, device, scene)

@@ -96,7 +96,7 @@ def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
         PatchError: an edit does not fit the sources; the message names the place and the expected code.
     """
     changes, problems = _try_apply(target, sets)
-    _refuse(target, problems)
+    _refuse(target, problems, "; a rasterizer that differs needs a recipe of its own, see patches/README.md")
     return changes
 
 
@@ -186,10 +186,10 @@ def _changes(target: Target, before: dict[str, str], after: dict[str, str]) -> t
     )
 
 
-def _refuse(target: Target, problems: Sequence[str]) -> None:
+def _refuse(target: Target, problems: Sequence[str], advice: str = "") -> None:
     if problems:
         more = f" (and {len(problems) - 1} more, see `lapgs patch status`)" if len(problems) > 1 else ""
-        raise PatchError(f"{target.folder} ({target.recipe.title}): {problems[0]}{more}; nothing was changed")
+        raise PatchError(f"{target.folder} ({target.recipe.title}): {problems[0]}{more}; nothing was changed{advice}")
 
 
 def _damage(file: str, source: str, sets: Collection[str]) -> list[str]:

@@ -21,11 +21,13 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
+from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
@@ -41,6 +43,9 @@ MOST_POINTS = 20_000
 
 SAME_COLOR = 1e-3
 """Largest difference of two images of one field: rounding gives 1e-6, a wrong colour map about 1."""
+
+SAME_VALUE = 1e-3
+"""Largest relative difference of a scale or opacity from the archived one: logits and logarithms round to 1e-6."""
 
 NATIVE_COEFFICIENTS = 15
 """SH coefficients above the first that a rasterizer may read when it does not know the flag of signed colour."""
@@ -71,6 +76,7 @@ class DryRun:
         self._context, self._scene, self._plan, self._activate = context, scene, plan, activate
         self._adapter = context.adapter
         self._call = call
+        self._inputs: Mapping[str, Any] = {}
         self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
         # Residuals ask for more than other stages do.
         self._stage = next((stage for stage in plan if stage.signed), next(iter(plan)))
@@ -96,11 +102,13 @@ class DryRun:
                 self._context, self._scratch_call(folder), self._scene, self._view, rendering, self._window
             )
             self._iterate(stage, works)
+            self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
             with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
                 image = self._render(view, stage.gaussians)
             with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
                 field = self._adapter.export_field(stage.gaussians, signed=False)
+            self._compare(field)
             if self._stage.signed:
                 with self._step("a model made from a finished field", "one that renders", NESTED_WORKS):
                     self._render(view, self._adapter.model_of(stage.call, field))
@@ -115,6 +123,7 @@ class DryRun:
         with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            self._require_parameters(gaussians)
             self._require_three_axes(gaussians)
             gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
@@ -182,7 +191,44 @@ class DryRun:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
         background = torch.zeros(3, device=self._context.device)
-        return self._context.render(rendering, self._call, view, gaussians, background)
+        image = self._context.render(rendering, self._call, view, gaussians, background)
+        self._inputs = rendering.inputs
+        return image
+
+    def _compare(self, field: GaussianField) -> None:
+        """Compare a field with what the checkout's rasterizer got for its model.
+
+        Raises:
+            UserInputError: they differ, and a residual would be added to another image than the checkout's.
+        """
+        rendered = {
+            "positions": ("means3D", field.means),
+            "scales": ("scales", field.log_scales.exp()),
+            "opacities": ("opacities", field.opacity_logits.sigmoid()[:, None]),
+        }
+        differ = [what for what, (name, value) in rendered.items() if not _alike(self._inputs.get(name), value)]
+        if not differ:
+            return
+        problem = (
+            f"{self._adapter.profile.source.model[1]}: the checkout renders other {' and '.join(differ)} than its "
+            "model has as parameters, from which fields are archived"
+        )
+        mend = "an adapter whose snapshot() returns what is rendered mends it (docs/extending.md)"
+        if self._stage.signed:
+            raise UserInputError(f"{problem}; expected the same, to which a residual is added; {mend}, {NESTED_WORKS}")
+        logger.warning(
+            "%s: lapgs eval, render and view show other images than the checkout's own render; %s", problem, mend
+        )
+
+    def _require_parameters(self, gaussians: Any) -> None:
+        """Refuse a model that lacks what a field has, unless its adapter makes fields otherwise."""
+        if type(self._adapter).snapshot is not BackboneAdapter.snapshot:
+            return
+        if absent := [name for name in PARAMETERS if not hasattr(gaussians, name)]:
+            raise UserInputError(
+                f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(PARAMETERS)}; the model "
+                f"has no {', '.join(absent)}; {OFF}"
+            )
 
     def _require_three_axes(self, gaussians: Any) -> None:
         place, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]
@@ -304,6 +350,14 @@ class _Nothing:
     def get(self, key: str) -> Tensor:
         width, height = self._sizes[key]
         return torch.zeros(3, height, width, device=self._device)
+
+
+def _alike(given: Any, value: Tensor) -> bool:
+    """Return whether an input of a rasterizer has the values of a field; True if it cannot be compared."""
+    if not isinstance(given, Tensor) or given.ndim != 2 or len(given) != len(value):
+        return True
+    axes = min(given.shape[1], value.shape[1])  # flat Gaussians have two scales, and get a third one in fields
+    return torch.allclose(given[:, :axes].detach(), value[:, :axes], rtol=SAME_VALUE, atol=SAME_VALUE**2)
 
 
 def _some(points: Any) -> Any:

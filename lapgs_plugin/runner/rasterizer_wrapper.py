@@ -28,12 +28,14 @@ class RasterizerWrapper:
     Attributes:
         stage: the running stage; None leaves every call unchanged.
         noted: key of the view that is being rendered; None outside of the renderers, and for other cameras.
+        given: values of each Gaussian (n, k) that the renderer was called with, such as colours to render instead.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
     """
 
     def __init__(self) -> None:
         self.stage: StageRendering | None = None
         self.noted: str | None = None
+        self.given: tuple[Tensor, ...] = ()
         self.mark: Callable[[str], None] = lambda part: None
         self._zeros: Tensor | None = None
 
@@ -42,12 +44,13 @@ class RasterizerWrapper:
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
-            outer = self.noted
-            self.noted = next((key for v in (*args, *kwargs.values()) if (key := view_key(v)) is not None), outer)
+            outer, given = (self.noted, self.given), (*args, *kwargs.values())
+            self.noted = next((key for v in given if (key := view_key(v)) is not None), self.noted)
+            self.given = (*self.given, *(v for v in given if isinstance(v, Tensor) and v.ndim == 2))
             try:
                 return original(*args, **kwargs)
             finally:
-                self.noted = outer
+                self.noted, self.given = outer
 
         return render
 
@@ -78,12 +81,12 @@ class RasterizerWrapper:
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = original(*args, **kwargs)
-            stage, noted = self.stage, self.noted
+            stage, noted, given = self.stage, self.noted, self.given
             if stage is None:
                 return made
             settings = next(iter((*args, *kwargs.values())), None)
             return WrappedRasterizer(
-                made, lambda call, inputs: stage.render(self._marking(call), inputs, settings, noted)
+                made, lambda call, inputs: self._render(stage, call, inputs, settings, noted, given)
             )
 
         return make_rasterizer
@@ -95,9 +98,24 @@ class RasterizerWrapper:
                 return original(*args, **kwargs)
             inputs = named_inputs(original, args, kwargs)
             settings = next((value for name, value in inputs.items() if "setting" in name), None)
-            return self.stage.render(self._marking(original), inputs, settings, self.noted)
+            return self._render(self.stage, original, inputs, settings, self.noted, self.given)
 
         return rasterize
+
+    def _render(
+        self,
+        stage: StageRendering,
+        rasterizer: Callable[..., Any],
+        inputs: dict[str, Any],
+        settings: Any,
+        noted: str | None,
+        given: tuple[Tensor, ...],
+    ) -> Any:
+        """Return what a rasterizer returns, with the image of the running stage if it renders the model's colours."""
+        colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
+        if any(color is each for color in colors for each in given):
+            return stage.render_other(self._marking(rasterizer), inputs, settings)
+        return stage.render(self._marking(rasterizer), inputs, settings, noted)
 
     def _marking(self, rasterizer: Callable[..., Any]) -> Callable[..., Any]:
         def rasterize(**inputs: Any) -> Any:

@@ -50,7 +50,7 @@ class StageRendering:
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
-        capture: keep the last composed image, before exposure or clamping, in `captured`.
+        capture: keep the last composed image, before exposure or clamping, in `captured`, and the rasterizer's inputs.
     """
 
     signed: bool
@@ -65,6 +65,7 @@ class StageRendering:
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
+    inputs: Mapping[str, Any] = field(default_factory=dict, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 
     def key(self, noted: str | None, settings: Any) -> str | None:
@@ -168,8 +169,25 @@ class StageRendering:
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
         image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
-            self.captured = image
+            self.captured, self.inputs = image, inputs
         return outputs.with_image(image)
+
+    def render_other(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any) -> Any:
+        """Return the outputs for colours that are not the model's, such as features or scores, as they are.
+
+        Nothing of the photos belongs into such an image.
+
+        Raises:
+            UserInputError: in the backward pass of a residual's: it is no image of the whole scene.
+        """
+        outputs = rasterizer(**inputs)
+        if not self.signed:
+            return outputs
+        found = RasterOutputs.of(outputs, size_of(settings))
+        image = found.image.clone()  # the hook is to see uses of this image alone
+        if image.requires_grad:
+            image.register_hook(_refuse_other_colors)  # type: ignore[no-untyped-call]  # torch's
+        return found.with_image(image)
 
     @property
     def _needs_views(self) -> bool:
@@ -180,6 +198,14 @@ class StageRendering:
     def _below_target(self) -> Predictions | None:
         """Images to subtract from targets where residuals are supervised alone."""
         return self.accumulated if self.coarse is None else self.coarse
+
+
+def _refuse_other_colors(_: Tensor) -> None:
+    raise UserInputError(
+        "the checkout trains on an image of other colours than the model's, which it gives to its renderer; a "
+        "residual covers a part of the scene only, so its image of them is not the whole one: train with --hierarchy "
+        "nested"
+    )
 
 
 def _refuse_unrecognised(_: Tensor) -> None:

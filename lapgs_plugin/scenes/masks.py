@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -57,6 +57,20 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
             "whole photo), or use no masks (in training: --masks none)"
         )
     return {name: path for name, path in found.items() if path is not None}
+
+
+def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None:
+    """Check that no photo counts as its own mask, as happens if --masks names the folder of the photos.
+
+    Raises:
+        SceneError: one is.
+    """
+    for name, mask in masks.items():
+        if mask.samefile(photos[name]):
+            raise SceneError(
+                f"--masks {mask.parent}: {printable(mask.name)} is the photo itself, expected its mask; give the "
+                "folder of the masks"
+            )
 
 
 def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | None:

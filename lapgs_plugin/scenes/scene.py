@@ -12,13 +12,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import SceneError
+from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape
-from lapgs_plugin.scenes.masks import ALPHA, AUTO, NONE, alpha_mask, find_masks, read_mask, resolve_masks
+from lapgs_plugin.scenes.masks import (
+    ALPHA,
+    AUTO,
+    MASKS,
+    NONE,
+    alpha_mask,
+    find_masks,
+    read_mask,
+    refuse_photos,
+    resolve_masks,
+)
 from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
@@ -107,7 +117,8 @@ def load_scene(
 
     Raises:
         SceneError: the folder, its model, an image or a mask cannot be used.
-        UserInputError: the resolution cannot be parsed, or there is no such folder of masks.
+        UserInputError: the resolution cannot be parsed, there is no such folder of masks, or no image has the
+            transparent pixels that `masks` asks for.
     """
     rule = parse_resolution(resolution)
     path = Path(path)
@@ -116,6 +127,7 @@ def load_scene(
     frames = [*source.train, *source.test]
     mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]
+    refuse_photos(mask_files, {frame.name: frame.path for frame in frames})
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
     if short:
         logger.warning(
@@ -125,6 +137,11 @@ def load_scene(
     as_3dgs = rule.backbone is not None
     read = partial(_read, source.kind, background, as_3dgs)
     views = _load_views(frames, cameras, read, partial(_read_mask, masks, mask_files), progress)
+    if masks == ALPHA and all(view.mask is None for view in views):
+        raise UserInputError(
+            f"--masks alpha: no image of {path / images} has transparent pixels; leave the option out, which uses "
+            f"{path / MASKS} if it is there"
+        )
     return Scene(
         path=path,
         kind=source.kind,

@@ -11,7 +11,7 @@ from statistics import fmean
 import torch
 from scipy.spatial import cKDTree
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.settings import AUTO
@@ -72,6 +72,7 @@ def merge_levels(
     Raises:
         UserInputError: the run has no residuals, and needs no merging.
         RunFolderError, SceneError: a field or the scene cannot be read.
+        TrainingStoppedError: the user asked to stop.
     """
     manifest = archive.manifest
     fields = {level: archive.field(level) for level in range(manifest.levels - 1, -1, -1)}
@@ -88,7 +89,7 @@ def merge_levels(
         placed = training_rasterizer(choose_rasterizer(AUTO), settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
         with RunArchive.create(Path(scratch) / "run", empty) as fitted:
-            Trainer(
+            trainer = Trainer(
                 scene=teacher,
                 settings=settings,
                 archive=fitted,
@@ -96,7 +97,14 @@ def merge_levels(
                 device=placed.device,
                 monitor=monitor or Monitor(),
                 first_field=start,
-            ).run()
+            )
+            try:
+                trainer.run()
+            except TrainingStoppedError:  # its message offers a checkpoint, which goes with the temporary folder
+                raise TrainingStoppedError(
+                    f"the fit to {archive.path()} was stopped and nothing is written; repeat the command to start it "
+                    "again, with fewer --iterations if it takes too long"
+                ) from None
             field = fitted.field(0)
         colors_fitted = archive.exposure(archive.available_levels[-1]) is not None
         return _measured(field, teacher, scene, placed, colors_fitted)

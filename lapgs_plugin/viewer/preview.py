@@ -71,12 +71,13 @@ def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> No
             )
 
 
-def save_run_preview(run: Path, device: str = "auto") -> None:
+def save_run_preview(run: Path, device: str = "auto", moved_to: Path | None = None) -> None:
     """Save the preview of a run that was just trained, see `save_preview`.
 
     Args:
         run: the run folder.
         device: where to render, see `rasterizer_for`.
+        moved_to: the scene's folder now; None if it did not move.
     """
     with _logged(run):
         # Imported here, because a backbone's environment may lack such packages as OpenImageIO.
@@ -86,7 +87,7 @@ def save_run_preview(run: Path, device: str = "auto") -> None:
         from lapgs_plugin.viewer.poses import SceneCameras
 
         archive = RunArchive.open(run)
-        cameras = SceneCameras.of(archive)
+        cameras = SceneCameras.of(archive, moved_to)
         save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
 
 

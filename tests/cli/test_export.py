@@ -73,8 +73,9 @@ def test_mistakes(run: Path, tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="level 7 is not in this run"):
         lapgs_export(run, "--level", 7)
     (tmp_path / "file").touch()
-    with pytest.raises(RunFolderError, match="cannot be written"):
-        lapgs_export(run, "--out", tmp_path / "file")
+    for merge in ((), ("--merge",)):  # before the fit, which takes minutes
+        with pytest.raises(UserInputError, match=r"--out .*file is a file; expected a folder"):
+            lapgs_export(run, "--out", tmp_path / "file", *merge)
     assert not (run / "export").exists()
     with pytest.raises(RunFolderError, match="level 1 is not in this run"):
         lapgs_export(write_run(tmp_path / "none", tmp_path / "scene", finished=0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -13,15 +14,16 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splat import splat_bytes
+from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
-from lapgs_plugin.training import merge, stage_start
+from lapgs_plugin.training import merge, stage_start, trainer
 from lapgs_plugin.training.merge import FAINT, first_field
 from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -72,11 +74,11 @@ def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, m
     """Its opacities and sizes are right already, and nothing is to shake the positions."""
     found = []
 
-    def trainer(**given: Any) -> None:
+    def capture(**given: Any) -> None:
         found.append(given["settings"].densification.options)
         raise UserInputError("far enough")
 
-    monkeypatch.setattr(merge, "Trainer", trainer)
+    monkeypatch.setattr(merge, "Trainer", capture)
     archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
     for iterations in (3_000, 30_000):
         with pytest.raises(UserInputError, match="far enough"):
@@ -108,6 +110,18 @@ def test_a_page_of_a_run_with_residuals(tmp_path: Path, monkeypatch: pytest.Monk
     assert "photos" not in output, "none are held out"
     assert files_in(run / "export") == {"scene.html"}
     assert len(splat_bytes(RunArchive.open(run).field(1))) * 4 / 3 < (run / "export" / "scene.html").stat().st_size
+
+
+def test_a_fit_that_is_stopped_offers_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is in a temporary folder, and the command has no --resume."""
+    request = StopRequest()
+    request.requested = True
+    monkeypatch.setattr(trainer, "stop_request", lambda: nullcontext(request))
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+    with pytest.raises(TrainingStoppedError, match="nothing is written; repeat the command") as stopped:
+        lapgs_export(run, "--merge", "--out", tmp_path / "out")
+    assert "--resume" not in str(stopped.value)
+    assert not (tmp_path / "out").exists()
 
 
 def test_runs_that_cannot_be_merged_are_one_line(tmp_path: Path) -> None:

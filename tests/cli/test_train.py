@@ -116,7 +116,7 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
         (("--views-per-step", "11"), "--views-per-step 11: the scene has 10 training views; give at most as many"),
         (("--resolution", "8k"), "expected 1k, 2k, 4k"),
         (("--background", "2,0,0"), "from 0 to 1"),
-        (("--resume",), "is not a run"),
+        (("--resume",), "is not a run, so there is nothing to continue; leave --resume out"),
         (("--resume", "--overwrite"), "contradict"),
     ],
 )

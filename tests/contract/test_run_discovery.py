@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,7 +55,7 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
     assert {"antialiasing", "viewmatrix"} < use.settings
     assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
     with pytest.raises(
-        MissingExtraError, match=f"no CPU stand-in for {OTHER}, which gaussian_renderer/__init__.py:"
+        MissingExtraError, match=f"no CPU stand-in for {OTHER}, imported in gaussian_renderer/__init__.py:"
     ) as e:
         adapter_class(fork).stand_in_for(fork, ())
     assert "\n" not in str(e.value)
@@ -179,6 +180,21 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     model.write_text("\n".join(lines) + "\n", encoding="utf-8")
     lapgs("doctor", fork)
     assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
+
+
+def test_doctor_says_that_a_model_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As of forks whose colours come from a network."""
+    model = fork / "scene" / "gaussian_model.py"
+    base, parameters = "class GaussianModel(GaussianBase):\n", ("_xyz", "_rotation", "_scaling", "_opacity")
+    text = model.read_text(encoding="utf-8")
+    assert base in text
+    roles = (
+        f"class GaussianModel:\n    def get_xyz(self):\n        return {', '.join(f'self.{n}' for n in parameters)}\n"
+    )
+    model.write_text(text.replace(base, roles), encoding="utf-8")
+    lapgs("doctor", fork)
+    shown = capsys.readouterr().out
+    assert len(re.findall(r"\(scene/gaussian_model.py:\d+\) have no _features_dc, _features_rest, from", shown)) == 2
 
 
 def test_doctor_says_that_images_of_several_sizes_have_no_levels(

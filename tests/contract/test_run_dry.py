@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,3 +103,46 @@ def test_an_evaluation_that_fails_costs_no_run(
     assert RunArchive.open(tmp_path / "run").field(0).means.isfinite().all()
     (warning,) = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
     assert "held-out views of level 0 could not be measured (RuntimeError: no image); " in warning
+
+
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_what_is_rendered_has_to_be_what_is_archived(
+    hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of forks whose renderers apply a filter or a mask to the parameters of their models."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    renderer = checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py"
+    text = renderer.read_text(encoding="utf-8")
+    for name in ("get_scaling,", "get_opacity,"):
+        assert text.count(name) == 1
+        text = text.replace(name, f"{name[:-1]} * 0.98,")
+    renderer.write_text(text, encoding="utf-8")
+    script, signed = checkouts / "graphdeco" / "train.py", hierarchy == "laplacian"
+    message = r"scene/gaussian_model.py:\d+: the checkout renders other scales and opacities than its model has as par"
+    refused = pytest.raises(UserInputError, match=f"{message}.* --hierarchy nested") if signed else nullcontext()
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        refused,
+    ):
+        drive(adapter, dry_run=True, hierarchy=hierarchy)
+    warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert [bool(re.match(message, each)) for each in warnings] == ([] if signed else [True])
+    assert (tmp_path / "run").exists() != signed
+
+
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_a_model_without_the_parameters_of_a_field(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+    """As of forks whose colours come from a network; their models have none of SH."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    for path in (*(checkouts / "graphdeco").rglob("*.py"), *(checkouts / "shared").rglob("*.py")):
+        path.write_text(path.read_text(encoding="utf-8").replace("_features_rest", "_table"), encoding="utf-8")
+    script = checkouts / "graphdeco" / "train.py"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        pytest.raises(UserInputError, match=r"the model has no _features_rest; `lapgs run --off`") as caught,
+    ):
+        drive(adapter, dry_run=True, hierarchy=hierarchy)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()

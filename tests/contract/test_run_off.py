@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import typer
 
 from lapgs_plugin.checkouts.script import loaded_script
 from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.app import run as main
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (
@@ -168,3 +170,16 @@ def test_on_a_gpu_a_script_of_no_known_checkout_runs_as_it_is(
     assert capsys.readouterr().out == "['-s', 'scene']\n"
     with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout"):
         command(["run", str(script), "-s", "scene"], standalone_mode=False)
+
+
+def test_an_exception_looks_as_if_python_ran_the_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "train.py"
+    script.write_text("def training():\n    return 1 / 0\n\n\nif __name__ == '__main__':\n    training()\n")
+    bare = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    monkeypatch.setattr(sys, "argv", ["lapgs", "run", "--off", "--device", "cpu", str(script)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == bare.returncode == 1
+    assert capsys.readouterr().err == bare.stderr

@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.cli.doctor_checkout import describe
+from lapgs_plugin.errors import MissingExtraError
 from tests.contract.stub_runs import STUBS
 
 
@@ -27,10 +30,69 @@ def test_the_stand_in_is_that_of_checkout_and_options(name: str, arguments: tupl
     assert adapter_class(checkout).stand_in_for(checkout, arguments) == variant
 
 
-def test_a_checkout_from_before_antialiasing(tmp_path: Path) -> None:
-    """The renderer lacks the setting, so its rasterizer does, too."""
-    checkout = Path(shutil.copytree(STUBS["graphdeco"].script.parent, tmp_path / "graphdeco"))
+BLUR = "        debug=pipe.debug,\n"
+"""Line of the stub's settings after which others are passed."""
+
+
+def changed(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Return a fork of graphdeco's stub, from before antialiasing, whose renderer has other text."""
+    checkout = Path(shutil.copytree(STUBS["graphdeco"].script.parent, folder / "fork"))
     renderer = checkout / "gaussian_renderer" / "__init__.py"
     text = renderer.read_text(encoding="utf-8")
-    renderer.write_text(text.replace("        antialiasing=pipe.antialiasing,\n", ""), encoding="utf-8")
+    older = ("        antialiasing=pipe.antialiasing,\n", ""), ("radii, depth_image = ", "radii = ")
+    for old, new in (*older, *changes):
+        assert old in text
+        text = text.replace(old, new)
+    renderer.write_text(text, encoding="utf-8")
+    return checkout
+
+
+def test_a_checkout_from_before_antialiasing(tmp_path: Path) -> None:
+    """The renderer lacks the setting, so its rasterizer does, too."""
+    checkout = changed(tmp_path)
     assert adapter_class(checkout).stand_in_for(checkout, ()) == "graphdeco"
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [("", "graphdeco"), ("        kernel_size=0.1,\n        subpixel_offset=None,\n", "mip_splatting")],
+)
+def test_a_fork_that_kept_a_file_is_recognised_by_what_it_renders_with(
+    settings: str, name: str, tmp_path: Path
+) -> None:
+    """As a fork of Mip-Splatting that has its tools, and a rasterizer of its own."""
+    checkout = changed(tmp_path, (BLUR, BLUR + settings))
+    (checkout / "create_fused_ply.py").write_text("")
+    assert adapter_class(checkout).info.name == name
+
+
+def test_a_rasterizer_that_returns_more_than_any_stand_in(tmp_path: Path) -> None:
+    """As those that return depth and alpha, too, and are otherwise called as graphdeco's."""
+    checkout = changed(tmp_path, ("rendered_image, radii = ", "rendered_image, radii, depth, alpha = "))
+    with pytest.raises(
+        MissingExtraError, match=r"the nearest, graphdeco, returns 2 outputs, not 4; it needs"
+    ) as caught:
+        adapter_class(checkout).stand_in_for(checkout, ())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_setting_that_no_stand_in_takes(tmp_path: Path) -> None:
+    checkout = changed(tmp_path, (BLUR, f"{BLUR}        confidence=1.0,\n"))
+    with pytest.raises(MissingExtraError, match=r"gaussian_renderer/__init__.py:\d+, .* takes no setting confidence"):
+        adapter_class(checkout).stand_in_for(checkout, ())
+
+
+def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
+    """As one that compiles itself when it is imported; stand-ins take the places of installed ones."""
+    module = "submodules.raster.binding"
+    checkout = changed(tmp_path, ("from diff_gaussian_rasterization import", f"from {module} import"))
+    binding = checkout / "submodules" / "raster" / "binding.py"
+    binding.parent.mkdir(parents=True)
+    binding.write_text("from .setup import _C\n\nclass GaussianRasterizer:\n    pass\n")
+    (use,) = CheckoutSource.read(checkout / "train.py").rasterizers
+    assert (use.module, use.functions) == (module, ("render",))
+    with pytest.raises(MissingExtraError, match=f"no CPU stand-in for {module}, imported in gaussian_renderer/__init_"):
+        adapter_class(checkout).stand_in_for(checkout, ())
+    (found,) = describe(checkout)["Rasterizers"]
+    assert (found.name, found.status) == (module, "ok")
+    assert found.detail.startswith("part of the checkout; ")

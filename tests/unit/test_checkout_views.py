@@ -96,6 +96,45 @@ def residual(camera: Camera, key: str, below: Tensor) -> tuple[RasterizerWrapper
     return wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
 
 
+def colored(means: Tensor, colors: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
+    """Return no radii and an image (h, w, 3) of the mean colour."""
+    size = rasterizer_settings.image_height, rasterizer_settings.image_width, 3
+    return torch.zeros(1), means.mean() + colors.mean(0).expand(size)
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool) -> None:
+    """As an image of features, masks or scores, that a loop compares with something else than the photo."""
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    assert wrapper.stage is not None
+    wrapper.stage.signed = signed
+    wrapper.stage.on_image = lambda key, image, below: image + 1
+    function = wrapper._function(colored)
+    view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
+    means, own = torch.zeros(2, 3, requires_grad=True), torch.full((2, 3), 0.125)
+
+    @wrapper.renderer
+    def render(viewpoint: Any, override_color: Tensor | None = None) -> Tensor:
+        made = settings(3, 4, torch.zeros(3), torch.eye(4))
+        image: Tensor = function(means, own if override_color is None else override_color, made)[1]
+        return image
+
+    scores = torch.full((2, 3), 0.5)
+    for image in (render(view, scores), render(view, override_color=scores)):
+        assert image.unique().tolist() == [0.5], "neither composed nor given to hooks"
+        if signed:
+            with pytest.raises(
+                UserInputError, match=r"other colours than the model's, .* --hierarchy nested"
+            ) as caught:
+                image.sum().backward()
+            assert "\n" not in str(caught.value)
+        else:
+            image.sum().backward()
+    assert render(view).unique().tolist() == [1.375], "the model's own colours are composed"
+    assert wrapper.given == ()
+
+
 @pytest.mark.parametrize("how", ["the camera", "a copy of its matrix", "a transposed matrix"])
 def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
     camera, images = made()

@@ -205,6 +205,13 @@ def test_alpha_channels_are_masks_if_asked_for(scene: Path) -> None:
     assert load_scene(scene, progress=False).train[0].mask is None
 
 
+def test_a_choice_of_masks_that_masks_nothing_is_one_line(scene: Path) -> None:
+    with pytest.raises(UserInputError, match=r"--masks alpha: no image of .*images has transparent pixels"):
+        load_scene(scene, masks="alpha", progress=False)
+    with pytest.raises(SceneError, match=r"--masks .*images: \S+ is the photo itself, expected its mask"):
+        load_scene(scene, masks="images", progress=False)
+
+
 def test_masks_that_do_not_fit_are_one_line(scene: Path, tmp_path: Path) -> None:
     def refused(message: str, kind: type[Exception] = SceneError, masks: str = "masks") -> None:
         with pytest.raises(kind, match=message):

@@ -215,6 +215,15 @@ def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypa
         find_photos(noise)
 
 
+def test_a_heic_photo_that_is_cut_short_is_one_line(tmp_path: Path) -> None:
+    pillow_heif.register_heif_opener()
+    whole, cut = tmp_path / "whole.heic", tmp_path / "cut.heic"
+    Image.fromarray(WALL[:64, :96]).save(whole)
+    cut.write_bytes(whole.read_bytes()[:-200])
+    with pytest.raises(SceneError, match=r"cut\.heic: the photo cannot be decoded \([^\\]+\); copy"):  # no newline
+        photos_module.convert_heic(cut, tmp_path / "cut.jpg")
+
+
 def test_files_that_are_no_photos_are_named(noise: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("a.dng", "b.mov", ".c.jpg", ".thumbnails/0.jpg"):
         (noise / name).parent.mkdir(exist_ok=True)
@@ -253,6 +262,9 @@ def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) 
 
     with pytest.raises(UserInputError, match=r"--masks .*nowhere: no such folder of masks"):
         prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=tmp_path / "nowhere"), progress=False)
+    with pytest.raises(SceneError, match=r"--masks .*: 0\.jpg is the photo itself, expected its mask"):
+        prepare_scene(noise, tmp_path / "scene", PrepareSettings(masks=noise), progress=False)
+    assert not (tmp_path / "scene").exists()
     shutil.copytree(masks, noise / "masks")
     assert list(find_photos(noise, noise / "masks").files) == ["0.jpg", "1.jpg", "2.jpg"]
     assert len(find_photos(noise, noise).files) == 5

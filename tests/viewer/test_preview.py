@@ -21,7 +21,7 @@ from lapgs_plugin.files import PREVIEW
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.preview import SIZE, crop_to_aspect, read_preview, save_run_preview
-from tests.cli.run_folder import write_run
+from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
@@ -131,6 +131,14 @@ def test_a_viewer_saves_a_preview_after_drawing(run: Path) -> None:
     kept = (run / PREVIEW).read_bytes()
     save_run_preview(run, "cpu")
     assert (run / PREVIEW).read_bytes() == kept
+
+
+def test_a_run_whose_scene_was_moved_has_a_preview(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    run, moved = write_run(tmp_path / "run", scene), tmp_path / "moved"
+    scene.rename(moved)
+    save_run_preview(run, "cpu", moved)
+    assert read_preview(run) is not None
 
 
 def test_a_damaged_run_has_no_preview(run: Path) -> None:

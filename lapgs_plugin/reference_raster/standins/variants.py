@@ -55,6 +55,7 @@ class Variant:
         settings: fields of its `GaussianRasterizationSettings`, in their order.
         options: from the settings of a call to its options of the engine.
         outputs: from these settings and the engine's output to the result of `forward`.
+        returned: number of outputs of `forward`, where it is always the same; None if it is not compared.
         module: name that checkouts import.
         binding: `GaussianRasterizer` without its `variant`; its `forward` has the arguments of the CUDA module's.
         sparse_adam: whether the module has `SparseGaussianAdam`.
@@ -68,6 +69,7 @@ class Variant:
     settings: tuple[str, ...] = _FAMILY
     options: Callable[[Any], Options] = _no_options
     outputs: Callable[[Any, Output], tuple[Tensor, ...]] = _image_and_radii
+    returned: int | None = None
     module: str = "diff_gaussian_rasterization"
     binding: type[Rasterizer] = WholeSh
     sparse_adam: bool = False
@@ -138,12 +140,13 @@ def _weight_rows(settings: Any) -> int:
 
 
 BACKBONES = {
-    "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main."),
+    "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main.", returned=2),
     "graphdeco-aa": Variant(
         "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
         (*_FAMILY, "antialiasing"),
         options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
         outputs=_with_inverse_depths,
+        returned=3,
     ),
     # Two faults of the copies in circulation are left out: their backward pass counts a background that is not black
     # twice, and skips Gaussians at random after a reduction over the wrong number of threads.
@@ -152,6 +155,7 @@ BACKBONES = {
         (*_FAMILY, "antialiasing"),
         options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
         outputs=_with_inverse_depths,
+        returned=3,
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
@@ -167,6 +171,7 @@ BACKBONES = {
     ),
     "taming-rasterizer": Variant(
         "Stand in for the rasterizer of Taming-3DGS, branch rasterizer: with DC apart and sparse Adam.",
+        returned=2,
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
@@ -223,6 +228,7 @@ FORKS = {
         "Stand in for the rasterizer of Mip-Splatting: with antialiasing of 0.3 px^2.",
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
         options=lambda settings: Options(antialiasing=True),
+        returned=2,
         binding=forks.MipSplatting,
     ),
     "efficientgs": Variant(

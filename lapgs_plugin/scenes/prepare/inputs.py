@@ -11,7 +11,7 @@ from typing import Any
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size
-from lapgs_plugin.scenes.masks import HEIC, alpha_mask, find_masks, read_mask, write_mask
+from lapgs_plugin.scenes.masks import HEIC, alpha_mask, find_masks, read_mask, refuse_photos, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import camera_of, convert_heic
@@ -73,6 +73,7 @@ def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
     own = {name: name for name in job.names}
     own |= {name: path.relative_to(found.folder).as_posix() for name, path in found.files.items()}
     masks = find_masks(folder, list(own.values()))
+    refuse_photos(masks, {photo: job.photos / name for name, photo in own.items()})
     return {name: masks[photo] for name, photo in own.items()}
 
 

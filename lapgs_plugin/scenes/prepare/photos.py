@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from lapgs_plugin.errors import MissingExtraError, SceneError, printable
+from lapgs_plugin.errors import MissingExtraError, SceneError, first_line, printable
 from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG_QUALITY
 from lapgs_plugin.scenes.masks import HEIC
@@ -133,7 +133,8 @@ def convert_heic(source: Path, target: Path) -> None:
     except SceneError:
         raise
     except (OSError, SyntaxError, ValueError, RuntimeError) as error:
-        raise SceneError(f"{source}: the photo cannot be decoded ({error}); copy or convert it again") from error
+        why = first_line(error)  # libheif ends its messages with a newline
+        raise SceneError(f"{source}: the photo cannot be decoded ({why}); copy or convert it again") from error
 
 
 def camera_of(photo: Path) -> tuple[str, ...]:
