@@ -75,7 +75,7 @@ def few_views_line(views: int, iterations: int, held_out: bool) -> str | None:
     keep = " or --keep best" if views >= LEAST_VIEWS else ""
     shows = "the held-out PSNR" if held_out else "--eval"
     return (
-        f"{views} training views are few for {iterations:,} iterations, {passes} passes over them: new views may get "
+        f"{views} training views are few for {iterations:,} iterations, {passes:,} passes over them: new views may get "
         f"worse late in the run; {shows} shows it, and fewer --iterations{keep} may help"
     )
 

@@ -106,7 +106,9 @@ def _frames(clip: Path, pixels: str, filters: str) -> Iterator[NDArray[np.uint8]
     """Yield the frames (h, w, c) of a clip after FFmpeg's filters, upright; `pixels` is "pgm" (grey) or "ppm" (RGB)."""
     import imageio_ffmpeg
 
-    options = ["-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough", "-f", "image2pipe", "-c:v", pixels, "-"]
+    depth = "rgb24" if pixels == "ppm" else "gray"  # else phones' HDR videos of 10 bits become 16-bit images
+    options = ["-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough", "-pix_fmt", depth]
+    options += ["-f", "image2pipe", "-c:v", pixels, "-"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-i", str(clip), *options]
     with tempfile.TemporaryFile() as words, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=words) as ffmpeg:
         assert ffmpeg.stdout is not None

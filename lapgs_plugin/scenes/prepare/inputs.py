@@ -81,10 +81,13 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
     """Return width and height of each photo by name. Photos are decoded, to find damaged ones before the long steps."""
 
     def size(name: str) -> tuple[int, int]:
-        width, height = check_image(job.photos / name)
+        photo = job.found.files.get(name, job.photos / name)  # errors name the user's file, not our copy
+        if photo.suffix.lower() in HEIC:
+            photo = job.photos / name
+        width, height = check_image(photo)
         longest = max(width, height)
         share = min(1.0, (job.settings.max_size or longest) / longest)
-        subject = f"{job.photos / name}: the photo has {width}x{height} pixels"
+        subject = f"{photo}: the photo has {width}x{height} pixels"
         VIEW_PIXELS.check(int(width * share) * int(height * share), subject, "choose a smaller --max-size", SceneError)
         return width, height
 
