@@ -13,7 +13,7 @@ from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Mcmc
 from tests.training_scene import blob_field
-from tests.unit.test_quality_watch import StopAt, ring_scene, train
+from tests.unit.test_quality_watch import Said, StopAt, ring_scene, train
 
 MCMC = Densification(strategy="mcmc", options=Mcmc(), every=10)
 
@@ -61,8 +61,9 @@ def test_few_photos_get_it_with_mcmc() -> None:
 
 def test_a_stopped_run_leaves_out_the_same_ones(tmp_path: Path) -> None:
     scene = ring_scene(train=4, test=1)
-    settings = TrainSettings(iterations=24, sh_degree=0, dropout=0.5, densification=MCMC)
-    whole = train(scene, settings, tmp_path / "whole", Monitor())
+    settings, said = TrainSettings(iterations=24, sh_degree=0, densification=MCMC), Said()
+    whole = train(scene, settings, tmp_path / "whole", said)
+    assert "4 training views are few: --dropout 0.2 leaves Gaussians out at random" in said.lines
     other = train(scene, TrainSettings(**{**vars(settings), "dropout": 0.0}), tmp_path / "other", Monitor())
     with pytest.raises(TrainingStoppedError):
         train(scene, settings, tmp_path / "stopped", StopAt((0, 6)))
