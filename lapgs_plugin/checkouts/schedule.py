@@ -200,6 +200,8 @@ class Schedule:
     def before_harm(self, end: int, variables: Mapping[str, Any], total: int) -> int:
         """Return `end`, or the iteration before a rare harmful event that comes there or shortly before.
 
+        Densification, rare in the shortest runs alone, leaves a field that can be archived.
+
         Args:
             end: iteration after which a field is archived.
             variables: those that the function sees, by name.
@@ -210,7 +212,8 @@ class Schedule:
             return operand.number(variables)
 
         for event in self.events:
-            if event.period is not None and event.harmful and (number(event.period) or 0) >= total / RARE:
+            damages = event.harmful and not any("densif" in name.lower() for name in event.calls)
+            if event.period is not None and damages and (number(event.period) or 0) >= total / RARE:
                 last = event.last(end, number)
                 end = last - 1 if last and end - last < total / RARE**2 else end
         return end

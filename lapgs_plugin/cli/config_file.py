@@ -90,7 +90,7 @@ def extend_config(path: Path, iterations: int, extended: int, strategy: str) -> 
         write_text(path, text)
 
 
-def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
+def write_config(path: Path, context: typer.Context, **replaced: str | int) -> None:
     """Write the parameters of a command that runs as a settings file that makes the same run.
 
     Parameters that are None and `OF_ONE_CALL` are left out.
@@ -98,7 +98,7 @@ def write_config(path: Path, context: typer.Context, **replaced: str) -> None:
     Args:
         path: of the file.
         context: of the command.
-        replaced: parameters' values that mean the same in every folder, instead of those that were given.
+        replaced: parameters' values that were chosen or mean the same in every folder, instead of those given.
     """
     lines = [
         f"# Made by lapgs {__version__}. The same again: {context.command_path} --config {path.name} -o NEW_FOLDER"

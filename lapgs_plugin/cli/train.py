@@ -103,12 +103,14 @@ def train(
         return
     reference = replace(reference, masks=resolve_masks(scene, photos.masks))
     _require_measuring(settings, control)
+    given = given_options(context)
     if start.resume:
-        given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
+        given = {name for name in given if name not in CHOSEN_ONCE or context.params[name] != AUTO}
         archive, loaded, settings = _resume(out, scene, _wanted(reference, settings, control.rasterizer), given)
     else:
-        archive, loaded = _create(out, reference, settings, control.rasterizer, start.overwrite)
-        write_config(archive.path(RUN_CONFIG), context, masks=reference.masks)
+        choose = "iterations" not in given
+        archive, loaded, settings = _create(out, reference, settings, control.rasterizer, start.overwrite, choose)
+        write_config(archive.path(RUN_CONFIG), context, masks=reference.masks, iterations=settings.iterations)
     with archive:
         _run(archive, loaded, settings, control, resume=start.resume, watcher=watcher)
     _finish(out, scene)
@@ -260,9 +262,14 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
 
 
 def _create(
-    out: Path, reference: SceneReference, settings: TrainSettings, rasterizer: str, overwrite: bool
-) -> tuple[RunArchive, Scene]:
-    """Read the scene and check the settings before the run folder is made."""
+    out: Path,
+    reference: SceneReference,
+    settings: TrainSettings,
+    rasterizer: str,
+    overwrite: bool,
+    choose_iterations: bool,
+) -> tuple[RunArchive, Scene, TrainSettings]:
+    """Read the scene, choose iterations if that is asked, and check the settings before the run folder is made."""
     from lapgs_plugin.rendering.run import load_reference
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.manifest import Manifest
@@ -274,13 +281,25 @@ def _create(
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = load_reference(reference)
+    if choose_iterations and (settings_for_few := settings.for_photos(len(loaded.train))) != settings:
+        settings = settings_for_few
+        _say_chosen(len(loaded.train), settings.iterations)
     require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
         rasterizer=rasterizer,
         **settings.for_manifest(),
     )
-    return RunArchive.create(out, manifest, overwrite), loaded
+    return RunArchive.create(out, manifest, overwrite), loaded, settings
+
+
+def _say_chosen(photos: int, iterations: int) -> None:
+    """Say that a run on few photos is shorter than others."""
+    make_console(stderr=True).print(
+        f"{photos} training photos: {iterations:,} iterations, {iterations // photos} passes over them; more gain "
+        "little with so few photos, and --iterations asks for another number",
+        soft_wrap=True,
+    )
 
 
 def _run(

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.training.settings import PASSES
 
 SAMPLES_OF_A_STAGE = 5
 """How often a stage measures some held-out views."""
@@ -21,8 +22,8 @@ LEAST_GAIN = 0.01
 """Decibels by which an earlier state must be better than the last one to be archived instead of it."""
 LEAST_VIEWS = 12
 """Fewest training views of which some can be set aside."""
-FEW_VIEWS, MANY_PASSES = 24, 100
-"""A run on fewer training views than that, with more passes over them than that, may fit them alone."""
+FEW_VIEWS = 24
+"""A run on fewer training views than that, with more than `PASSES` over them, may fit them alone."""
 FALL = 0.5
 """Decibels below the best measurement that count as getting worse."""
 
@@ -69,7 +70,7 @@ def few_views_line(views: int, iterations: int, held_out: bool) -> str | None:
         held_out: whether other views are measured during the run.
     """
     passes = iterations // views
-    if views >= FEW_VIEWS or passes <= MANY_PASSES:
+    if views >= FEW_VIEWS or passes <= PASSES:
         return None
     keep = " or --keep best" if views >= LEAST_VIEWS else ""
     shows = "the held-out PSNR" if held_out else "--eval"

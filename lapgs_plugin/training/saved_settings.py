@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 LEFT_OUT_ONCE: dict[str, Any] = {
     **{"packed": False, "sparse_adam": False, "joint": 0.0, "gather": 1, "hierarchy": "laplacian"},
-    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0},
+    **{"base_sh_degree": None, "views_per_step": "1", "residual_threshold": 1.0, "sh_rate_factor": 1.0, "dropout": 0.0},
     **{"protocol": "default", "exposure": OFF, "keep": LAST, "extended": 0, "refine_poses": False},
 }
 """Settings that older manifests do not name, with the values they had."""

@@ -47,6 +47,12 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that are fields of the manifest itself."""
 
 
+FEW_PHOTOS, FEW_DROPOUT = 40, 0.2
+"""Default of `TrainSettings.dropout` for fewer training photos than that."""
+PASSES = 300
+"""Passes over few training photos in a run whose iterations are left open; more of them gain little."""
+
+
 @dataclass(frozen=True)
 class LearningRates:
     """Set Adam's step sizes, by default 3DGS's. Those of positions are in units of the scene's extent."""
@@ -146,7 +152,10 @@ class TrainSettings(HierarchySettings):
     __pydantic_config__: ClassVar[Any] = STRICT
 
     iterations: int = option(
-        REFERENCE_ITERATIONS, "Views trained on, all stages together. The 3DGS schedule shrinks with it.", least=1
+        REFERENCE_ITERATIONS,
+        "Views trained on, all stages together. The 3DGS schedule shrinks with it. If it is left out, fewer than "
+        f"{REFERENCE_ITERATIONS // PASSES} training photos get {PASSES} for each, but at least {LONG_RUN}.",
+        least=1,
     )
     gather: int = option(
         8,
@@ -173,6 +182,13 @@ class TrainSettings(HierarchySettings):
         "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
         "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
         f"to {SH_RATE_VIEWS} to {MOST_SH_RATE:g}.",
+        panel=SCHEDULE,
+    )
+    dropout: float | None = option(
+        None,
+        "Share of the Gaussians that is left out at random, anew for each step, growing from 0 to this over a stage; "
+        f"against floaters that few photos allow. Default: {FEW_DROPOUT:g} for fewer than {FEW_PHOTOS} training photos "
+        "with --strategy mcmc, else 0.",
         panel=SCHEDULE,
     )
     exposure: str = option(
@@ -223,6 +239,8 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
+        if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
+            raise UserInputError(f"--dropout {self.dropout}: expected a share from 0 to below 1, such as 0.2")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
 
@@ -290,6 +308,17 @@ class TrainSettings(HierarchySettings):
             if each.name in strategy.unused and getattr(owner, each.name) not in (each.default, 0)
         ]
 
+    def for_photos(self, count: int) -> TrainSettings:
+        """Return settings with `PASSES` over few training photos, but no shorter than a long run.
+
+        Settings of the paper, and of a schedule in iterations of the run, stay.
+        """
+        enough, control = max(LONG_RUN, PASSES * count), self.densification
+        timed = any(each is not None for each in (control.start, control.until, control.reset_every))
+        if enough >= self.iterations or timed or self.protocol == "paper":
+            return self
+        return replace(self, iterations=enough)
+
     @property
     def scheduled(self) -> int:
         """Iterations of the run's schedule, all stages together, without those that extended the finished run."""
@@ -332,12 +361,19 @@ class TrainSettings(HierarchySettings):
             return self.sh_rate_factor
         return min(MOST_SH_RATE, max(1.0, training_views / SH_RATE_VIEWS))
 
+    def dropout_for(self, training_photos: int) -> float:
+        """Return the share of Gaussians that the last steps of a stage leave out."""
+        if self.dropout is not None:
+            return self.dropout
+        return FEW_DROPOUT if training_photos < FEW_PHOTOS and self.densification.strategy == MCMC else 0.0
+
     @property
     def paper_settings(self) -> Mapping[str, object]:
         """See `HierarchySettings.paper_settings`."""
         return {
             **super().paper_settings,
             **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF, "refine_poses": False},
+            "dropout": 0.0,
         }
 
     def sh_degree_of(self, level: int) -> int:

@@ -25,6 +25,7 @@ from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.losses import ViewLosses
 from lapgs_plugin.training.model import TrainableField
@@ -109,6 +110,7 @@ class StageRun:
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
 
     def __post_init__(self) -> None:
+        self._dropout = self.settings.dropout_for(len(self.views))
         self._losses = ViewLosses(
             self.stage, self.images, self.coarser, self.hooks, self.exposures, self.settings.ssim_weight
         )
@@ -291,7 +293,8 @@ class StageRun:
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
-        shown = gaussians if self.poses is None else self.poses.watched(names[0], gaussians)
+        shown = thinned(gaussians, self._dropout * last / self.stage.iterations)
+        shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, [view.camera for view in views], last)
         self.breakdown.mark("loss")
         losses = losses_of(rendered)

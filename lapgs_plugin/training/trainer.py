@@ -149,6 +149,8 @@ class Trainer:
         say(self._strategy_line())
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
+        if self.settings.dropout is None and (share := self.settings.dropout_for(len(scene.train))) > 0.0:
+            say(f"{len(scene.train)} training views are few: --dropout {share:g} leaves Gaussians out at random")
         for level in unpruned_levels(self._context.plan, self.settings):
             say(unpruned_line(self.settings.prune, level))
         if self.settings.refine_poses and self.device.type == "cuda":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
@@ -52,6 +53,19 @@ def test_the_command_line_comes_before_the_file(scene: Path, tmp_path: Path) -> 
     lapgs("train", "--config", config, "-o", tmp_path / "run", "--seed", 5, "--levels", 1)
     manifest = RunArchive.open(tmp_path / "run").manifest
     assert (manifest.seed, manifest.settings["iterations"], manifest.levels) == (5, 8, 1)
+
+
+def test_a_run_on_few_photos_has_iterations_by_their_number(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lapgs_plugin.training.trainer.Trainer.run", lambda *_: None)
+    monkeypatch.setattr("lapgs_plugin.cli.train.keep_preview", lambda _: None)
+    for name, more, expected in (("open", [], 5000), ("given", ["--iterations", "30000"], 30_000)):
+        result = CliRunner().invoke(app, ["train", str(scene), "-o", str(tmp_path / name), *more])
+        assert result.exit_code == 0, result.output
+        assert ("training photos: 5,000 iterations" in result.output) is (name == "open")
+        assert read_toml(tmp_path / name / "run.toml")["iterations"] == expected
+        assert RunArchive.open(tmp_path / name).manifest.settings["iterations"] == expected
 
 
 def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: Path) -> None:

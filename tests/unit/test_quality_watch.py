@@ -192,6 +192,16 @@ def test_few_views_for_many_iterations_are_named() -> None:
     assert "--keep best" not in str(few_views_line(8, 7000, held_out=True))  # too few to set some aside
 
 
+def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happen() -> None:
+    given = TrainSettings()
+    assert [given.for_photos(count).iterations for count in (3, 16, 17, 43, 99)] == [5000, 5000, 5100, 12_900, 29_700]
+    assert given.for_photos(100) is given
+    assert TrainSettings(iterations=3000).for_photos(43).iterations == 3000
+    assert TrainSettings(protocol="paper").for_photos(43).iterations == 30_000
+    assert TrainSettings(densification=Densification(until=9000)).for_photos(43).iterations == 30_000
+    assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
+
+
 def test_keep_best_needs_views_to_set_aside() -> None:
     with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 6 of them, expected at least 12"):
         make_plan((56, 40), TrainSettings(keep="best"), 6)
