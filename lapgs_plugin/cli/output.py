@@ -39,10 +39,10 @@ def make_table(*headings: str) -> Table:
     return Table(*headings, box=box.SIMPLE_HEAD)
 
 
-def train_command(scene: Path) -> str:
-    """Return the command that trains a scene, as a user can paste it."""
+def train_command(scene: Path, options: str = "") -> str:
+    """Return the command that trains a scene with further options, as a user can paste it."""
     run = Path("runs") / scene.absolute().name
-    return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval"
+    return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval {options}".rstrip()
 
 
 def require_place(folder: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +11,9 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import train_command
+from lapgs_plugin.cli.train import MINUTES_ON_A_CPU, long_on_a_cpu
+from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 
 
@@ -47,4 +52,20 @@ def prepare(
         f"mean reprojection error {result.reprojection_error:.2f} pixels, "
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
-    typer.echo(f"next: {train_command(out)}")
+    typer.echo(f"next: {_next_command(out, result.registered)}")
+
+
+def _next_command(out: Path, registered: Sequence[str]) -> str:
+    """Return the command that trains the scene, with options for minutes where a CPU would take hours."""
+    from lapgs_plugin.scenes.images import image_size
+    from lapgs_plugin.scenes.prepare.photos import target_name
+    from lapgs_plugin.training.backend import choose_rasterizer
+    from lapgs_plugin.training.settings import TrainSettings
+
+    iterations = TrainSettings().for_photos(len(registered)).iterations
+    size = image_size(out / "images" / target_name(registered[0]))
+    if long_on_a_cpu(size, iterations):
+        with suppress(MissingExtraError):  # there is a GPU, and `lapgs train` says what it needs
+            if choose_rasterizer(AUTO) == "cpu":
+                return train_command(out, MINUTES_ON_A_CPU)
+    return train_command(out)

@@ -39,6 +39,8 @@ CHOSEN_ONCE = ("rasterizer", "strategy")
 
 LONG_ON_A_CPU = 4e9
 """Pixels to render, over all iterations, from which the command says that a CPU takes long."""
+MINUTES_ON_A_CPU = "--resolution 1/4 --iterations 3000"
+"""Options that are proposed there."""
 
 
 @dataclass(frozen=True)
@@ -371,5 +373,5 @@ def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:
         return ""
     return (
         f"without a GPU {iterations:,} iterations of {width}x{height} pixels can take hours; "
-        "--resolution 1/4 --iterations 3000 takes minutes"
+        f"{MINUTES_ON_A_CPU} takes minutes"
     )

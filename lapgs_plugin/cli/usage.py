@@ -18,6 +18,8 @@ PLAIN = {
     "Input should be": "expected",
 }
 """Our words for pydantic's."""
+WITH_BASELINE = ("report", "view")
+"""Commands that show one run, and a second one by --baseline."""
 
 
 def usage_message(error: Any) -> str:
@@ -47,4 +49,8 @@ def one_line_usage_errors(context: Any = None) -> Iterator[None]:
         where = getattr(error, "ctx", None)
         words = ["lapgs", context and context.invoked_subcommand] if where is None else [where.command_path]
         command = " ".join(filter(None, words))
+        if getattr(where, "info_name", "") in WITH_BASELINE and "extra argument" in usage_message(error):
+            raise UserInputError(
+                f"{usage_message(error)}; expected one run, to compare it with another: {command} RUN --baseline OTHER"
+            ) from error
         raise UserInputError(f"{usage_message(error)}; see `{command} --help`") from error

@@ -13,13 +13,12 @@ are one field: a single call trains them (`single_call`). Everything between ren
 from __future__ import annotations
 
 import inspect
-import itertools
 import logging
 import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -141,7 +140,7 @@ class HierarchyDriver:
                 self._options.kind,
             )
             if self._signs_nothing:
-                plan = self._between_events(plan, call)
+                plan = between_events(plan, self._schedule, _variables(call))
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
             path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
             if self._options.dry_run:
@@ -164,19 +163,6 @@ class HierarchyDriver:
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
         logger.info("run folder: %s", folder)
-
-    def _between_events(self, plan: StagePlan, call: TrainingCall) -> StagePlan:
-        """Return a plan in which no nested level is archived right after a reset of opacities or hard pruning."""
-        before, stages = 0, list(plan)
-        for i, (stage, finer) in enumerate(itertools.pairwise(plan)):
-            end = before + stage.iterations
-            clear = self._schedule.before_harm(end, _variables(call), plan.iterations)
-            if before < clear < end:
-                logger.info("level %d ends after iteration %d: the script acts at %d", stage.level, clear, clear + 1)
-                stages[i] = replace(stages[i], iterations=clear - before)
-                stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
-            before += stages[i].iterations
-        return replace(plan, stages=tuple(stages))
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
@@ -241,6 +227,29 @@ class HierarchyDriver:
             archive.close()
             raise
         return archive
+
+
+def between_events(plan: StagePlan, schedule: Schedule, variables: Mapping[str, Any]) -> StagePlan:
+    """Return a plan in which no nested level is archived right after a reset of opacities or hard pruning.
+
+    The iterations that a level loses go to the next finer one.
+
+    Args:
+        plan: of nested levels.
+        schedule: of the script.
+        variables: those that its training function sees, by name.
+    """
+    before, stages = 0, list(plan)
+    for i in range(len(stages) - 1):
+        stage, finer = stages[i], stages[i + 1]
+        end = before + stage.iterations
+        clear = schedule.before_harm(end, variables, plan.iterations)
+        if before < clear < end:
+            logger.info("level %d ends after iteration %d: the script acts at %d", stage.level, clear, clear + 1)
+            stages[i] = replace(stage, iterations=clear - before)
+            stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
+        before += stages[i].iterations
+    return replace(plan, stages=tuple(stages))
 
 
 def _variables(call: TrainingCall) -> dict[str, Any]:

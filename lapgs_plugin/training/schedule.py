@@ -190,15 +190,18 @@ class StageSchedule:
             found.add(max(1, due))
         return frozenset(found)
 
+    def progress_at(self, iteration: int) -> float:
+        """Return the share of the schedule that is done, from 0 to 1; 1 while a finished stage is extended."""
+        return min(max(iteration / self.iterations, 0.0), 1.0)
+
     def means_learning_rate(self, iteration: int) -> float:
         """Return the step size of positions in units of the scene's extent; its logarithm decays linearly."""
-        progress = min(max(iteration / self.iterations, 0.0), 1.0)
+        progress = self.progress_at(iteration)
         return math.exp((1 - progress) * math.log(self.means_first) + progress * math.log(self.means_last))
 
     def sh_rest_factor_at(self, iteration: int) -> float:
         """Return the factor on the rate of SH above degree 0, which falls exponentially to 1 at the stage's end."""
-        left: float = 1.0 - min(iteration / self.iterations, 1.0)
-        factor: float = self.sh_rest_factor**left
+        factor: float = self.sh_rest_factor ** (1.0 - self.progress_at(iteration))
         return factor
 
     def active_sh_degree(self, iteration: int) -> int:

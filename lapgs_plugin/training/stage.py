@@ -293,7 +293,7 @@ class StageRun:
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
-        shown = thinned(gaussians, self._dropout * last / self.stage.iterations)
+        shown = thinned(gaussians, self._dropout * self.schedule.progress_at(last))
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, [view.camera for view in views], last)
         self.breakdown.mark("loss")

@@ -91,6 +91,14 @@ def test_usage_errors_are_one_line_with_exit_code_2(
     assert tuple(capsys.readouterr()) == ("", f"{line}\n")
 
 
+@pytest.mark.parametrize("command", ["report", "view", "render"])
+def test_a_second_run_is_told_its_option(command: str) -> None:
+    error = CliRunner().invoke(app, [command, "one", "other"]).exception
+    assert isinstance(error, LapgsError)
+    assert ("(other); expected one run" in str(error)) == (command != "render")
+    assert f"lapgs {command} {'--help' if command == 'render' else 'RUN --baseline OTHER'}" in str(error)
+
+
 @pytest.mark.parametrize("words", [[], ["bench"], ["patch"]])
 def test_a_group_without_arguments_shows_its_help(words: list[str]) -> None:
     result = CliRunner().invoke(app, words)

@@ -1,11 +1,17 @@
-"""Test how wide the output of commands is on a terminal and in a file."""
+"""Test how wide the output of commands is on a terminal and in a file, and which command comes next."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from PIL import Image
 from rich.table import Table
 
+from lapgs_plugin.cli import prepare
 from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.training import backend
 
 WORDS = "word " * 40 + "end"
 
@@ -30,3 +36,33 @@ def test_lines_are_wrapped_for_terminals_alone(
     shown = capsys.readouterr().out.splitlines()
     assert " ".join(" ".join(shown).split()) == f"{WORDS} {WORDS}"
     assert len(shown) == lines
+
+
+@pytest.mark.parametrize(
+    ("size", "rasterizer", "options"),
+    [
+        ((1600, 1200), "cpu", " --resolution 1/4 --iterations 3000"),
+        ((160, 120), "cpu", ""),
+        ((1600, 1200), "gsplat", ""),
+        ((1600, 1200), MissingExtraError("a GPU without gsplat"), ""),
+    ],
+    ids=["cpu", "small-photos", "gpu", "gpu-that-needs-a-package"],
+)
+def test_prepare_proposes_a_training_that_this_machine_can_do(
+    size: tuple[int, int],
+    rasterizer: str | MissingExtraError,
+    options: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def choose(name: str) -> str:
+        if isinstance(rasterizer, MissingExtraError):
+            raise rasterizer
+        return rasterizer
+
+    monkeypatch.setattr(backend, "choose_rasterizer", choose)
+    monkeypatch.chdir(tmp_path)
+    Path("desk/images/left").mkdir(parents=True)
+    Image.new("L", size).save("desk/images/left/a.png")
+    command = prepare._next_command(Path("desk"), ["left/a.webp", *(f"left/{i}.webp" for i in range(24))])
+    assert command == f"lapgs train desk -o runs/desk --eval{options}"

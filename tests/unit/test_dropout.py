@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from lapgs_plugin.errors import TrainingStoppedError, UserInputError
+from lapgs_plugin.training import stage
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -70,3 +72,12 @@ def test_a_stopped_run_leaves_out_the_same_ones(tmp_path: Path) -> None:
     again = train(scene, settings, tmp_path / "stopped", Monitor(), resume=True)
     assert bool((again.field(0).means == whole.field(0).means).all())
     assert not bool((other.field(0).means == whole.field(0).means).all())
+
+
+def test_an_extension_leaves_out_as_many_as_the_end_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, shares = ring_scene(train=4, test=1), list[float]()
+    settings = TrainSettings(iterations=12, levels=1, sh_degree=0, densification=MCMC)
+    train(scene, settings, tmp_path / "run", Monitor())
+    monkeypatch.setattr(stage, "thinned", lambda field, share: shares.append(share) or thinned(field, share))
+    train(scene, replace(settings, iterations=16, extended=4), tmp_path / "run", Monitor(), resume=True)
+    assert shares == [0.2] * 4

@@ -245,6 +245,8 @@ def test_webp_photos_become_jpeg_files_which_colmap_reads(
     photo = tmp_path / "scene" / ".prepare" / "photos" / "3.jpg"
     read = pycolmap.Bitmap.read(str(photo), as_rgb=True)
     assert np.abs(read.to_array().astype(np.float64) - WALL[:64, :96]).mean() < 16  # seen 8.4
+    with pytest.raises(SceneError, match=r"--masks .*: 0\.jpg is the photo itself"):  # not the copy that COLMAP gets
+        prepare_scene(noise, tmp_path / "other", PrepareSettings(masks=noise), progress=False)
     Image.new("RGBA", (96, 64), (9, 9, 9, 0)).save(noise / "4.webp")
     with pytest.raises(SceneError, match=r"4\.webp: a WebP photo with transparency"):
         photos_module.convert_photo(noise / "4.webp", tmp_path / "4.jpg")

@@ -9,6 +9,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from lapgs_plugin.checkouts.schedule import Schedule
+from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan
+from lapgs_plugin.runner.driver import between_events
 
 LOOP = """
 def training(opt, args, testing_iterations, seen, unused=None):
@@ -128,6 +130,15 @@ def test_a_level_does_not_end_right_after_a_rare_harmful_event() -> None:
     ends = {end: schedule.before_harm(end, variables, 30_000) for end in (200, 8000, 9000, 9299, 9300, 12_000, 15_000)}
     # Opacities are reset, or Gaussians pruned, every 3000 iterations, and simplified every 5000.
     assert ends == {200: 200, 8000: 8000, 9000: 8999, 9299: 8999, 9300: 9300, 12_000: 11_999, 15_000: 14_999}
+
+
+def test_the_ends_of_several_nested_levels_move_and_no_iteration_is_lost() -> None:
+    definition = ast.parse(LOOP).body[0]
+    assert isinstance(definition, ast.FunctionDef)
+    stages = tuple(Stage(level, (64, 64), 9000, signed=False) for level in (2, 1, 0))
+    plan = StagePlan(stages, Hierarchy.NESTED)
+    moved = between_events(plan, Schedule(definition), {"opt": SimpleNamespace(**OPT)})
+    assert [stage.iterations for stage in moved] == [8999, 9000, 9001]  # opacities and Gaussians go at 9000 and 18,000
 
 
 def test_a_stage_as_long_as_the_run_changes_nothing_but_its_last_tenth() -> None:

@@ -73,7 +73,8 @@ def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
     own = {name: name for name in job.names}
     own |= {name: path.relative_to(found.folder).as_posix() for name, path in found.files.items()}
     masks = find_masks(folder, list(own.values()))
-    refuse_photos(masks, {photo: job.photos / name for name, photo in own.items()})
+    # The user's files: those beside HEIC and WebP photos are read from copies.
+    refuse_photos(masks, {photo: found.files.get(name, job.photos / name) for name, photo in own.items()})
     return {name: masks[photo] for name, photo in own.items()}
 
 
