@@ -139,7 +139,7 @@ def load_scene(
     views = _load_views(frames, cameras, read, partial(_read_mask, masks, mask_files), progress)
     if masks == ALPHA and all(view.mask is None for view in views):
         raise UserInputError(
-            f"--masks alpha: no image of {path / images} has transparent pixels; leave the option out, which uses "
+            f"--masks alpha: no image of {path} has transparent pixels; leave the option out, which uses "
             f"{path / MASKS} if it is there"
         )
     return Scene(

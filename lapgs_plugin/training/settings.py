@@ -314,7 +314,7 @@ class TrainSettings(HierarchySettings):
         Settings of the paper, and of a schedule in iterations of the run, stay.
         """
         enough, control = max(LONG_RUN, PASSES * count), self.densification
-        timed = any(each is not None for each in (control.start, control.until, control.reset_every))
+        timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
         if enough >= self.iterations or timed or self.protocol == "paper":
             return self
         return replace(self, iterations=enough)

@@ -206,7 +206,7 @@ def test_alpha_channels_are_masks_if_asked_for(scene: Path) -> None:
 
 
 def test_a_choice_of_masks_that_masks_nothing_is_one_line(scene: Path) -> None:
-    with pytest.raises(UserInputError, match=r"--masks alpha: no image of .*images has transparent pixels"):
+    with pytest.raises(UserInputError, match=r"--masks alpha: no image of .* has transparent pixels"):
         load_scene(scene, masks="alpha", progress=False)
     with pytest.raises(SceneError, match=r"--masks .*images: \S+ is the photo itself, expected its mask"):
         load_scene(scene, masks="images", progress=False)

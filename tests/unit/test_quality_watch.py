@@ -182,7 +182,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
 
 
 def test_few_views_for_many_iterations_are_named() -> None:
-    assert few_views_line(24, 30_000, True) is few_views_line(12, 1200, True) is None
+    assert few_views_line(24, 30_000, True) is few_views_line(12, 5000, True) is None
     line = few_views_line(15, 7000, held_out=False)
     assert line is not None
     assert line.startswith("15 training views are few for 7,000 iterations, 466 passes over them")
@@ -199,6 +199,7 @@ def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happe
     assert TrainSettings(iterations=3000).for_photos(43).iterations == 3000
     assert TrainSettings(protocol="paper").for_photos(43).iterations == 30_000
     assert TrainSettings(densification=Densification(until=9000)).for_photos(43).iterations == 30_000
+    assert TrainSettings(densification=Densification(reset_every=0)).for_photos(43).iterations == 12_900
     assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
 
 
