@@ -29,6 +29,15 @@ def one_line(text: str) -> str:
     return line
 
 
+def counted(number: int, thing: str) -> str:
+    """Return a number with what it counts, in the plural unless it is one.
+
+    >>> counted(1, "photo"), counted(0, "photo")
+    ('1 photo', '0 photos')
+    """
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type if it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]

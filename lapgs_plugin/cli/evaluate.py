@@ -11,7 +11,7 @@ import typer
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console, make_table
 from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
-from lapgs_plugin.errors import printable
+from lapgs_plugin.errors import counted, printable
 from lapgs_plugin.options import check_values, option
 
 if TYPE_CHECKING:
@@ -185,7 +185,8 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
-        f"{metrics['num_views']} {kind} views{where}; optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
+        f"{counted(metrics['num_views'], kind + ' view')}{where}; "
+        f"optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
     )
     console.print(

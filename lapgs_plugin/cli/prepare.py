@@ -12,7 +12,7 @@ import typer
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import train_command
 from lapgs_plugin.cli.train import MINUTES_ON_A_CPU, long_on_a_cpu
-from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.errors import MissingExtraError, counted
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 
@@ -48,7 +48,7 @@ def prepare(
     result = prepare_scene(photos, out, settings, overwrite=overwrite)
     total = len(result.registered) + len(result.left_out)
     typer.echo(
-        f"{out}: {len(result.registered)} of {total} photos, {result.points} points, "
+        f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, "
         f"mean reprojection error {result.reprojection_error:.2f} pixels, "
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )

@@ -267,6 +267,12 @@ def _write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
         raise OSError(complaint or target.geterror())
 
 
+def require_readable(path: Path) -> None:
+    """Raise a SceneError if this user has no permission to read a file."""
+    if not os.access(path, os.R_OK):
+        raise SceneError(f"{path}: no permission to read it; give this user the permission, or copy the file")
+
+
 def _open(path: Path) -> oiio.ImageInput:
     if (length := len(path.name.encode(errors="surrogatepass"))) > LONGEST_NAME:
         raise SceneError(
@@ -275,6 +281,7 @@ def _open(path: Path) -> oiio.ImageInput:
         )
     if not is_file(path):
         raise SceneError(f"{path}: no such image; put it there or choose another folder with --images")
+    require_readable(path)
     options = oiio.ImageSpec()
     # Without it, 8-bit colour is multiplied by alpha in 8 bits, which loses precision where alpha is small.
     options.attribute("oiio:UnassociatedAlpha", 1)

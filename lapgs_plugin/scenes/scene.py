@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
@@ -212,7 +212,9 @@ def _check_source(path: Path, source: SceneSource) -> None:
     if len(source.train) < 2:
         held_out = f" besides {len(source.test)} held out" if source.test else ""
         hint = "train without --eval or add photos" if source.test else "add photos and reconstruct again"
-        raise SceneError(f"{path}: {len(source.train)} training views{held_out}, expected at least 2; {hint}")
+        raise SceneError(
+            f"{path}: {counted(len(source.train), 'training view')}{held_out}, expected at least 2; {hint}"
+        )
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
         double = next(name for name in names if names.count(name) > 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shutil
 import sqlite3
@@ -229,12 +230,36 @@ def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypa
     with pytest.raises(SceneError, match=rf"^{re.escape(str(noise / '2.jpg'))}: not a readable image"):
         prepare_scene(noise, tmp_path / "scene", progress=False)
     monkeypatch.setattr(photos_module, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"1 HEIC photos \(IMG_1\.HEIC\) need pillow-heif: pip install"):
+    with pytest.raises(MissingExtraError, match=r"pillow-heif is needed for 1 HEIC photo \(IMG_1\.HEIC\): pip install"):
         prepare_scene(noise, tmp_path / "scene", progress=False)
     shutil.copy(noise / "0.jpg", noise / "IMG_1.jpg")
     monkeypatch.undo()
     with pytest.raises(SceneError, match=r"IMG_1\.HEIC and IMG_1\.jpg would both become IMG_1\.jpg"):
         find_photos(noise)
+
+
+def test_damaged_photos_are_listed_together(noise: Path, tmp_path: Path) -> None:
+    for index in range(12):
+        (noise / f"bad{index:02}.jpg").write_bytes(b"")
+    with pytest.raises(SceneError) as caught:
+        prepare_scene(noise, tmp_path / "scene", progress=False)
+    message = str(caught.value)
+    assert message.startswith("12 of 15 photos cannot be used: bad00.jpg, bad01.jpg, ")
+    assert "bad09.jpg and 2 more; the first: " in message
+    assert f"{noise / 'bad00.jpg'}: not a readable image" in message
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("beside_webp", [False, True])
+def test_a_photo_without_permission_is_said_so(
+    beside_webp: bool, noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if beside_webp:  # the others are copied
+        Image.fromarray(WALL[:64, :96]).save(noise / "3.webp")
+    allowed = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "1.jpg" and allowed(path, mode))  # for root
+    with pytest.raises(SceneError, match=rf"^{re.escape(str(noise / '1.jpg'))}: no permission to read it; "):
+        prepare_scene(noise, tmp_path / "scene", progress=False)
 
 
 def test_webp_photos_become_jpeg_files_which_colmap_reads(
@@ -348,7 +373,9 @@ def test_reasons_for_photos_without_a_place(tmp_path: Path) -> None:
 
 
 def test_cameras_that_rest_on_few_points_are_told() -> None:
-    assert few_points(557, 29).startswith("557 points are few for 29 photos: cameras may be wrong")  # a museum piece
+    assert few_points(557, 29).startswith(
+        "557 points for 29 photos, so few that cameras may be wrong"
+    )  # a museum piece
     assert not few_points(12540, 50)  # fox
 
 

@@ -333,7 +333,7 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
     (empty / "a.dng").write_bytes(b"")
     refused(SceneError, r"0 photos \(and files of type \.dng\)", empty)
     shutil.copy(noise / "00.png", empty)
-    refused(SceneError, "1 photos", empty)
+    refused(SceneError, r"1 photo \(and files of type \.dng\), expected", empty)
     shutil.copy(noise / "00.png", empty / "00.tif")
     refused(SceneError, r"00\.png and 00\.tif would both become 00\.png", empty)
     refused(

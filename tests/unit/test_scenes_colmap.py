@@ -424,12 +424,12 @@ def test_first_of_several_broken_images_is_the_one_named(tmp_path: Path) -> None
 
 def test_fewer_than_two_training_views(tmp_path: Path) -> None:
     one = make_scene(tmp_path / "one", Model(names=["a.png"]))
-    with pytest.raises(SceneError, match="1 training views, expected at least 2; add photos"):
+    with pytest.raises(SceneError, match="1 training view, expected at least 2; add photos"):
         load(one)
     two = make_scene(tmp_path / "two", Model(names=["a.png", "b.png"]))
     assert len(load(two).train) == 2
     with pytest.raises(
-        SceneError, match="1 training views besides 1 held out, expected at least 2; train without --eval"
+        SceneError, match="1 training view besides 1 held out, expected at least 2; train without --eval"
     ):
         load(two, eval=True)
 

@@ -444,4 +444,4 @@ def test_pair_without_its_test_file(tmp_path: Path) -> None:
 
 
 def test_too_few_views(tmp_path: Path) -> None:
-    refused(capture(tmp_path, 1), "1 training views, expected at least 2")
+    refused(capture(tmp_path, 1), "1 training view, expected at least 2")

@@ -10,11 +10,11 @@ from typing import Any
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
-from lapgs_plugin.scenes.images import check_image, has_alpha, image_size
+from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, require_readable
 from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_photos, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import CONVERTED, camera_of, convert_photo
+from lapgs_plugin.scenes.prepare.photos import CONVERTED, camera_of, convert_photo, listed
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +37,7 @@ def make_photos(job: Job) -> None:
         others = [name for name, source in found.files.items() if source.suffix.lower() in CONVERTED]
         for name, source in found.files.items():
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
+            require_readable(source)
             if name not in others:
                 shutil.copy2(source, partial / name)
         job.each_photo("Converting photos", lambda name: convert_photo(found.files[name], partial / name), others)
@@ -92,7 +93,27 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
         VIEW_PIXELS.check(int(width * share) * int(height * share), subject, "choose a smaller --max-size", SceneError)
         return width, height
 
-    return dict(zip(job.names, job.each_photo("Reading photos", size, job.names), strict=True))
+    def size_or_error(name: str) -> tuple[int, int] | SceneError:
+        try:
+            return size(name)
+        except SceneError as error:
+            return error
+
+    found = dict(zip(job.names, job.each_photo("Reading photos", size_or_error, job.names), strict=True))
+    _refuse_all({name: result for name, result in found.items() if isinstance(result, SceneError)}, len(found))
+    return {name: result for name, result in found.items() if not isinstance(result, SceneError)}
+
+
+def _refuse_all(refused: dict[str, SceneError], total: int) -> None:
+    """Raise the error of a photo, or one that lists several, so that a user need not find them one by one."""
+    if not refused:
+        return
+    first = next(iter(refused.values()))
+    if len(refused) == 1:
+        raise first
+    raise SceneError(
+        f"{len(refused)} of {total} photos cannot be used: {listed(list(refused))}; the first: {first}"
+    ) from first
 
 
 def one_camera(job: Job, sizes: dict[str, tuple[int, int]]) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
+from lapgs_plugin.errors import counted
 from lapgs_plugin.scenes.prepare.colmap import VERIFIED
 
 FEW_FEATURES = 100
@@ -31,7 +32,8 @@ def few_points(points: int, photos: int) -> str:
     if points >= FEW_POINTS * photos:
         return ""
     return (
-        f"{points} points are few for {photos} photos: cameras may be wrong; what may help: --matcher exhaustive, "
+        f"{counted(points, 'point')} for {photos} photos, so few that cameras may be wrong; "
+        "what may help: --matcher exhaustive, "
         "larger masks, or more photos, sharp, in more light and a step aside from each other"
     )
 

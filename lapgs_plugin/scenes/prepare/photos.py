@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from lapgs_plugin.errors import MissingExtraError, SceneError, first_line, printable
+from lapgs_plugin.errors import MissingExtraError, SceneError, counted, first_line, printable
 from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG_QUALITY
 from lapgs_plugin.scenes.masks import HEIC
@@ -73,7 +73,8 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     heic = [file for file in present if file.suffix.lower() in HEIC]
     if heic and find_spec("pillow_heif") is None:
         raise MissingExtraError(
-            f"{source}: {len(heic)} HEIC photos ({listed([file.name for file in heic])}) need pillow-heif: "
+            f"{source}: pillow-heif is needed for {counted(len(heic), 'HEIC photo')} "
+            f"({listed([file.name for file in heic])}): "
             "pip install 'lapgs_plugin[heic]'; or convert them to JPEG"
         )
     chosen = [file for file in present if file.suffix.lower() in (*SUFFIXES, *HEIC)]
@@ -81,7 +82,8 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     if len(chosen) < 2:
         found = f" (and files of type {', '.join(others)})" if others else ""
         raise SceneError(
-            f"{source}: {len(chosen)} photos{found}, expected at least 2, better 30, as JPEG, PNG, TIFF, BMP, WebP or "
+            f"{source}: {counted(len(chosen), 'photo')}{found}, expected at least 2, "
+            "better 30, as JPEG, PNG, TIFF, BMP, WebP or "
             "HEIC; of a video give the file itself"
         )
     if others:
