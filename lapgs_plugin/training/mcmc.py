@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.training.multiview import ViewScores
 
 START_SCALE, START_OPACITY = 0.1, 0.5
-"""Factor on the sizes, and opacity, of a field that starts from points."""
+"""Factor on the sizes, and opacity, of a field that starts from points, as MCMC's authors have them."""
 DEAD_OPACITY = 0.005
 """Gaussians with at most this opacity are moved."""
 MOST_COPIES = 51
@@ -42,11 +42,11 @@ SOLID = 0.1
 """Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
 
 
-def mcmc_start(field: GaussianField) -> GaussianField:
-    """Return a field from points with the sizes and opacities that MCMC's authors start with."""
+def mcmc_start(field: GaussianField, scale: float = START_SCALE) -> GaussianField:
+    """Return a field from points with its sizes times `scale`, half opaque."""
     return field.with_parameters(
         {
-            "log_scales": field.log_scales + math.log(START_SCALE),
+            "log_scales": field.log_scales + math.log(scale),
             "opacity_logits": torch.full_like(field.opacity_logits, math.log(START_OPACITY / (1 - START_OPACITY))),
         }
     )

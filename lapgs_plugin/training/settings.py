@@ -14,6 +14,7 @@ from lapgs_plugin.options import check_values, option, option_name, options_of
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
+    FEW_PHOTOS,
     GRADIENTS,
     LONG_RUN,
     MCMC,
@@ -47,8 +48,8 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that are fields of the manifest itself."""
 
 
-FEW_PHOTOS, FEW_DROPOUT = 40, 0.2
-"""Default of `TrainSettings.dropout` for fewer training photos than that."""
+FEW_DROPOUT = 0.2
+"""Default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos."""
 PASSES = 300
 """Passes over few training photos in a run whose iterations are left open; more of them gain little."""
 

@@ -47,7 +47,7 @@ def first_model(context: RunContext, stage: Stage) -> TrainableField:
 def _field_of_points(context: RunContext, stage: Stage) -> GaussianField:
     scene, settings = context.scene, context.settings
     points = field_from_points(scene.points, scene.colors, settings.sh_degree_of(stage.level))
-    return settings.densification.options.start(points)
+    return settings.densification.options.start(points, len(scene.train))
 
 
 def _moments(context: RunContext, level: int, field: GaussianField) -> dict[str, Any]:

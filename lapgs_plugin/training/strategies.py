@@ -31,6 +31,8 @@ ABSGRAD_THRESHOLD = 8e-4
 
 PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
 """Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
+FEW_PHOTOS = 40
+"""Fewer training photos than that leave room for floaters."""
 LONG_RUN = 5_000
 """Iterations from which MCMC is better than 3DGS's heuristics: it starts from tiny Gaussians, and short runs end before
 they have grown."""
@@ -87,8 +89,8 @@ class Strategy:
         """Most Gaussians of a stage, of what `of_stage` returned; None if there is no limit."""
         return None
 
-    def start(self, field: GaussianField) -> GaussianField:
-        """Return the field to train, given one that was made from points."""
+    def start(self, field: GaussianField, photos: int) -> GaussianField:
+        """Return the field to train on so many photos, given one that was made from points."""
         return field
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
@@ -241,10 +243,11 @@ class Mcmc(Regularized):
     def most(self) -> int | None:
         return self.cap_max
 
-    def start(self, field: GaussianField) -> GaussianField:
-        from lapgs_plugin.training.mcmc import mcmc_start
+    def start(self, field: GaussianField, photos: int) -> GaussianField:
+        from lapgs_plugin.training.mcmc import START_SCALE, mcmc_start
 
-        return mcmc_start(field)
+        # Few photos do not correct what tiny Gaussians with space between them grow into.
+        return mcmc_start(field, 1.0 if photos < FEW_PHOTOS else START_SCALE)
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
         from lapgs_plugin.training.mcmc import McmcDensifier

@@ -35,7 +35,7 @@ class Copying(Strategy):
     densify_until: ClassVar[int] = 30_000
     copies: int = option(2, "Gaussians to copy at a time.", panel="Density control", least=1)
 
-    def start(self, field):
+    def start(self, field, photos):
         return field.with_parameters({name: value[:100] for name, value in field.parameters.items()})
 
     def density_control(self, schedule, extent):

@@ -25,7 +25,7 @@ from lapgs_plugin.reference_raster.oracle import world_covariances
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training import mcmc
-from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, mcmc_start, shake
+from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, shake
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
@@ -284,8 +284,9 @@ def test_a_sparse_step_leaves_out_what_no_view_shows_although_the_loss_has_all_o
     assert not touched[30:].any()
 
 
-def test_a_base_starts_small_and_half_opaque() -> None:
+@pytest.mark.parametrize(("photos", "scale"), [(40, 0.1), (39, 1.0)])
+def test_a_base_starts_small_unless_photos_are_few_and_half_opaque(photos: int, scale: float) -> None:
     field = blob_field(5)
-    started = mcmc_start(field)
-    torch.testing.assert_close(started.log_scales.exp(), 0.1 * field.log_scales.exp())
+    started = Mcmc().start(field, photos)
+    torch.testing.assert_close(started.log_scales.exp(), scale * field.log_scales.exp())
     torch.testing.assert_close(started.opacity_logits.sigmoid(), torch.full((5,), 0.5))
