@@ -392,6 +392,11 @@ class BackboneAdapter(ABC):
                     )
             return self.snapshot(gaussians, signed)
 
+    @classmethod
+    def archived_parameters(cls) -> tuple[str, ...]:
+        """Return the parameters that a model needs to be archived; none if the adapter makes fields in its own way."""
+        return tuple(PARAMETERS) if cls.snapshot is BackboneAdapter.snapshot else ()
+
     def snapshot(self, gaussians: Any, signed: bool) -> GaussianField:
         """Return a copy of the model's parameters as a field on their device."""
         import torch

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
@@ -100,8 +99,7 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:
-    own = adapter_class(source.root).snapshot is not BackboneAdapter.snapshot
-    if not own and (absent := source.unknown_attributes(PARAMETERS)):
+    if absent := source.unknown_attributes(adapter_class(source.root).archived_parameters()):
         why = f"its Gaussians ({source.model[1]}) have no {', '.join(absent)}, from which fields are archived"
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     if (several := source.image_scales) is not None:

@@ -283,9 +283,8 @@ def _create(
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
     loaded = load_reference(reference)
-    if choose_iterations and (settings_for_few := settings.for_photos(len(loaded.train))) != settings:
-        settings = settings_for_few
-        _say_chosen(len(loaded.train), settings.iterations)
+    if choose_iterations:
+        settings = _for_photos(len(loaded.train), settings)
     require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
     manifest = Manifest(
         scene=replace(reference, kind=loaded.kind),
@@ -295,13 +294,16 @@ def _create(
     return RunArchive.create(out, manifest, overwrite), loaded, settings
 
 
-def _say_chosen(photos: int, iterations: int) -> None:
-    """Say that a run on few photos is shorter than others."""
-    make_console(stderr=True).print(
-        f"{photos} training photos: {iterations:,} iterations, {iterations // photos} passes over them; more gain "
-        "little with so few photos, and --iterations asks for another number",
-        soft_wrap=True,
-    )
+def _for_photos(photos: int, settings: TrainSettings) -> TrainSettings:
+    """Return `TrainSettings.for_photos`, and say if a run on few photos gets shorter by it."""
+    chosen = settings.for_photos(photos)
+    if chosen != settings:
+        make_console(stderr=True).print(
+            f"{photos} training photos: {chosen.iterations:,} iterations, {chosen.iterations // photos} passes over "
+            "them; more gain little with so few photos, and --iterations asks for another number",
+            soft_wrap=True,
+        )
+    return chosen
 
 
 def _run(

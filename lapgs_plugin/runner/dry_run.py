@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
-from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
@@ -222,11 +221,10 @@ class DryRun:
 
     def _require_parameters(self, gaussians: Any) -> None:
         """Refuse a model that lacks what a field has, unless its adapter makes fields otherwise."""
-        if type(self._adapter).snapshot is not BackboneAdapter.snapshot:
-            return
-        if absent := [name for name in PARAMETERS if not hasattr(gaussians, name)]:
+        needed = self._adapter.archived_parameters()
+        if absent := [name for name in needed if not hasattr(gaussians, name)]:
             raise UserInputError(
-                f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(PARAMETERS)}; the model "
+                f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(needed)}; the model "
                 f"has no {', '.join(absent)}; {OFF}"
             )
 

@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.training.settings import PASSES
-from lapgs_plugin.training.strategies import LONG_RUN
+from lapgs_plugin.training.settings import enough_iterations
 
 SAMPLES_OF_A_STAGE = 5
 """How often a stage measures some held-out views."""
@@ -24,8 +23,7 @@ LEAST_GAIN = 0.01
 LEAST_VIEWS = 12
 """Fewest training views of which some can be set aside."""
 FEW_VIEWS = 24
-"""A run on fewer training views than that, with more iterations than `TrainSettings.for_photos` gives it, may fit them
-alone."""
+"""A run on fewer training views than that, with more than `enough_iterations`, may fit them alone."""
 FALL = 0.5
 """Decibels below the best measurement that count as getting worse."""
 
@@ -72,7 +70,7 @@ def few_views_line(views: int, iterations: int, held_out: bool) -> str | None:
         held_out: whether other views are measured during the run.
     """
     passes = iterations // views
-    if views >= FEW_VIEWS or iterations <= max(LONG_RUN, PASSES * views):
+    if views >= FEW_VIEWS or iterations <= enough_iterations(views):
         return None
     keep = " or --keep best" if views >= LEAST_VIEWS else ""
     shows = "the held-out PSNR" if held_out else "--eval"

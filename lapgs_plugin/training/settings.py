@@ -21,6 +21,7 @@ from lapgs_plugin.training.strategies import (
     PANEL,
     STRATEGIES,
     Auto,
+    Mcmc,
     StagePart,
     Strategy,
     require_positive,
@@ -48,10 +49,17 @@ IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "sh_degree", "seed")
 """Settings that are fields of the manifest itself."""
 
 
-FEW_DROPOUT = 0.2
-"""Default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos."""
 PASSES = 300
 """Passes over few training photos in a run whose iterations are left open; more of them gain little."""
+
+
+def enough_iterations(photos: int) -> int:
+    """Return the iterations after which more gain little on few training photos, and no fewer than a long run has.
+
+    >>> enough_iterations(43), enough_iterations(10)
+    (12900, 5000)
+    """
+    return max(LONG_RUN, PASSES * photos)
 
 
 @dataclass(frozen=True)
@@ -188,8 +196,8 @@ class TrainSettings(HierarchySettings):
     dropout: float | None = option(
         None,
         "Share of the Gaussians that is left out at random, anew for each step, growing from 0 to this over a stage; "
-        f"against floaters that few photos allow. Default: {FEW_DROPOUT:g} for fewer than {FEW_PHOTOS} training photos "
-        "with --strategy mcmc, else 0.",
+        f"against floaters that few photos allow. Default: {Mcmc.few_dropout:g} for fewer than {FEW_PHOTOS} training "
+        "photos with --strategy mcmc, else 0.",
         panel=SCHEDULE,
     )
     exposure: str = option(
@@ -314,7 +322,7 @@ class TrainSettings(HierarchySettings):
 
         Settings of the paper, and of a schedule in iterations of the run, stay.
         """
-        enough, control = max(LONG_RUN, PASSES * count), self.densification
+        enough, control = enough_iterations(count), self.densification
         timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
         if enough >= self.iterations or timed or self.protocol == "paper":
             return self
@@ -366,7 +374,7 @@ class TrainSettings(HierarchySettings):
         """Return the share of Gaussians that the last steps of a stage leave out."""
         if self.dropout is not None:
             return self.dropout
-        return FEW_DROPOUT if training_photos < FEW_PHOTOS and self.densification.strategy == MCMC else 0.0
+        return self.densification.options.few_dropout if training_photos < FEW_PHOTOS else 0.0
 
     @property
     def paper_settings(self) -> Mapping[str, object]:

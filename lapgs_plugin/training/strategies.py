@@ -65,11 +65,13 @@ class Strategy:
     Attributes:
         densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
+        few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
     densify_until: ClassVar[int] = 15_000
     unused: ClassVar[tuple[str, ...]] = ()
+    few_dropout: ClassVar[float] = 0.0
 
     @property
     def needs_absgrad(self) -> bool:
@@ -218,6 +220,7 @@ class Mcmc(Regularized):
 
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
+    few_dropout: ClassVar[float] = 0.2
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )

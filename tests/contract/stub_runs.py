@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from lapgs_plugin.adapters.base import BackboneAdapter
@@ -23,6 +24,7 @@ from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 from lapgs_plugin.checkouts.script import loaded_script
 from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.errors import MissingExtraError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rendering.run import run_renderer, run_scene
@@ -289,3 +291,10 @@ def composed_psnr(archive: RunArchive) -> float:
         image = renderer.render(view.camera).composed[0].clamp(0, 1)
         values += [-10 * math.log10(float(error)) for error in ((image - view.image) ** 2).mean((1, 2))]
     return sum(values) / len(values)
+
+
+def stand_in_is_refused(checkout: Path, pattern: str) -> None:
+    """Check that a checkout has no CPU stand-in, and that one line says why."""
+    with pytest.raises(MissingExtraError, match=pattern) as caught:
+        adapter_class(checkout).stand_in_for(checkout, ())
+    assert "\n" not in str(caught.value)

@@ -10,8 +10,7 @@ import pytest
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.cli.doctor_checkout import describe
-from lapgs_plugin.errors import MissingExtraError
-from tests.contract.stub_runs import STUBS
+from tests.contract.stub_runs import STUBS, stand_in_is_refused
 
 
 @pytest.mark.parametrize(
@@ -69,17 +68,12 @@ def test_a_fork_that_kept_a_file_is_recognised_by_what_it_renders_with(
 def test_a_rasterizer_that_returns_more_than_any_stand_in(tmp_path: Path) -> None:
     """As those that return depth and alpha, too, and are otherwise called as graphdeco's."""
     checkout = changed(tmp_path, ("rendered_image, radii = ", "rendered_image, radii, depth, alpha = "))
-    with pytest.raises(
-        MissingExtraError, match=r"the nearest, graphdeco, returns 2 outputs, not 4; it needs"
-    ) as caught:
-        adapter_class(checkout).stand_in_for(checkout, ())
-    assert "\n" not in str(caught.value)
+    stand_in_is_refused(checkout, r"the nearest, graphdeco, returns 2 outputs, not 4; it needs")
 
 
 def test_a_setting_that_no_stand_in_takes(tmp_path: Path) -> None:
     checkout = changed(tmp_path, (BLUR, f"{BLUR}        confidence=1.0,\n"))
-    with pytest.raises(MissingExtraError, match=r"gaussian_renderer/__init__.py:\d+, .* takes no setting confidence"):
-        adapter_class(checkout).stand_in_for(checkout, ())
+    stand_in_is_refused(checkout, r"gaussian_renderer/__init__.py:\d+, .* takes no setting confidence")
 
 
 def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
@@ -91,8 +85,7 @@ def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
     binding.write_text("from .setup import _C\n\nclass GaussianRasterizer:\n    pass\n")
     (use,) = CheckoutSource.read(checkout / "train.py").rasterizers
     assert (use.module, use.functions) == (module, ("render",))
-    with pytest.raises(MissingExtraError, match=f"no CPU stand-in for {module}, imported in gaussian_renderer/__init_"):
-        adapter_class(checkout).stand_in_for(checkout, ())
+    stand_in_is_refused(checkout, f"no CPU stand-in for {module}, imported in gaussian_renderer/__init_")
     (found,) = describe(checkout)["Rasterizers"]
     assert (found.name, found.status) == (module, "ok")
     assert found.detail.startswith("part of the checkout; ")

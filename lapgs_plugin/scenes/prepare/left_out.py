@@ -32,9 +32,8 @@ def few_points(points: int, photos: int) -> str:
     if points >= FEW_POINTS * photos:
         return ""
     return (
-        f"{counted(points, 'point')} for {photos} photos, so few that cameras may be wrong; "
-        "what may help: --matcher exhaustive, "
-        "larger masks, or more photos, sharp, in more light and a step aside from each other"
+        f"{counted(points, 'point')} for {photos} photos, so few that cameras may be wrong; what may help: "
+        "--matcher exhaustive, larger masks, or more photos, sharp, in more light and a step aside from each other"
     )
 
 

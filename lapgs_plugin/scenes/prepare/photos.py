@@ -82,9 +82,8 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     if len(chosen) < 2:
         found = f" (and files of type {', '.join(others)})" if others else ""
         raise SceneError(
-            f"{source}: {counted(len(chosen), 'photo')}{found}, expected at least 2, "
-            "better 30, as JPEG, PNG, TIFF, BMP, WebP or "
-            "HEIC; of a video give the file itself"
+            f"{source}: {counted(len(chosen), 'photo')}{found}, expected at least 2, better 30, as "
+            "JPEG, PNG, TIFF, BMP, WebP or HEIC; of a video give the file itself"
         )
     if others:
         left = [file.name for file in present if file not in chosen]
