@@ -115,7 +115,7 @@ class ActiveStage:
         self._context.parts.breakdown.mark("other")
         every = self._context.test_every
         if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
-            elapsed = self.record.elapsed()
+            elapsed = self.record.elapsed_in_run()
             with self.record.outside("evaluation"):
                 self._measure_held_out(gaussians, iteration - 1, elapsed)
         if iteration == self._prune_at:
