@@ -6,13 +6,12 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a Speedy-Splat checkout, whose scores must not reach finished fields that are trained jointly."""
 
     info = BackboneInfo(
