@@ -312,9 +312,7 @@ class BackboneAdapter:
             for name in _options(opt, "feature", "_lr"):
                 setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
         values: dict[str, Any] = {**copies, **dict.fromkeys(CHECKPOINTS)}
-        for name, value in call.values.items():
-            if name.endswith("iterations") and isinstance(value, (list, tuple)):
-                values[name] = window.local(value)
+        values |= {name: window.local(iterations) for name, iterations in call.iteration_lists.items()}
         debug_from = call.values.get("debug_from", -1)
         pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1

@@ -28,7 +28,7 @@ from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import StagePlan, level_size
-from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
+from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.loop_record import LoopRecord
@@ -40,9 +40,6 @@ logger = logging.getLogger(__name__)
 
 MOST_POINTS = 20_000
 """About how many of the scene's points the dry run starts from."""
-
-SAME_COLOR = 1e-3
-"""Largest difference of two images of one field: rounding gives 1e-6, a wrong colour map about 1."""
 
 SAME_VALUE = 1e-3
 """Largest relative difference of a scale or opacity from the archived one: logits and logarithms round to 1e-6."""
@@ -170,10 +167,7 @@ class DryRun:
             values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
             values["dataset"].model_path = str(folder)
             call = self._call.changed(**values)
-        lists: dict[str, Any] = {
-            name: [] for name, v in call.values.items() if name.endswith("iterations") and isinstance(v, (list, tuple))
-        }
-        return call.changed(**lists)
+        return call.changed(**{name: [] for name in call.iteration_lists})
 
     def _view(self, camera: Any) -> Any:
         """Return a camera at the level of the tried stage."""
@@ -257,7 +251,7 @@ class DryRun:
         finally:
             gaussians._features_dc, gaussians._features_rest = kept
         same = all(
-            bool(((a - b).abs() <= SAME_COLOR * (1 + b.abs().max())).all())
+            bool(((a - b).abs() <= PROBE_TOLERANCE * (1 + b.abs().max())).all())
             for a, b in zip(found, expected, strict=True)
         )
         return ColorPath.NATIVE if same else ColorPath.PRECOMPUTED
