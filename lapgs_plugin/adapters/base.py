@@ -90,7 +90,8 @@ class BackboneInfo:
         name: for `--backbone` and the manifest.
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
-        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, if it fits.
+        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, where runs are
+            rendered without a checkout, and where it fits the checkout's calls; empty is chosen by the calls alone.
         densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
             them by their names.
         own_files: files of its checkout that tell it from other code bases, relative to the checkout's root.
@@ -106,7 +107,7 @@ class BackboneInfo:
     name: str
     title: str
     rasterizer: str
-    stand_in: str
+    stand_in: str = ""
     densify_thresholds: tuple[str, ...] = ()
     own_files: tuple[str, ...] = ()
     family_files: tuple[str, ...] = FAMILY_FILES

@@ -29,7 +29,6 @@ class Adapter(BackboneAdapter):
         name="dashgaussian",
         title="DashGaussian",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="graphdeco-aa",
         own_files=("train_dash.py", "utils/schedule_utils.py"),
         family_files=(),
         fork_of=("graphdeco",),

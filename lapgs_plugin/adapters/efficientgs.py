@@ -25,7 +25,6 @@ class Adapter(BackboneAdapter):
         name="efficientgs",
         title="EfficientGS",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="efficientgs",
         own_files=("scene/renderer.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

@@ -8,6 +8,4 @@ from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 class Adapter(BackboneAdapter):
     """Drive a checkout by its profile alone."""
 
-    info = BackboneInfo(
-        name="generic", title="3DGS, a checkout of its own", rasterizer="diff_gaussian_rasterization", stand_in=""
-    )
+    info = BackboneInfo(name="generic", title="3DGS, a checkout of its own", rasterizer="diff_gaussian_rasterization")

@@ -32,7 +32,6 @@ class Adapter(BackboneAdapter):
         name="mini_splatting",
         title="Mini-Splatting",
         rasterizer="diff_gaussian_rasterization_ms",
-        stand_in="mini-splatting",
         own_files=("ms/train.py",),
         family_files=(),
         fork_of=("graphdeco",),

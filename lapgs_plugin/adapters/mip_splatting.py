@@ -22,7 +22,6 @@ class Adapter(BackboneAdapter):
         name="mip_splatting",
         title="Mip-Splatting",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="mip-splatting",
         own_files=("create_fused_ply.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

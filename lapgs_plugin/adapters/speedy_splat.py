@@ -18,7 +18,6 @@ class Adapter(BackboneAdapter):
         name="speedy_splat",
         title="Speedy-Splat",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="speedy-splat",
         own_files=("compute_scene_metrics.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

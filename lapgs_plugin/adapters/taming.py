@@ -43,7 +43,6 @@ class Adapter(BackboneAdapter):
         name="taming",
         title="Taming-3DGS",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="taming",
         density_scores=("compute_gaussian_score",),
         own_files=("utils/taming_utils.py",),
         unscaled=("ho_iteration",),

@@ -59,11 +59,11 @@ class RunContext:
             gaussians: the checkout's model.
             background: (3,) behind the Gaussians.
         """
-        outer, self.wrapper.stage = self.wrapper.stage, rendering
+        outer, self.wrapper.rendering = self.wrapper.rendering, rendering
         try:
             self.adapter.render(call, view, gaussians, background)
         finally:
-            self.wrapper.stage = outer
+            self.wrapper.rendering = outer
         image, rendering.captured = rendering.captured, None
         assert image is not None, "a rendering that captures"
         return image

@@ -32,7 +32,7 @@ from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, ex
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.loop_record import LoopRecord
-from lapgs_plugin.runner.raster_settings import fields_of, with_values
+from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
@@ -95,9 +95,8 @@ class DryRun:
             if self._stage.signed:
                 rendering.accumulated = _Nothing(sizes, self._context.device)
                 rendering.composed = frozenset(self._cameras)
-            stage = _DryStage(
-                self._context, self._scratch_call(folder), self._scene, self._view, rendering, self._window
-            )
+            call = self._scratch_call(folder)
+            stage = _DryStage(call, rendering, self._window, lambda gaussians: self._scene_for(call, gaussians))
             self._iterate(stage, works)
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
@@ -135,7 +134,7 @@ class DryRun:
             if stage.iteration == 0 and steps_positions(optimizer, stage.gaussians):
                 raise _Enough  # the loop would run to its end
 
-        self._context.wrapper.stage = stage.rendering
+        self._context.wrapper.rendering = stage.rendering
         self._activate(stage)
         watching = register_optimizer_step_post_hook(stepped)
         try:
@@ -145,7 +144,7 @@ class DryRun:
             pass
         finally:
             watching.remove()
-            self._context.wrapper.stage = None
+            self._context.wrapper.rendering = None
             self._activate(None)
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)
         if stage.iteration == 0:
@@ -168,6 +167,12 @@ class DryRun:
             values["dataset"].model_path = str(folder)
             call = self._call.changed(**values)
         return call.changed(**{name: [] for name in call.iteration_lists})
+
+    def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
+        """Return the checkout's scene with views of the tried stage, and make Gaussians of some of its points."""
+        train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
+        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+        return self._scene.copy(gaussians, call.dataset.model_path, train, test)
 
     def _view(self, camera: Any) -> Any:
         """Return a camera at the level of the tried stage."""
@@ -295,23 +300,19 @@ class _DryStage:
 
     def __init__(
         self,
-        context: RunContext,
         call: TrainingCall,
-        scene: CheckoutScene,
-        view: Callable[[Any], Any],
         rendering: StageRendering,
         window: StageWindow | None,
+        make_scene: Callable[[Any], Any],
     ) -> None:
-        self._context, self.call, self._scene, self._view = context, call, scene, view
-        self.rendering, self.window, self.keeps_schedule = rendering, window, window is None
-        self.record, self.iteration = LoopRecord(context.device), 0
+        self.call, self.rendering, self.window, self._make_scene = call, rendering, window, make_scene
+        self.keeps_schedule, self.iteration = window is None, 0
+        self.record = LoopRecord(torch.device("cpu"))  # what it measures is dropped
         self.gaussians: Any = None
 
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
-        train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
-        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
-        return self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
+        return self._make_scene(gaussians)
 
     def optimizers_made(self, gaussians: Any) -> None:
         """Do nothing: there is nothing to inherit."""

@@ -7,7 +7,7 @@ launches of a render of its own to an iteration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -112,16 +112,9 @@ class JointLevels:
             one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
         return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
 
-    @property
-    def fields(self) -> dict[int, GaussianField]:
-        """Copies of the fields by level, on the device."""
-        adapter = self._context.adapter
-        return {one.of.stage.level: adapter.snapshot(one.gaussians, one.of.stage.signed) for one in self._fields}
-
-    def export_fields(self) -> dict[int, GaussianField]:
-        """Return the fields for the archive by level, on the CPU; see `BackboneAdapter.export_field`."""
-        export, stages = self._context.adapter.export_field, [(one, one.of.stage) for one in self._fields]
-        return {stage.level: export(one.gaussians, stage.signed).to("cpu") for one, stage in stages}
+    def fields(self, read: Callable[[Any, bool], GaussianField]) -> dict[int, GaussianField]:
+        """Return the fields by level; `read` makes one from the checkout's model and whether it is a residual."""
+        return {one.of.stage.level: read(one.gaussians, one.of.stage.signed) for one in self._fields}
 
 
 class _Follow:

@@ -90,7 +90,7 @@ class StageViews:
         keys = {id(view): key for key, view in self._views.items()}
 
         def prefetch(view: Any) -> None:
-            rendering = self._context.wrapper.stage  # of the running stage: views may outlive this one
+            rendering = self._context.wrapper.rendering  # of the running stage: views may outlive this one
             if rendering is not None:
                 rendering.prefetch(keys[id(view)])
 
