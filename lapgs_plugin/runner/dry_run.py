@@ -189,8 +189,7 @@ class DryRun:
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
-        background = torch.zeros(3, device=self._context.device)
-        image = self._context.render(rendering, self._call, view, gaussians, background)
+        image = self._context.render(rendering, self._call, view, gaussians, black=True)
         self._inputs = rendering.inputs
         return image
 

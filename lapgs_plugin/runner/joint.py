@@ -35,14 +35,12 @@ class _JointField:
         of: the stage that it comes from.
         gaussians: the checkout's model of it.
         rendering: tells the rasterizer's wrapper to render it alone.
-        background: (3,) behind it.
         views: level views by key, made when they are first rendered.
     """
 
     of: FinishedStage
     gaussians: Any
     rendering: StageRendering
-    background: Tensor
     views: dict[str, Any] = field(default_factory=dict)
 
 
@@ -68,8 +66,7 @@ class JointLevels:
         rendering = StageRendering(
             signed=finished.stage.signed, path=self._run.color_path, views=self._views.cameras, capture=True
         )
-        background = torch.full((3,), float(call.white_background), device=device)
-        return _JointField(finished, gaussians, rendering, background)
+        return _JointField(finished, gaussians, rendering)
 
     def follow(self, gaussians: Any, residual_color_rate: float) -> None:
         """Step the finished fields whenever an optimizer of the running stage steps, at its learning rates.
@@ -110,7 +107,7 @@ class JointLevels:
             stage, camera = one.of.stage, self._views.cameras[key]
             size = self._views.size(key, stage.level)
             one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
-        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
+        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians)
 
     def fields(self, read: Callable[[Any, bool], GaussianField]) -> dict[int, GaussianField]:
         """Return the fields by level; `read` makes one from the checkout's model and whether it is a residual."""
