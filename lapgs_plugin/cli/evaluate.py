@@ -136,14 +136,13 @@ def _print(metrics: dict[str, Any]) -> None:
 def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     from rich.markup import escape
 
-    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+    from lapgs_plugin.evaluation.lpips import lpips_titles
 
-    measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
-    headings = [f"LPIPS ({title_of(name)})" for name in measured]
-    table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings)
+    measured = lpips_titles(metrics)
+    table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *measured.values())
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
-        distances = [f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured]
+        distances = [f"{view[key]:.4f}" for key in measured]
         figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
@@ -176,11 +175,11 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
-    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, missing_lines
+    from lapgs_plugin.evaluation.lpips import lpips_titles, missing_lines
 
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
     where = " inside their masks" if metrics["masked"] else ""
-    if where and any(LPIPS_KEY.format(name) in metrics for name in VARIANTS):
+    if where and lpips_titles(metrics):
         where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(

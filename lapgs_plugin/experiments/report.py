@@ -19,19 +19,18 @@ from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
-from lapgs_plugin.reports.pictures import Strip
-from lapgs_plugin.reports.report import (
-    MeasuredRun,
-    ViewRow,
-    count_text,
+from lapgs_plugin.reports.charts import (
+    Arrow,
+    Bar,
+    BarChart,
+    Chart,
+    draw_arrows,
+    draw_bars,
     number_text,
-    render_page,
     seconds_text,
-    training_charts,
-    view_strips,
-    view_table,
 )
+from lapgs_plugin.reports.pictures import Strip
+from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
@@ -51,30 +50,6 @@ FIGURES = ("train_seconds", "gaussians")
 """Columns with numbers that every row has."""
 
 Row = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One scene on one backbone.
-
-    Attributes:
-        title: names of both.
-        charts: charts of training, see `report.training_charts`.
-        names: variants by the style of their lines.
-        strips: views of a variant beside the baseline.
-        view_columns, view_rows: see `report.view_table`.
-        compared: the variants that the views compare, in words.
-        notes: parts that could not be shown, with the reason.
-    """
-
-    title: str
-    charts: dict[str, list[Chart]]
-    names: dict[str, str]
-    strips: list[Strip]
-    view_columns: list[str]
-    view_rows: list[ViewRow]
-    compared: str
-    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -212,9 +187,7 @@ def _time_arrows(results: Results) -> Chart | None:
                 arrows.append(Arrow(results.style(variant), label, start, end))
     if not arrows:
         return None
-    return draw_arrows(
-        "Optimization (s) against Gaussians", COUNTS[column], arrows, format_x=count_text, format_y=count_text
-    )
+    return draw_arrows("Optimization (s) against Gaussians", COUNTS[column], arrows)
 
 
 def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
@@ -253,14 +226,18 @@ def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable
             ]
             if parts:
                 bars.append(Bar(results.title(variant, backbone), parts))
-    return draw_bars(title, bars, format_value=text) if bars else None
+    return draw_bars(title, bars, text) if bars else None
 
 
 # One scene on one backbone.
 
 
-def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> Part:
-    """Show the first seed of every variant."""
+def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> dict[str, Any]:
+    """Return what the page shows of a scene on a backbone, with the first seed of every variant.
+
+    Keys: title; charts of training, and variants by the style of their lines; views of a variant beside the baseline
+    as pictures and as a table, and the variants that these compare, in words; notes on what could not be shown.
+    """
     runs: dict[str, MeasuredRun] = {}
     notes = []
     for variant in results.variants:
@@ -270,27 +247,25 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
             except LapgsError as error:
                 notes.append(f"{variant} is not shown: {error}")
     base = results.baseline(backbone)
-    charts = {}
-    if runs:
-        kinds = [results.style(variant) for variant in runs]
-        charts = training_charts(list(runs.values()), kinds)
-    names = {results.style(variant): variant for variant in runs}
     measured = [name for name in runs if runs[name].metrics.get("views")]
     shown = next((name for name in measured if name != base), base)
+    pair = [runs[name] for name in dict.fromkeys((shown, base)) if name in measured]
     strips: list[Strip] = []
-    columns: list[str] = []
-    rows: list[ViewRow] = []
-    compared = ""
-    if shown in measured:
-        pair = [runs[name] for name in dict.fromkeys((shown, base)) if name in measured]
-        columns, rows = view_table(pair)
-        compared = shown if len(pair) == 1 else f"{shown}, beside {base}"
+    if pair:
         try:
             renderers = [run_renderer(run.archive, device, rasterizer) for run in pair]
             strips = view_strips(pair[0], renderers, None, most=1)
         except LapgsError as error:
             notes.append(f"no pictures: {error}")
-    return Part(results.title(scene, backbone), charts, names, strips, columns, rows, compared, notes)
+    return {
+        "title": results.title(scene, backbone),
+        "charts": training_charts(list(runs.values()), [results.style(name) for name in runs]) if runs else {},
+        "styles": {results.style(name): name for name in runs},
+        "strips": strips,
+        "views": view_table(pair) if pair else None,
+        "compared": shown if len(pair) == 1 else f"{shown}, beside {base}",
+        "notes": notes,
+    }
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+from lapgs_plugin.evaluation.lpips import lpips_titles
 from lapgs_plugin.runs.manifest import Manifest
 
 Metrics = dict[str, Any]
@@ -61,9 +61,8 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
         *(
-            (LPIPS_KEY.format(name), f"LPIPS ({title_of(name)}), {views} views", "{:.4f}", _difference("{:+.4f}"))
-            for name in VARIANTS
-            if any(LPIPS_KEY.format(name) in each for each in metrics)
+            (key, f"{title}, {views} views", "{:.4f}", _difference("{:+.4f}"))
+            for key, title in lpips_titles({name for each in metrics for name in each}).items()
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),
