@@ -25,12 +25,8 @@ SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
-NEGATIONS = {
-    "dry-run": ["--no-dry-run"],
-    "fused-adam": ["--no-fused-adam"],
-    "prune-by-size": ["--no-prune-by-size"],
-}
-"""Words that switch off options which are on by default."""
+ON_BY_DEFAULT = ("dry-run", "fused-adam", "prune-by-size")
+"""Options that --no-NAME switches off."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""
 
@@ -230,10 +226,10 @@ def _as_options(options: Mapping[str, Any]) -> list[str]:
     words = []
     for name, value in options.items():
         option = name.replace("_", "-")
-        if isinstance(value, bool):
-            words += [f"--{option}"] if value else NEGATIONS.get(option, [])
-        else:
+        if not isinstance(value, bool):
             words += [f"--{option}", str(value)]
+        elif value or option in ON_BY_DEFAULT:
+            words.append(f"--{option}" if value else f"--no-{option}")
     return words
 
 
