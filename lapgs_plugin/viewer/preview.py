@@ -81,14 +81,16 @@ def save_run_preview(run: Path, device: str = "auto", moved_to: Path | None = No
     """
     with _logged(run):
         # Imported here, because a backbone's environment may lack such packages as OpenImageIO.
+        from lapgs_plugin.jit.threads import one_pool
         from lapgs_plugin.rendering.run import run_renderer
         from lapgs_plugin.runs.archive import RunArchive
         from lapgs_plugin.viewer.pictures import ShownRun
         from lapgs_plugin.viewer.poses import SceneCameras
 
-        archive = RunArchive.open(run)
-        cameras = SceneCameras.of(archive, moved_to)
-        save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
+        with one_pool():
+            archive = RunArchive.open(run)
+            cameras = SceneCameras.of(archive, moved_to)
+            save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
 
 
 @contextmanager
