@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
@@ -29,7 +28,7 @@ from lapgs_plugin.experiments.schema import Experiment, load_experiment
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
 from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
 from lapgs_plugin.experiments.tables import latex, markdown
-from lapgs_plugin.files import write_text
+from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
 
 SET_BY_EXPERIMENTS = {
@@ -91,7 +90,7 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
         return None
     weights = settings.lpips_weights or []
     for file in weights:
-        if not os.path.isfile(file):  # noqa: PTH113  # Path.is_file raises where a name is too long
+        if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
     missing = [name for name in READS_SCENES if find_spec(name) is None]
     if missing:

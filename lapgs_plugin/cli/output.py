@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def require_place(folder: Path) -> None:
         if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
             raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
         existing = os.path.dirname(existing)  # noqa: PTH120
-    if not os.path.isdir(existing):  # noqa: PTH112
+    if not is_folder(Path(existing)):
         raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
@@ -71,7 +72,7 @@ class Locations:
         names = [scene.name, *([scene.dataset] if scene.dataset else [])]
         folder = self._require_folder(f"scene {scene.name}", folder, names)
         transforms = any(folder.glob("transforms*.json"))
-        if not transforms and not _is_folder(folder / scene.images):
+        if not transforms and not is_folder(folder / scene.images):
             raise UserInputError(
                 f"scene {scene.name}: {folder} has no image folder {scene.images}; expected a COLMAP or Blender-style "
                 f'scene; give another folder with --path {scene.name}=FOLDER or set images = "..." in the experiment'
@@ -100,13 +101,9 @@ class Locations:
         ways = " or ".join(f"--path {name}=FOLDER ({_environment_variable(name)})" for name in names)
         if folder is None:
             raise UserInputError(f"{what}: its folder is not given; give {ways}")
-        if not _is_folder(folder):
+        if not is_folder(folder):
             raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
         return folder.absolute()
-
-
-def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises when a name is too long for the file system
 
 
 def _environment_variable(name: str) -> str:
