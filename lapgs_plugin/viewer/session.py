@@ -272,6 +272,10 @@ class Session:
                 wxyz=pose.wxyz,
                 position=pose.position,
             )
-            frustum.on_click(lambda _, index=index: self._go_to(index))
+
+            @frustum.on_click
+            def _(_: object, index: int = index) -> None:
+                self._go_to(index)
+
             frustums.append(frustum)
         return frustums
