@@ -85,7 +85,7 @@ class BackboneInfo:
         name: for `--backbone` and the manifest.
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
-        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU.
+        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, if it fits.
         color_rates: its options that are learning rates of SH coefficients; empty finds them by their names.
         densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
             them by their names.
@@ -186,12 +186,11 @@ class BackboneAdapter(ABC):
             arguments: arguments of its script.
 
         Raises:
-            MissingExtraError: there is none; the line says what the checkout's calls have that stand-ins lack.
+            MissingExtraError: there is none; see `fitting_stand_in`.
         """
-        from lapgs_plugin.checkouts.stand_in import require_stand_in
-        from lapgs_plugin.reference_raster.standins import variant_for
+        from lapgs_plugin.checkouts.stand_in import fitting_stand_in
 
-        return require_stand_in(cls.info.stand_in or variant_for(checkout), checkout)
+        return fitting_stand_in(checkout, cls.info.stand_in)
 
     @classmethod
     def rasterizer_semantics(cls) -> Semantics | None:

@@ -61,14 +61,7 @@ class Adapter(generic.Adapter):
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        from lapgs_plugin.checkouts.stand_in import require_stand_in
-        from lapgs_plugin.reference_raster.standins import FORKS, variant_for
+        from lapgs_plugin.checkouts.stand_in import fitting_stand_in
 
-        renderer = checkout / "gaussian_renderer" / "__init__.py"
-        newer = "antialiasing" in renderer.read_text(encoding="utf-8", errors="replace")
-        found = variant_for(checkout)
-        if found in FORKS:
-            return require_stand_in(found, checkout)
         wants_sparse_adam = any(argument.rpartition("=")[2] == "sparse_adam" for argument in arguments)
-        chosen = "graphdeco" if not newer else "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in
-        return require_stand_in(chosen, checkout)
+        return fitting_stand_in(checkout, "graphdeco-accel" if wants_sparse_adam else cls.info.stand_in)

@@ -36,11 +36,13 @@ class External:
 
     Attributes:
         name: full name of the module.
+        names: names that are imported from it.
         where: file and line of its import.
         optional: whether the import may fail: in a `try`, or in a function that may never be called.
     """
 
     name: str
+    names: tuple[str, ...]
     where: str
     optional: bool
 
@@ -274,21 +276,21 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
         needed = {id(node) for node in _always_executed(tree.body)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
+                imports: dict[str, tuple[str, ...]] = {alias.name: () for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names = [node.module]
+                imports = {node.module: tuple(alias.name for alias in node.names)}
             else:
                 continue
             where = place(path, root, node.lineno)
-            for each in names:
+            for each, names in imports.items():
                 if each not in modules and each.partition(".")[0] not in modules:
-                    yield External(each, where, id(node) not in needed)
+                    yield External(each, names, where, id(node) not in needed)
 
 
 def _always_executed(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
     """Yield statements that importing a module executes, whatever fails."""
     for node in body:
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Try)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Try, ast.With)):  # `with suppress(ImportError)`
             continue
         yield node
         yield from _always_executed(getattr(node, "body", []))

@@ -1,4 +1,4 @@
-"""Check that a CPU stand-in takes what a checkout passes to its rasterizer, and returns what the checkout unpacks."""
+"""Choose the CPU stand-in that takes what a checkout passes to its rasterizer and returns what the checkout unpacks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
-from lapgs_plugin.checkouts.source import readable_source
+from lapgs_plugin.checkouts.source import CheckoutSource, readable_source
 from lapgs_plugin.errors import MissingExtraError
 from lapgs_plugin.reference_raster.standins.variants import VARIANTS, rasterizer_module
 
@@ -15,35 +15,43 @@ OPTIONAL_INPUTS = {"dc", "raster_settings"}
 """Inputs that checkouts pass in one of several calls, and that of the constructor."""
 
 
-def require_stand_in(variant: str | None, checkout: Path) -> str:
-    """Return a variant of `standins.VARIANTS`, chosen for a checkout, if it fits the calls of its training script.
+def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
+    """Return the variant of `standins.VARIANTS` that fits the imports and calls of a checkout's training script.
 
     Args:
-        variant: the chosen one; None if none was found.
         checkout: root of the checkout.
+        preferred: variant to choose if it fits; empty prefers the one with the fewest functions of its own.
 
     Raises:
-        MissingExtraError: it does not; the line says what the nearest one lacks, and where it is needed.
+        MissingExtraError: none does; the line says what the nearest one lacks, and where it is needed.
     """
     source = readable_source(checkout)
     uses = () if source is None else source.rasterizers
-    if variant is not None and not list(_lacks(variant, uses)):
-        return variant
-    names = [name for name, each in VARIANTS.items() if each.module in {use.module for use in uses}]
-    near = variant or min(names, key=lambda name: len(list(_lacks(name, uses))), default=None)
-    lacks = [] if near is None else list(_lacks(near, uses))
-    modules, places = (", ".join(dict.fromkeys(each)) for each in ([u.module for u in uses], [u.where for u in uses]))
-    why = f"; the nearest, {near}, {' and '.join(lacks)}" if lacks else ""
+    modules, places = (dict.fromkeys(each) for each in ([use.module for use in uses], [use.where for use in uses]))
+    known = [name for name, each in VARIANTS.items() if each.module in modules]
+    known.sort(key=lambda name: len(VARIANTS[name].functions) + len(VARIANTS[name].beside))
+    names = dict.fromkeys([preferred, *known] if preferred else known)
+    lacks = {name: [] if source is None else list(_lacks(name, source)) for name in names}
+    near = min(lacks, key=lambda name: len(lacks[name]), default="")
+    found = [*lacks.get(near, ()), *_unreturned(near, uses)]
+    if near and not found:
+        return near
+    why = f"; the nearest, {near}, {' and '.join(found)}" if near else ""
     raise MissingExtraError(
-        f"no CPU stand-in for {modules or 'a rasterizer'}, imported in {places or 'the checkout'}, with the settings, "
-        f"inputs and outputs of the checkout{why}; it needs a CUDA device"
+        f"no CPU stand-in for {', '.join(modules) or 'a rasterizer'}, imported in "
+        f"{', '.join(places) or 'the checkout'}, with the settings, inputs and outputs of the checkout{why}; it needs "
+        "a CUDA device"
     )
 
 
-def _lacks(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[str]:
-    """Yield what a variant, or those beside it, would have to take or return, as ends of sentences."""
-    offered = {VARIANTS[each].module: each for each in (variant, *VARIANTS[variant].beside)}
-    for use in uses:
+def _lacks(variant: str, source: CheckoutSource) -> Iterator[str]:
+    """Yield what a variant, or those beside it, would have to have or take, as ends of sentences."""
+    offered = _offered(variant)
+    for one in source.externals:
+        if one.name in offered and not one.optional:
+            absent = set(one.names) - rasterizer_module(offered[one.name]).keys() - {"_C"}
+            yield from (f"has no {name}" for name in sorted(absent))
+    for use in source.rasterizers:
         each = VARIANTS.get(offered.get(use.module, ""))
         if each is None:
             yield f"has no {use.module}"
@@ -57,5 +65,17 @@ def _lacks(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[str]:
         forward = rasterizer_module(offered[use.module])["GaussianRasterizer"].forward
         for name in sorted(use.inputs - set(inspect.signature(forward).parameters) - OPTIONAL_INPUTS):
             yield f"takes no input {name}"
-        if each.returned is not None and use.outputs > each.returned:
-            yield f"returns {each.returned} outputs, not {use.outputs}"
+
+
+def _unreturned(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[str]:
+    """Yield the outputs that a variant would have to return; their number does not tell what they are."""
+    offered = _offered(variant) if variant else {}
+    for use in uses:
+        returned = VARIANTS[offered[use.module]].returned if use.module in offered else None
+        if returned is not None and use.outputs > returned:
+            yield f"returns {returned} outputs, not {use.outputs}"
+
+
+def _offered(variant: str) -> dict[str, str]:
+    """Return a variant and those beside it by their modules."""
+    return {VARIANTS[each].module: each for each in (variant, *VARIANTS[variant].beside)}

@@ -79,7 +79,7 @@ class ActiveStage:
     def load_images(self) -> None:
         """Make the level's images; from now on the checkout renders for this stage."""
         with self.record.overhead.timed("pyramid"):
-            self._views.images.load()
+            self._views.load_images()
         self._context.wrapper.stage = self._views.rendering
 
     @property
@@ -114,8 +114,8 @@ class ActiveStage:
         self._show(gaussians, iteration - 1)
         self._context.parts.breakdown.mark("other")
         every = self._context.test_every
-        if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.images.test:
-            elapsed = self.record.elapsed()
+        if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
+            elapsed = self.record.elapsed_in_run()
             with self.record.outside("evaluation"):
                 self._measure_held_out(gaussians, iteration - 1, elapsed)
         if iteration == self._prune_at:
@@ -167,14 +167,14 @@ class ActiveStage:
         Raises:
             LapgsError: training left nothing to archive, or NaN or inf.
         """
-        self.record.stop(self._views.images.bytes_on_device)
+        self.record.stop(self._views.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
         gaussians, self.gaussians = self.gaussians, None
         field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
         self._require_finite(field)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
         self.record.archive(result, None if self._joint is None else self._joint.export_fields())
-        if self._views.images.test and (self.stage.level == 0 or self._context.test_every is not None):
+        if self._views.test and (self.stage.level == 0 or self._context.test_every is not None):
             self._evaluate(gaussians)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
@@ -195,7 +195,7 @@ class ActiveStage:
 
     def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
-        images = self._views.images.bytes_on_device
+        images = self._views.bytes_on_device
         help_ = "--images-on memory takes them off the GPU" if images else "a larger threshold for densification helps"
         return DeviceMemoryError(
             f"out of GPU memory at level {self.stage.level} with {self.record.peak:,} Gaussians; images held on the "
@@ -257,9 +257,9 @@ class ActiveStage:
 
     def _train_jointly(self, gaussians: Any) -> None:
         """Optimize the finished fields, too, and render them instead of reading their predictions."""
-        self.record.note_memory(self._views.images.bytes_on_device)
-        self._views.images.drop_predictions()
-        self._joint = JointLevels(self._context, self._run, self._finished, self._views.images)
+        self.record.note_memory(self._views.bytes_on_device)
+        self._views.drop_predictions()
+        self._joint = JointLevels(self._context, self._run, self._finished, self._views)
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
         self._views.rendering.accumulated = self._joint
@@ -282,7 +282,7 @@ class ActiveStage:
         """Write the quality of the held-out views after an iteration to the history."""
         quality = self._views.held_out_quality(gaussians)
         self.record.write_quality(iteration, quality, elapsed)
-        logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._views.images.test))
+        logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._views.test))
 
     def _result(self, gaussians: Any, field: GaussianField, carried: Any, moments: Any) -> StageResult:
         predictions = None

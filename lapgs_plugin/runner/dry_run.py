@@ -31,6 +31,7 @@ from lapgs_plugin.hierarchy.plan import StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.raster_settings import fields_of, with_values
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
@@ -293,13 +294,6 @@ class _Enough(BaseException):
     """Leave the script's loop."""
 
 
-class _NoRecord:
-    """Measure nothing."""
-
-    def outside(self, purpose: str) -> nullcontext[None]:
-        return nullcontext()
-
-
 class _DryStage:
     """Answer the replaced symbols for one iteration; see `ActiveStage`."""
 
@@ -316,7 +310,7 @@ class _DryStage:
     ) -> None:
         self._context, self.call, self._scene, self._view = context, call, scene, view
         self.rendering, self.window, self.keeps_schedule = rendering, window, window is None
-        self.record, self.iteration = _NoRecord(), 0
+        self.record, self.iteration = LoopRecord(context.device), 0
         self.gaussians: Any = None
 
     def scene_for(self, gaussians: Any) -> Any:

@@ -101,19 +101,13 @@ class HookCaller:
     def _make_context(self, key: str, below: Tensor | None) -> StageContext:
         assert self._stage is not None
         assert self._rendering is not None
-        targets, accumulated, coarse = self._rendering.targets, self._rendering.accumulated, self._rendering.coarse
-        assert targets is not None, "a stage that is trained has targets"
+        images, accumulated = self._rendering.images, self._rendering.accumulated
+        assert images is not None, "a stage that is trained has targets"
+        target, coarse = images.get(key)
         if below is None and accumulated is not None:
             below = accumulated.get(key)
-        return StageContext(
-            stage=self._stage,
-            iteration=self._iteration,
-            view=view_name(key),
-            target=targets.get(key),
-            accumulated=below,
-            coarse_target=None if coarse is None else coarse.get(key),
-            weight=None if (weights := self._rendering.weights) is None else weights.get(key),
-        )
+        weight = images.get_weights([key])
+        return StageContext(self._stage, self._iteration, view_name(key), target, below, coarse, weight)
 
     def densified(self) -> None:
         """Call `on_densify`."""

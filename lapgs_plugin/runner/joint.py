@@ -21,8 +21,8 @@ from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.runner.context import FinishedStage, RunContext, TrainingRun
-from lapgs_plugin.runner.stage_images import StageImages
 from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runner.stage_views import StageViews
 
 COLORS = ("f_dc", "f_rest")
 
@@ -52,22 +52,21 @@ class JointLevels:
     Args:
         context, run: the run, whose archive has the coarser fields.
         finished: the coarser stages, coarsest first.
-        images: images of the running stage.
+        views: of the running stage.
     """
 
     def __init__(
-        self, context: RunContext, run: TrainingRun, finished: Sequence[FinishedStage], images: StageImages
+        self, context: RunContext, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews
     ) -> None:
-        self._context, self._run, self._images = context, run, images
+        self._context, self._run, self._views = context, run, views
         self._pyramid = Pyramid(context.options.grid)
-        self._cameras = {images.key(camera): camera for camera in images.cameras}
         self._fields = [self._load(one) for one in finished]
 
     def _load(self, finished: FinishedStage) -> _JointField:
         adapter, device, call = self._context.adapter, self._context.device, finished.call
         gaussians = adapter.model_of(call, self._run.archive.field(finished.stage.level).to(device))
         rendering = StageRendering(
-            signed=finished.stage.signed, path=self._run.color_path, views=self._cameras, capture=True
+            signed=finished.stage.signed, path=self._run.color_path, views=self._views.cameras, capture=True
         )
         background = torch.full((3,), float(call.white_background), device=device)
         return _JointField(finished, gaussians, rendering, background)
@@ -101,16 +100,16 @@ class JointLevels:
 
     def get(self, key: str) -> Tensor:
         """Return the upsampled prediction (3, h, w) of a view, differentiable where gradients are recorded."""
-        camera = self._cameras[key]
-        levels = [(one, one.of.stage.level) for one in self._fields]
-        renders = ((level, self._render(one, key, self._images.size(camera, level))) for one, level in levels)
-        width, height = self._images.size(camera, levels[-1][1] - 1)
+        renders = ((one.of.stage.level, self._render(one, key)) for one in self._fields)
+        width, height = self._views.size(key, self._fields[-1].of.stage.level - 1)
         return upsample(self._pyramid, compose(self._pyramid, renders).image, (height, width))
 
-    def _render(self, one: _JointField, key: str, size: tuple[int, int]) -> Tensor:
+    def _render(self, one: _JointField, key: str) -> Tensor:
         """Return the image (3, h, w) of one field alone."""
         if key not in one.views:
-            one.views[key] = self._context.adapter.view_at(self._cameras[key], size, one.of.stage.signed, _no_image)
+            stage, camera = one.of.stage, self._views.cameras[key]
+            size = self._views.size(key, stage.level)
+            one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
         return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
 
     @property

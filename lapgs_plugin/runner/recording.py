@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +18,16 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
-from lapgs_plugin.checkouts.attachment import Attachment, Replacement, of_class
+from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_rendering import StageRendering
-from lapgs_plugin.runner.step_clock import counting_steps
-from lapgs_plugin.runs.gpu_busy import GpuBusy
+from lapgs_plugin.runner.step_clock import counting_steps, timing_replacements
 
 logger = logging.getLogger(__name__)
 
@@ -46,18 +44,14 @@ class BareRunRecorder:
         gpu_busy: profile some iterations; needs a CUDA device.
 
     Attributes:
-        iteration: running iteration, from 1; 0 before the first.
+        record: measurements of the loop.
     """
 
     def __init__(self, adapter: BackboneAdapter, device: str, gpu_busy: bool = False) -> None:
-        self._adapter, self._device = adapter, device
-        self._profiles, self._busy = gpu_busy, GpuBusy()
+        self._adapter, self._device, self._gpu_busy = adapter, torch.device(device), gpu_busy
         self._call: TrainingCall | None = None
         self._scene: Any = None
-        self._began: float | None = None
-        self._seconds = self._saving = self._profiling = 0.0
-        self.iteration = self._peak = self._summed = 0
-        self._memory: dict[str, int] = {}
+        self.record = LoopRecord(self._device)
         self._timeline: list[dict[str, float]] = []
 
     def run(self) -> None:
@@ -68,10 +62,10 @@ class BareRunRecorder:
         """
         with Attachment(self._replacements()), counting_steps(self._adapter.profile.model, lambda: self):
             self._adapter.script.run_main()
-        if self._call is None or self._began is None:
+        if self._call is None or self.iteration == 0:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
         path = Path(self._call.dataset.model_path) / BARE_RECORD
-        write_text(path, json.dumps(self._record(), indent=2) + "\n")
+        write_text(path, json.dumps(self._contents(self._call), indent=2) + "\n")
         logger.info("recorded: %s", path)
 
     def _replacements(self) -> list[Replacement]:
@@ -84,20 +78,16 @@ class BareRunRecorder:
         return [
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
-            *of_class(profile.model, "update_learning_rate", self._make_update_learning_rate, "every iteration"),
-            *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
+            *timing_replacements(profile, lambda: self),
         ]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def training(*args: Any, **kwargs: Any) -> Any:
             self._call = TrainingCall.bind(original, args, kwargs)
+            self.record = LoopRecord(self._device, self._call.opt.iterations if self._gpu_busy else 0)
             result = original(*args, **kwargs)
-            self._profile()
-            self._synchronize()
-            if self._began is not None:
-                self._seconds = self._elapsed(self._began)
-            if self._device == "cuda":
-                self._memory = {"peak": torch.cuda.max_memory_allocated(), "images": self._image_bytes()}
+            if self.iteration:
+                self.record.stop(self._image_bytes())
             return result
 
         return training
@@ -109,24 +99,10 @@ class BareRunRecorder:
 
         return make_scene
 
-    def _make_update_learning_rate(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(original)
-        def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            self.iteration_begins(gaussians)
-            return original(gaussians, *args, **kwargs)
-
-        return update_learning_rate
-
-    def _make_save(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(original)
-        def save(scene: Any, *args: Any, **kwargs: Any) -> Any:
-            self._synchronize()
-            start = time.perf_counter()
-            result = original(scene, *args, **kwargs)
-            self._saving += time.perf_counter() - start
-            return result
-
-        return save
+    @property
+    def iteration(self) -> int:
+        """Running iteration, from 1; 0 before the first."""
+        return self.record.iteration
 
     @property
     def gaussians(self) -> Any:
@@ -140,77 +116,51 @@ class BareRunRecorder:
 
     def iteration_begins(self, gaussians: Any) -> None:
         """Count an iteration that is about to begin."""
-        if self._began is None:
-            self._synchronize()
-            if self._device == "cuda":
-                torch.cuda.reset_peak_memory_stats()
-            self._began = time.perf_counter()
-            if self._profiles and self._call is not None:
-                self._busy = GpuBusy(self._call.opt.iterations)
-        self._profile()
-        count = len(gaussians._xyz)
-        self.iteration += 1
-        self._summed += count
-        self._peak = max(self._peak, count)
+        record, count = self.record, len(gaussians._xyz)
+        if self.iteration == 0:
+            record.start()
+        record.start_clock()
+        record.count(self.iteration + 1, count)
         assert self._call is not None, "training() makes iterations"
         if self.iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
-            elapsed = self._elapsed(self._began)
-            self._timeline.append({"iteration": self.iteration, "elapsed": elapsed, "num_gaussians": count})
+            entry = {"iteration": self.iteration, "elapsed": record.elapsed(), "num_gaussians": count}
+            self._timeline.append(entry)
 
-    def _profile(self) -> None:
-        """Start or end a profile if it is due; its time does not count."""
-        if self._busy.due(self.iteration):
-            self._synchronize()
-            start = time.perf_counter()
-            self._busy.step(self.iteration)
-            self._profiling += time.perf_counter() - start
-
-    def _elapsed(self, began: float) -> float:
-        return time.perf_counter() - began - self._saving - self._profiling
-
-    def _record(self) -> dict[str, Any]:
+    def _contents(self, call: TrainingCall) -> dict[str, Any]:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
-        gaussians = self.gaussians
+        record, count = self.record, len(self.gaussians._xyz)
         return {
             "iterations": self.iteration,
-            "train_seconds": self._seconds,
-            "saving_seconds": self._saving,
-            "num_gaussians": len(gaussians._xyz),
-            "peak_gaussians": max(self._peak, len(gaussians._xyz)),
-            "mean_gaussians": self._summed / self.iteration,
-            "memory_bytes": self._memory,
-            **({} if (busy := self._busy.seconds()) is None else {"gpu_busy_seconds": busy}),
-            **self._held_out(gaussians),
+            "train_seconds": record.seconds,
+            "saving_seconds": record.overhead.get("saving", 0.0),
+            "num_gaussians": count,
+            "peak_gaussians": max(record.peak, count),
+            "mean_gaussians": record.mean_gaussians,
+            "memory_bytes": record.memory_bytes,
+            **({} if (busy := record.gpu_busy_seconds) is None else {"gpu_busy_seconds": busy}),
+            **self._held_out(call),
             "timeline": self._timeline,
         }
 
     @torch.no_grad()
-    def _held_out(self, gaussians: Any) -> dict[str, float]:
+    def _held_out(self, call: TrainingCall) -> dict[str, float]:
         """Return means of PSNR in dB and SSIM over the held-out views, empty without any."""
-        assert self._call is not None, "called after training"
-        cameras = list(self._scene.getTestCameras())
-        background = torch.full((3,), float(self._call.white_background), device=self._device)
+        background = torch.full((3,), float(call.white_background), device=self._device)
         wrapper = RasterizerWrapper()
-        wrapper.stage = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
+        wrapper.stage = rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
+
+        def rendered(camera: Any) -> tuple[Tensor, Tensor]:
+            """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
+            self._adapter.render(call, camera, self.gaussians, background)
+            assert rendering.captured is not None, "render() rasterizes"
+            return rendering.captured, camera.original_image.to(rendering.captured.device)
+
         found = wrapper.entries(self._adapter.profile)
         with Attachment([Replacement(owner, name, make, "render()") for owner, name, make in found]):
-            return mean_quality(self._rendered(camera, gaussians, background, wrapper.stage) for camera in cameras)
-
-    def _rendered(
-        self, camera: Any, gaussians: Any, background: Tensor, rendering: StageRendering
-    ) -> tuple[Tensor, Tensor]:
-        """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
-        assert self._call is not None, "called after training"
-        self._adapter.render(self._call, camera, gaussians, background)
-        assert rendering.captured is not None, "render() rasterizes"
-        return rendering.captured, camera.original_image.to(rendering.captured.device)
+            return mean_quality(map(rendered, self._scene.getTestCameras()))
 
     def _image_bytes(self) -> int:
         """Return the bytes of photos on the GPU."""
         cameras = [*self._scene.getTrainCameras(), *self._scene.getTestCameras()]
         images = [camera.original_image for camera in cameras]
         return sum(image.numel() * image.element_size() for image in images if image.device.type == "cuda")
-
-    def _synchronize(self) -> None:
-        if self._device == "cuda":
-            torch.cuda.synchronize()

@@ -14,6 +14,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
+from lapgs_plugin.runner.step_clock import timing_replacements
 
 SIZE_LIMIT = "max_screen_size"
 """Parameter of the family's density control: with None it removes no Gaussian for its size."""
@@ -53,6 +54,7 @@ class StageReplacements:
                 for camera in profile.cameras
             ),
             *self._in_rendering(profile),
+            *timing_replacements(profile, self._running),
             *self._in_model(profile),
             *adapter.replacements(self._window),
             *self._in_scores(profile),
@@ -69,7 +71,6 @@ class StageReplacements:
         return [
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
-            *of_class(profile.scene, "save", self._make_save, "training() at --save_iterations"),
         ]
 
     def _in_rendering(self, profile: Profile) -> list[Replacement]:
@@ -83,7 +84,6 @@ class StageReplacements:
         return [Replacement(owner, name, make, consumer) for owner, name, make in found]
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
-        start = "training() at the start of every iteration"
         control = dict.fromkeys(profile.density_control, self._make_density_control)
         if not self._context.options.prune_by_size:
             methods = {name: inspect.signature(getattr(profile.model, name)) for name in control}
@@ -98,7 +98,6 @@ class StageReplacements:
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
         return [
-            *of_class(profile.model, "update_learning_rate", self._before_iteration, start),
             *of_class(profile.model, "training_setup", self._make_training_setup, "training()"),
             *(each for name, make in control.items() for each in of_class(profile.model, name, make, "training()")),
         ]
@@ -127,28 +126,6 @@ class StageReplacements:
             return stage.scene_for(gaussians)
 
         return make_scene
-
-    def _make_save(self, original: Callable[..., None]) -> Callable[..., None]:
-        @wraps(original)
-        def save(scene: Any, *args: Any, **kwargs: Any) -> None:
-            if (stage := self._running()) is None:
-                original(scene, *args, **kwargs)
-                return
-            with stage.record.outside("saving"):
-                original(scene, *args, **kwargs)
-
-        return save
-
-    def _before_iteration(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Begin an iteration at each call, whatever its argument: some loops do not pass the iteration."""
-
-        @wraps(original)
-        def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            if (stage := self._running()) is not None:
-                stage.iteration_begins(gaussians)
-            return original(gaussians, *args, **kwargs)
-
-        return update_learning_rate
 
     def _make_training_setup(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)

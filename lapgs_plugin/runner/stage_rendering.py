@@ -17,8 +17,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.raster_outputs import RasterOutputs
 from lapgs_plugin.runner.raster_settings import matrix_keys, size_of, view_matrices
 from lapgs_plugin.runner.signed_calls import with_signed_colors
-from lapgs_plugin.runs.image_store import ImageStore
-from lapgs_plugin.runs.level_images import HeldImages
+from lapgs_plugin.runs.level_images import LevelImages
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
@@ -42,11 +41,9 @@ class StageRendering:
         signed: whether the field is a residual.
         path: how signed colour is evaluated.
         views: the checkout's camera of each view by key.
-        targets: I^l by key; None if images are compared with nothing.
+        images: targets I^l, what else the supervision needs, and weights of masks; None if nothing is trained.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
-        coarse: Up(I^(l+1)) of training views by key; None unless the supervision needs it.
-        weights: share of each pixel inside of the view's mask by key; None without masks.
-        masked: keys of the training views, whose masks the loop's losses and scores have to honour.
+        masked: keys of the training views whose masks the loop's losses and scores have to honour.
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
@@ -56,10 +53,8 @@ class StageRendering:
     signed: bool
     path: ColorPath
     views: Mapping[str, Any]
-    targets: ImageStore | None = None
+    images: LevelImages | None = None
     accumulated: Predictions | None = None
-    coarse: Predictions | None = None
-    weights: ImageStore | HeldImages | None = None
     masked: frozenset[str] = frozenset()
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
@@ -84,7 +79,7 @@ class StageRendering:
             return None
         keys = self._keys_by_matrix(settings)
         # Photos of one camera have the same prediction, but not the same mask or target.
-        differ = self.weights is not None or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
+        differ = self.masked or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
         if len(keys) > 1 and differ:
             names = " and ".join(view_name(key) for key in sorted(keys)[:2])
             raise UserInputError(
@@ -106,21 +101,17 @@ class StageRendering:
 
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
-        if self.targets is not None:
-            self.targets.prefetch(key)
-        below = self.accumulated if key in self.composed else self._below_target
-        if below is not None:
-            below.prefetch(key)
-        if self.weights is not None:
-            self.weights.prefetch(key)
+        images = self.images
+        stores = () if images is None else (images.targets, images.weights)
+        for each in (*stores, self.accumulated if key in self.composed else self._below_target):
+            if each is not None:
+                each.prefetch(key)
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
-        assert self.targets is not None, "a stage that is trained has targets"
-        target = self.targets.get(key)
-        if key in self.composed or self._below_target is None:
-            return target
-        return target - self._below_target.get(key)
+        assert self.images is not None, "a stage that is trained has targets"
+        target, below = self.images.targets.get(key), None if key in self.composed else self._below_target
+        return target if below is None else target - below.get(key)
 
     def compose(self, key: str | None, image: Tensor, *, by_place: bool = False) -> Tensor:
         """Return the composed image (3, h, w) of a view.
@@ -157,9 +148,9 @@ class StageRendering:
             image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
-        if self.weights is not None and key in self.masked and not self.capture:
+        if self.images is not None and key in self.masked and not self.capture:
             # Whatever the loop's loss is, it compares the target with itself outside of the mask.
-            image = fill_outside(image, self.target(key), self.weights.get(key))
+            image = fill_outside(image, self.target(key), self.images.get_weights([key]))
         return image
 
     def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
@@ -192,12 +183,13 @@ class StageRendering:
     @property
     def _needs_views(self) -> bool:
         """Whether training on an image of no known view would train something else."""
-        return self.signed or self.weights is not None
+        return self.signed or bool(self.masked)
 
     @property
     def _below_target(self) -> Predictions | None:
         """Images to subtract from targets where residuals are supervised alone."""
-        return self.accumulated if self.coarse is None else self.coarse
+        coarse = None if self.images is None else self.images.coarse
+        return self.accumulated if coarse is None else coarse
 
 
 def _refuse_other_colors(_: Tensor) -> None:

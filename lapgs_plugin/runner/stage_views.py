@@ -1,4 +1,4 @@
-"""Give a checkout the views of a stage, and render its model from them."""
+"""Give a checkout the views of a stage with their images, and render its model from them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from torch import Tensor
 from lapgs_plugin.checkouts.level_views import PrefetchingViews
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.runner.context import RunContext, TrainingRun
-from lapgs_plugin.runner.stage_images import StageImages
 from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
+from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 
 class StageViews:
-    """Hold the cameras of a stage at its level's size with their images.
+    """Hold the cameras of a stage at its level's size, their targets, and the predictions of coarser levels.
+
+    Views are named by the keys of `SceneImages`.
 
     Args:
         context, run, stage: the stage and its run.
@@ -29,7 +33,9 @@ class StageViews:
         predictions: Up(I_hat^(l+1)) of every view, closed with the other images; None for the base and nested levels.
 
     Attributes:
-        images: targets and predictions; empty until `load`.
+        cameras: the scene's cameras by key.
+        train, test: keys of the training and of the held-out views.
+        images: targets of all views; empty until `load_images`.
         rendering: the stage as the wrapped rasterizer sees it.
     """
 
@@ -41,29 +47,46 @@ class StageViews:
         call: TrainingCall,
         predictions: UpsampledImages | None,
     ) -> None:
-        self._context, self._call, self._stage = context, call, stage
-        self._pyramid = Pyramid(context.options.grid)
+        self._context, self._call, self._stage, self._predictions = context, call, stage, predictions
+        full, options, supervision = context.images, context.options, SUPERVISIONS[context.options.supervision]
+        train, test = ({full.key(each): each for each in cameras} for cameras in (run.scene.train, run.scene.test))
+        self.cameras, self.train, self.test = {**train, **test}, list(train), list(test)
+        self._pyramid = Pyramid(options.grid)
         self._views: dict[str, Any] = {}
         self._changed: dict[str, set[str]] = {}  # attributes of each view that depend on the level
-        self.images = StageImages(
-            context.images, run.scene, stage, context.options, context.device, run.archive.path(CACHE), predictions
+        sizes, folder = [full[key].size for key in self.cameras], run.archive.path(CACHE)
+        self._stores = ImageStores(sizes, context.device, full.exact, options.images_on, folder)
+        self.images = LevelImages(
+            self._stores,
+            stage.level,
+            self._pyramid,
+            with_coarse=stage.signed and supervision.needs_coarse,
+            masked=bool(full.masks),
         )
         self.rendering = StageRendering(
             signed=stage.signed,
             path=run.color_path,
-            views={self.images.key(camera): camera for camera in self.images.cameras},
-            targets=self.images.targets,
-            accumulated=self.images.accumulated,
-            coarse=self.images.coarse,
-            weights=self.images.weights,
-            masked=frozenset(self.images.key(camera) for camera in self.images.train),
-            composed=self.images.composed_keys,
+            views=self.cameras,
+            images=self.images,
+            accumulated=predictions,
+            masked=frozenset(train if full.masks else ()),
+            composed=frozenset(self.cameras if supervision.composes else test),
             on_image=context.hooks.on_image if context.hooks else None,
         )
 
+    def load_images(self) -> None:
+        """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""
+        full, training = self._context.images, set(self.train)
+        for key in self.cameras:
+            self.images.put(key, full[key].load(self._device), full.masks.get(key), with_coarse=key in training)
+
+    def size(self, key: str, level: int) -> tuple[int, int]:
+        """Return (width, height) of a view's image at a level."""
+        return level_size(self._context.images[key].size, level)
+
     def train_views(self) -> list[Any]:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
-        views = [self._view(camera) for camera in self.images.train]
+        views = [self._view(key) for key in self.train]
         keys = {id(view): key for key, view in self._views.items()}
 
         def prefetch(view: Any) -> None:
@@ -75,78 +98,88 @@ class StageViews:
 
     def test_views(self) -> list[Any]:
         """Return the held-out views."""
-        return [self._view(camera) for camera in self.images.test]
+        return [self._view(key) for key in self.test]
 
     @torch.no_grad()
     def predict(self, gaussians: Any) -> UpsampledImages:
         """Return the composed image of every view for the next level."""
-        predictions = self.images.new_predictions()
-        for camera in self.images.cameras:
-            width, height = self.images.size(camera, self._stage.level - 1)
-            predictions.put(self.images.key(camera), self._composed(gaussians, camera), (height, width))
-        predictions.get(self.images.key(self.images.cameras[0]))  # compiles Up now, outside the next stage's clock
+        level = self._stage.level
+        precision = chosen_precision(self._context.options.prediction_precision, self._device)
+        predictions = self._stores.make_upsampled(level, precision, f"predictions_{level}", self._pyramid)
+        for key in self.cameras:
+            width, height = self.size(key, level - 1)
+            predictions.put(key, self._composed(gaussians, key), (height, width))
+        predictions.get(next(iter(self.cameras)))  # compiles Up now, outside the next stage's clock
         return predictions
 
     @torch.no_grad()
     def held_out_quality(self, gaussians: Any) -> dict[str, float]:
         """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
-        images = self._context.images
-        masks = {key: mask.to(self._device) for key, mask in images.masks.items()}
+        full, device = self._context.images, self._device
+        masks = {key: mask.to(device) for key, mask in full.masks.items()}
         return mean_quality(
-            (self._full_size(gaussians, camera), images[key].load(self._device), masks.get(key))
-            for camera, key in ((camera, self.images.key(camera)) for camera in self.images.test)
+            (self._full_size(gaussians, key), full[key].load(device), masks.get(key)) for key in self.test
         )
 
-    def render_train_view(self, rendering: StageRendering, gaussians: Any, camera: Any) -> Tensor:
-        """Return the image (3, h, w) of a training camera over black; `rendering` replaces the stage's meanwhile."""
+    def render_alone(self, rendering: StageRendering, gaussians: Any, key: str) -> Tensor:
+        """Return the image (3, h, w) of a view over black; `rendering` replaces the stage's meanwhile."""
         background = torch.zeros(3, device=self._device)
-        return self._context.render(rendering, self._call, self._view(camera), gaussians, background)
+        return self._context.render(rendering, self._call, self._view(key), gaussians, background)
 
     def take_over(self, before: StageViews) -> None:
         """Bring the views of another stage to this one's level: the checkout's training holds the objects."""
         self._views, before._views = before._views, {}
-        for camera in self.images.cameras:
-            if (view := self._views.get(key := self.images.key(camera))) is not None:
-                fresh = vars(self._make_view(camera))
-                names = before._changed[key] | self._changed[key]
-                vars(view).update({name: value for name, value in fresh.items() if name in names})
+        for key, view in self._views.items():
+            fresh = vars(self._make_view(key))
+            names = before._changed[key] | self._changed[key]
+            vars(view).update({name: value for name, value in fresh.items() if name in names})
+
+    @property
+    def bytes_on_device(self) -> int:
+        """Bytes of this stage's images on the GPU."""
+        predictions = 0 if self._predictions is None else self._predictions.store.bytes_on_device
+        return self.images.bytes_on_device + predictions
+
+    def drop_predictions(self) -> None:
+        """Drop the predictions of coarser levels: from now on they are rendered."""
+        if self._predictions is not None:
+            self._predictions.close()
 
     def close(self) -> None:
         """Drop the stage's images, except the predictions for the next stage."""
         self.rendering.accumulated = None
         self.images.close()
+        self.drop_predictions()
         self._views.clear()
 
     @property
     def _device(self) -> torch.device:
         return self._context.device
 
-    def _view(self, camera: Any) -> Any:
-        """Return the camera at this stage's level, the same object on every call."""
-        key = self.images.key(camera)
+    def _view(self, key: str) -> Any:
+        """Return the camera of a view at this stage's level, the same object on every call."""
         if key not in self._views:
-            self._views[key] = self._make_view(camera)
+            self._views[key] = self._make_view(key)
         return self._views[key]
 
-    def _make_view(self, camera: Any) -> Any:
-        """Return a copy of the camera at this stage's level, and note which of its attributes are other ones."""
-        key = self.images.key(camera)
-        size = self.images.size(camera, self._stage.level)
+    def _make_view(self, key: str) -> Any:
+        """Return a copy of a camera at this stage's level, and note which of its attributes are other ones."""
+        camera, size = self.cameras[key], self.size(key, self._stage.level)
         view = self._context.adapter.view_at(camera, size, self._stage.signed, lambda: self.rendering.target(key))
         before = vars(camera)
         self._changed[key] = {name for name, value in vars(view).items() if value is not before.get(name, self)}
         return view
 
-    def _composed(self, gaussians: Any, camera: Any) -> Tensor:
+    def _composed(self, gaussians: Any, key: str) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
-        rendering = replace(self.rendering, composed=self.images.keys, capture=True)
+        rendering = replace(self.rendering, composed=frozenset(self.cameras), capture=True)
         background = torch.full((3,), float(self._call.white_background), device=self._device)
-        return self._context.render(rendering, self._call, self._view(camera), gaussians, background)
+        return self._context.render(rendering, self._call, self._view(key), gaussians, background)
 
-    def _full_size(self, gaussians: Any, camera: Any) -> Tensor:
+    def _full_size(self, gaussians: Any, key: str) -> Tensor:
         """Return a view (3, h, w) at full resolution, with finer residuals of zero."""
-        image = self._composed(gaussians, camera)
+        image = self._composed(gaussians, key)
         for level in range(self._stage.level - 1, -1, -1):
-            width, height = self.images.size(camera, level)
+            width, height = self.size(key, level)
             image = self._pyramid.up(image, (height, width))
         return image

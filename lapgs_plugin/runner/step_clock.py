@@ -1,12 +1,16 @@
-"""Count iterations by optimizer steps, where the checkout's model is not told when an iteration begins."""
+"""Tell a stage when an iteration of a checkout's loop begins, and leave saving out of its time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+
+from lapgs_plugin.checkouts.attachment import Replacement, of_class
+from lapgs_plugin.checkouts.profile import Profile
 
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
@@ -17,6 +21,39 @@ def steps_positions(optimizer: Optimizer, gaussians: Any) -> bool:
     if gaussians is None:
         return False
     return any(each is gaussians._xyz for group in optimizer.param_groups for each in group["params"])
+
+
+def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Replacement]:
+    """Return the replacements by which the running stage, or a recorder, is timed.
+
+    Args:
+        profile: the checkout's.
+        running: returns what runs; None between stages.
+    """
+
+    def make_clock(original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            if (stage := running()) is not None:
+                stage.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
+            return original(gaussians, *args, **kwargs)
+
+        return update_learning_rate
+
+    def make_save(original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def save(scene: Any, *args: Any, **kwargs: Any) -> Any:
+            if (stage := running()) is None:
+                return original(scene, *args, **kwargs)
+            with stage.record.outside("saving"):
+                return original(scene, *args, **kwargs)
+
+        return save
+
+    return [
+        *of_class(profile.model, CLOCK, make_clock, "training() at the start of every iteration"),
+        *of_class(profile.scene, "save", make_save, "training() at --save_iterations"),
+    ]
 
 
 @contextmanager

@@ -64,6 +64,7 @@ class ImageStores:
 class HeldImages:
     """Keep images as the tensors they are. It has those methods of an `ImageStore` that training calls."""
 
+    where = "memory"
     bytes_on_device = 0  # nothing has to be copied
 
     def __init__(self) -> None:

@@ -112,13 +112,13 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
     """
 
     def differences(levels: JointLevels) -> list[float]:
-        kept = levels._images.accumulated
+        kept = levels._views._predictions
         assert kept is not None
         assert len(kept.store) == 0
         renderer = run_renderer(RunArchive.open(tmp_path / "run"), device="cpu", rasterizer="cpu")
         found = []
         for view in load_scene(odd, progress=False).train[:3]:
-            (key,) = [key for key in levels._cameras if Path(view_name(key)).stem == Path(view.name).stem]
+            (key,) = [key for key in levels._views.cameras if Path(view_name(key)).stem == Path(view.name).stem]
             image = levels.get(key)
             level = min(renderer.fields)
             composed = renderer.render(view.camera, level).composed[level]
@@ -142,7 +142,7 @@ def test_gradients_reach_every_finished_field(
 
     def relative_errors(levels: JointLevels) -> list[float]:
         generator = torch.Generator().manual_seed(0)
-        key = next(iter(levels._cameras))
+        key = next(iter(levels._views.cameras))
         weights = torch.randn(levels.get(key).shape, generator=generator)
         errors = []
         for one in levels._fields:

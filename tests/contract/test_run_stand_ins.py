@@ -9,7 +9,10 @@ import pytest
 
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.checkouts.stand_in import fitting_stand_in
 from lapgs_plugin.cli.doctor_checkout import describe
+from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.reference_raster.standins import FORKS, VARIANTS
 from tests.contract.stub_runs import STUBS, stand_in_is_refused
 
 
@@ -89,3 +92,59 @@ def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
     (found,) = describe(checkout)["Rasterizers"]
     assert (found.name, found.status) == (module, "ok")
     assert found.detail.startswith("part of the checkout; ")
+
+
+TRAIN = """\
+from renderer import render
+
+class GaussianModel:
+    def get_xyz(self): ...
+    def training_setup(self): ...
+
+def training():
+    render().backward()
+
+if __name__ == "__main__":
+    training()
+"""
+CALLS = {
+    "speedy-splat": ("diff_gaussian_rasterization", "", "scores=None, "),
+    "mip-splatting": ("diff_gaussian_rasterization", "kernel_size=0, subpixel_offset=0, ", ""),
+    "absgs": ("diff_gaussian_rasterization_abs", "", ""),
+    "graphdeco": ("diff_gaussian_rasterization", "", ""),
+    "graphdeco-aa": ("diff_gaussian_rasterization", "antialiasing=0, ", ""),
+    None: ("diff_gaussian_rasterization", "glow=0, ", ""),
+}
+
+
+def renderer(module: str, settings: str = "", inputs: str = "") -> str:
+    view = ", ".join(f"{name}=0" for name in VARIANTS["graphdeco"].settings)
+    return (
+        f"from {module} import GaussianRasterizationSettings, GaussianRasterizer\n"
+        f"def render():\n    rasterizer = GaussianRasterizer(GaussianRasterizationSettings({settings}{view}))\n"
+        f"    return rasterizer(means3D=0, means2D=0, opacities=0, {inputs}shs=0)\n"
+    )
+
+
+@pytest.mark.parametrize("variant", CALLS)
+def test_the_stand_in_is_chosen_by_the_checkouts_calls(variant: str | None, tmp_path: Path) -> None:
+    (tmp_path / "train.py").write_text(TRAIN)
+    (tmp_path / "renderer.py").write_text(renderer(*CALLS[variant]))
+    if variant is None:
+        with pytest.raises(MissingExtraError, match="takes no setting glow"):
+            fitting_stand_in(tmp_path)
+    else:
+        assert fitting_stand_in(tmp_path) == variant
+
+
+def test_functions_that_are_imported_decide_and_optional_imports_do_not(tmp_path: Path) -> None:
+    optional = "from diff_gaussian_rasterization import SparseGaussianAdam\n"
+    imports = (
+        "from diff_gaussian_rasterization import compute_relocation\n"
+        f"try:\n    {optional}except ImportError:\n    pass\n"
+        f"import contextlib\nwith contextlib.suppress(ImportError):\n    {optional}"
+    )
+    (tmp_path / "train.py").write_text(imports + TRAIN)
+    (tmp_path / "renderer.py").write_text(renderer("diff_gaussian_rasterization"))
+    assert fitting_stand_in(tmp_path, "graphdeco") == "3dgs-mcmc"
+    assert {"3dgs-mcmc", "faster-gs"} <= set(FORKS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from torch.nn.functional import normalize
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.oracle import project
-from lapgs_plugin.reference_raster.standins import FORKS, VARIANTS, stand_ins, variant_for
+from lapgs_plugin.reference_raster.standins import stand_ins
 from lapgs_plugin.reference_raster.standins.forks import compute_relocation
 from tests.raster.scenes import Case
 from tests.raster.test_standins import activated, call, case_of, module_of, relative, settings_of
@@ -277,35 +276,3 @@ def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
     assert points.grad is not None
     assert relative(info[1], points.grad[:, :2].norm(dim=1)) < 1e-3  # worst seen: 5e-7
     assert all(leaf.grad is not None for leaf in leaves)
-
-
-SOURCES = {
-    "speedy-splat": ("diff_gaussian_rasterization", "", "scores=None, "),
-    "mip-splatting": ("diff_gaussian_rasterization", "kernel_size=0, subpixel_offset=0, ", ""),
-    "absgs": ("diff_gaussian_rasterization_abs", "", ""),
-    "graphdeco": ("diff_gaussian_rasterization", "", ""),
-    "graphdeco-aa": ("diff_gaussian_rasterization", "antialiasing=0, ", ""),
-    None: ("diff_gaussian_rasterization", "glow=0, ", ""),
-}
-
-
-@pytest.mark.parametrize("variant", SOURCES)
-def test_the_stand_in_is_chosen_by_the_checkouts_calls(variant: str | None, tmp_path: Path) -> None:
-    module, settings, more = SOURCES[variant]
-    view = ", ".join(f"{name}=0" for name in VARIANTS["graphdeco"].settings)
-    (tmp_path / "gaussian_renderer").mkdir()
-    (tmp_path / "gaussian_renderer" / "__init__.py").write_text(
-        f"from {module} import GaussianRasterizationSettings, GaussianRasterizer\n"
-        f"def render():\n    rasterizer = GaussianRasterizer(GaussianRasterizationSettings({settings}{view}))\n"
-        f"    return rasterizer(means3D=0, means2D=0, opacities=0, {more}shs=0)\n"
-    )
-    assert variant_for(tmp_path) == variant
-
-
-def test_optional_imports_do_not_decide(tmp_path: Path) -> None:
-    (tmp_path / "train.py").write_text(
-        "from diff_gaussian_rasterization import GaussianRasterizer, compute_relocation\n"
-        "try:\n    from diff_gaussian_rasterization import SparseGaussianAdam\nexcept ImportError:\n    pass\n"
-    )
-    assert variant_for(tmp_path) == "3dgs-mcmc"
-    assert {"3dgs-mcmc", "faster-gs"} <= set(FORKS)

@@ -193,11 +193,11 @@ def test_photos_of_one_camera_are_composed_alike_and_not_mistaken_for_each_other
     stage = StageRendering(True, ColorPath.NATIVE, cameras, composed=frozenset(cameras))
     assert stage.key(None, settings) in cameras, "their predictions are the same"
     for options in (
-        {"weights": SimpleNamespace()},
+        {"masked": frozenset({"0-day"})},
         {"on_image": lambda key, image, below: image},
         {"composed": frozenset({"1-night"})},
     ):
-        stage = replace(stage, **{"weights": None, "on_image": None, **options})
+        stage = replace(stage, **{"masked": frozenset(), "on_image": None, **options})
         with pytest.raises(UserInputError, match=matters):
             stage.key(None, settings)
         assert stage.key("0-day", settings) == "0-day", "a renderer was called with it"

@@ -19,10 +19,9 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
 from lapgs_plugin.reference_raster.standins import fused_ssim
-from lapgs_plugin.reference_raster.standins.choice import variant_for
 from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 
-__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "variant_for"]
+__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins"]
 
 
 def stand_ins(variant: str) -> dict[str, ModuleType]:
