@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table
-from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
+from lapgs_plugin.cli.output import make_console, make_table, show_log
 from lapgs_plugin.errors import counted, printable
-from lapgs_plugin.options import check_values, option
+from lapgs_plugin.options import check_values, option, refuse
+from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -92,7 +92,7 @@ def evaluate(
     wanted = LpipsRequest.parse(settings.lpips, settings.lpips_weights or ())
     archive = RunArchive.open(run)
     show_log()
-    metrics = evaluate_run(archive, options.scene, device=options.device, rasterizer=options.rasterizer, lpips=wanted)
+    metrics = evaluate_run(archive, options, wanted)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
 
@@ -108,9 +108,7 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
     other = None if settings.baseline is None else RunArchive.open(settings.baseline)
     show_log()
     cameras = path_cameras(archive, trajectory, settings.frames, FLICKER_FRAMES, options.scene)
-    figures = evaluate_stability(
-        archive, other, trajectory, cameras, device=options.device, rasterizer=options.rasterizer
-    )
+    figures = evaluate_stability(archive, other, trajectory, cameras, options)
     table = make_table("", "mean difference", "PSNR (dB)")
     for name, each in figures["flicker"].items():
         table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")

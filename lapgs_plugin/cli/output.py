@@ -1,7 +1,8 @@
-"""Print tables, name the command that comes next, and check where results go."""
+"""Print tables and logs, name the command that comes next, and check where results go."""
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 from pathlib import Path
@@ -38,6 +39,12 @@ def make_table(*headings: str) -> Table:
     from rich.table import Table
 
     return Table(*headings, box=box.SIMPLE_HEAD)
+
+
+def show_log() -> None:
+    """Print on stderr which rasterizer renders a run, and why."""
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
 
 
 def train_command(scene: Path, options: str = "") -> str:

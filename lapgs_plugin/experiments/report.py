@@ -18,6 +18,7 @@ from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import (
     Arrow,
@@ -117,12 +118,12 @@ class Results:
         return f"{scene}, {backbone}" if several else scene
 
 
-def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: str = "auto") -> Path:
+def write_experiment_report(folder: Path, options: RenderOptions) -> Path:
     """Write FOLDER/report.html.
 
     Args:
         folder: folder of `lapgs bench`.
-        device, rasterizer: see `rendering.run.run_renderer`.
+        options: what renders the runs.
 
     Returns:
         The path of the page.
@@ -141,7 +142,7 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         arrows=_time_arrows(results),
         breakdown=_breakdown(results),
         overhead=_overhead(results),
-        parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
+        parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
         machines=_machines(results),
     )
     write_text(folder / REPORT, page)
@@ -232,7 +233,7 @@ def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable
 # One scene on one backbone.
 
 
-def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> dict[str, Any]:
+def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -> dict[str, Any]:
     """Return what the page shows of a scene on a backbone, with the first seed of every variant.
 
     Keys: title; charts of training, and variants by the style of their lines; views of a variant beside the baseline
@@ -253,7 +254,7 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
     strips: list[Strip] = []
     if pair:
         try:
-            renderers = [run_renderer(run.archive, device, rasterizer) for run in pair]
+            renderers = [run_renderer(run.archive, options.device, options.rasterizer) for run in pair]
             strips = view_strips(pair[0], renderers, None, most=1)
         except LapgsError as error:
             notes.append(f"no pictures: {error}")

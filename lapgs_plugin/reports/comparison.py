@@ -15,7 +15,6 @@ Metrics = dict[str, Any]
 
 OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
-PAIR = 2
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         values = [cell.value for cell in cells if cell.value is not None]
         if not values and key in OPTIONAL_ROWS:
             continue
-        rows.append(Row(key, label, cells, compare(*values) if len(values) == PAIR else ""))
+        rows.append(Row(key, label, cells, compare(*values) if len(values) == 2 else ""))
     return tuple(rows)
 
 

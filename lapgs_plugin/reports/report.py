@@ -16,6 +16,7 @@ from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.reports.charts import (
     INSET_AT,
@@ -76,21 +77,13 @@ class ViewTable:
     rows: dict[str, list[tuple[float, str]]]
 
 
-def write_report(
-    run: MeasuredRun,
-    baseline: MeasuredRun | None = None,
-    moved_to: Path | None = None,
-    *,
-    device: str = "auto",
-    rasterizer: str = "auto",
-) -> Path:
+def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: RenderOptions) -> Path:
     """Write RUN/report.html.
 
     Args:
         run: the run that the page is about.
-        baseline: the run that it is compared with.
-        moved_to: the scene's folder now; None when it did not move.
-        device, rasterizer: see `rendering.run.run_renderer`.
+        baseline: the run that it is compared with, or None.
+        options: where the scene is, and what renders the runs.
 
     Returns:
         The path of the page.
@@ -100,7 +93,7 @@ def write_report(
     """
     runs = [run] if baseline is None else [run, baseline]
     kinds = [RUN, BASELINE][: len(runs)]
-    renderers = [run_renderer(each.archive, device, rasterizer) for each in runs]
+    renderers = [run_renderer(each.archive, options.device, options.rasterizer) for each in runs]
     page = render_page(
         TEMPLATE,
         name=run.name,
@@ -114,7 +107,7 @@ def write_report(
         arrows=_time_arrows(run, baseline) if baseline else None,
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
-        strips=view_strips(run, renderers, moved_to),
+        strips=view_strips(run, renderers, options.scene),
         views=view_table(runs),
         settings=_settings(run),
     )
