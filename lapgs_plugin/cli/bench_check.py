@@ -13,26 +13,24 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import typer
 
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.experiments.commands import LAPGS
-from lapgs_plugin.experiments.expansion import SceneSpec
+from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec, SceneSpec
 from lapgs_plugin.experiments.mistakes import Mistakes
+from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution
-
-if TYPE_CHECKING:
-    from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec
-    from lapgs_plugin.experiments.store import Job
-    from lapgs_plugin.runner.settings import RunSettings
-    from lapgs_plugin.runs.manifest import SceneReference
-    from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import TrainSettings
 
 READS_SCENES = ("OpenImageIO", "pycolmap")
 """Packages without which no scene can be read."""
@@ -147,8 +145,6 @@ def _without_device(words: Sequence[str]) -> list[str]:
 @cache
 def _command(name: str) -> Any:
     """Return a command as click's object."""
-    from lapgs_plugin.cli.app import app
-
     return cast(Any, typer.main.get_command(app)).commands[name]
 
 
@@ -203,10 +199,7 @@ def _sets(arguments: Sequence[str], *options: str) -> bool:
 
 
 def _smallest_size(scene: SceneSpec, folder: Path, resolution: str) -> tuple[int, int] | None:
-    """Return the smallest width and height of a scene's images from their headers.
-
-    Returns:
-        None without the packages that read scenes.
+    """Return the smallest width and height of a scene's images; None without the packages that read scenes.
 
     Raises:
         SceneError: the scene cannot be used.

@@ -202,13 +202,7 @@ def baseline_of(experiment: Experiment, names: Sequence[str]) -> str:
 
 
 def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> ResultTable:
-    """Make the table of an experiment.
-
-    Args:
-        experiment: the experiment.
-        planned: its runs.
-        records: rows of finished runs, by run.
-    """
+    """Make the table of an experiment from its runs and, by the names of runs, the rows of those that are finished."""
     paper = check_table(experiment)
     by_dataset: dict[str, list[PlannedRun]] = defaultdict(list)
     by_scene: dict[tuple[str, str], list[PlannedRun]] = defaultdict(list)
@@ -240,14 +234,7 @@ def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
 
 
 class _GroupBuilder:
-    """Builds one group of a table.
-
-    Args:
-        experiment: the experiment.
-        paper: the paper's table, or None.
-        runs: runs of the group, of one data set or of other scenes.
-        records: rows of all finished runs.
-    """
+    """Builds one group of a table, of runs that share their data set, from the rows of all finished runs."""
 
     def __init__(
         self,

@@ -130,7 +130,9 @@ def run_steps(
         steps = [Step(_train(spec, scene, folder), str(folder.parent))]
     else:
         bare = spec.method == "bare"
-        steps = [Step((*_lapgs_run(spec, bare), *_script(spec, scene, checkout, folder)), str(checkout))]
+        how = ("--off", "--record") if bare else ("--overwrite", "--seed", str(spec.seed))
+        command = *LAPGS, "run", *how, *_as_options(spec.options), *_script(spec, scene, checkout, folder)
+        steps = [Step(command, str(checkout))]
         if bare and evaluate is not None:
             steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))
     if evaluate is not None:
@@ -171,12 +173,6 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         # Backbones compensate no exposure, and tables compare views as they are.
         *_as_options({"exposure": "off", **spec.options, **levels}),
     )
-
-
-def _lapgs_run(spec: RunSpec, bare: bool) -> tuple[str, ...]:
-    if bare:
-        return (*LAPGS, "run", "--off", "--record", *_as_options(spec.options))
-    return (*LAPGS, "run", "--overwrite", "--seed", str(spec.seed), *_as_options(spec.options))
 
 
 def _script(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:

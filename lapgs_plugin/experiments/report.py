@@ -55,12 +55,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Results:
-    """The results of an experiment.
-
-    Attributes:
-        folder: the experiment's folder.
-        rows: rows of results.csv, in order.
-    """
+    """The results in an experiment's folder: the rows of its results.csv, in order."""
 
     folder: Path
     rows: Sequence[Row]
@@ -119,14 +114,7 @@ class Results:
 
 
 def write_experiment_report(folder: Path, options: RenderOptions) -> Path:
-    """Write FOLDER/report.html.
-
-    Args:
-        folder: folder of `lapgs bench`.
-        options: what renders the runs.
-
-    Returns:
-        The path of the page.
+    """Write report.html into a folder of `lapgs bench`, and return its path.
 
     Raises:
         RunFolderError: there are no results, or the file cannot be written.

@@ -50,11 +50,7 @@ class Row:
 
 
 def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
-    """Return the rows of a run, with its baseline if there is one.
-
-    Args:
-        metrics: of the run, then of the baseline if there is one.
-    """
+    """Return the rows for the metrics of a run, and then of its baseline if there is one."""
     views = "held-out" if metrics[0]["split"] == "test" else "training"
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),

@@ -78,15 +78,7 @@ class ViewTable:
 
 
 def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: RenderOptions) -> Path:
-    """Write RUN/report.html.
-
-    Args:
-        run: the run that the page is about.
-        baseline: the run that it is compared with, or None.
-        options: where the scene is, and what renders the runs.
-
-    Returns:
-        The path of the page.
+    """Write report.html into the folder of a run, compared with its baseline if there is one, and return its path.
 
     Raises:
         RunFolderError: the scene is missing, or the file cannot be written.
@@ -290,11 +282,7 @@ def _select_views(metrics: Metrics) -> dict[str, str]:
 
 
 def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
-    """Make the table of all views, sorted by the run's PSNR, the worst first.
-
-    Args:
-        runs: the run, then its baseline if there is one.
-    """
+    """Make the table of all views of a run, the worst PSNR first, beside those of its baseline if there is one."""
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
     keys = {"psnr": "PSNR (dB)", "ssim": "SSIM", **lpips_titles(set.intersection(*map(set, views)))}
     others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]

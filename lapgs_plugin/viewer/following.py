@@ -50,14 +50,10 @@ class FollowedRun:
     """The levels of a run that can be shown: finished, undamaged, from the coarsest on without gaps.
 
     Attributes:
-        options: as given.
+        options: where the scene is, and what renders the run.
         archive: the archive when last read.
         shown: the run; None while it has no level.
         problem: one line about the first level that is missing or damaged; None without.
-
-    Args:
-        folder: the run folder.
-        options: where the scene is, and what renders the run.
 
     Raises:
         RunFolderError: there is no run, it has another version, or its coarsest level is damaged.
@@ -136,14 +132,9 @@ class FollowedRun:
 
 
 class RunFollower:
-    """Keeps a viewer up to date with a run, and with a second one beside it.
+    """Keeps a viewer and the status on its page up to date with a run, and perhaps with another one beside it.
 
-    Args:
-        viewer: shows the runs.
-        page: shows the status.
-        run: the run.
-        other: the run to compare with, or None.
-        report: called with each new line of status.
+    `report` is called with each new line of status.
     """
 
     def __init__(

@@ -36,13 +36,7 @@ REPORT_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """The content that all clients see.
-
-    Attributes:
-        run: the run.
-        other: the run to compare with, or None.
-        cameras: the scene's cameras; None when unknown.
-    """
+    """What all clients see: a run, perhaps another one to compare it with, and the scene's cameras if known."""
 
     run: ShownRun
     other: ShownRun | None
