@@ -157,8 +157,7 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
             *(f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}"),
         )
     console.print(
-        "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels",
-        table,
+        "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels", table
     )
 
 
@@ -184,16 +183,16 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
         f"{counted(metrics['num_views'], kind + ' view')}{where}; "
         f"optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
-        f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
+        f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second"
     )
     console.print(
         f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR of the right half of each view after a colour fit on its "
         "left half; compare this one where photos differ in exposure or white balance"
-        + (", as they do here" if metrics["exposure_compensated"] else ""),
+        + (", as they do here" if metrics["exposure_compensated"] else "")
     )
     if metrics["exposure_predicted"]:
         console.print(
-            "all other figures give each view the exposure of its neighbours by name among the training photos",
+            "all other figures give each view the exposure of its neighbours by name among the training photos"
         )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]

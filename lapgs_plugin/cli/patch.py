@@ -31,8 +31,7 @@ app = typer.Typer(
 )
 
 Checkout = Annotated[
-    Path,
-    typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer."),
+    Path, typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer.")
 ]
 SetName = Annotated[
     str,

@@ -288,11 +288,7 @@ def _create(
     if choose_iterations:
         settings = _for_photos(len(loaded.train), settings)
     require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
-    manifest = Manifest(
-        scene=replace(reference, kind=loaded.kind),
-        rasterizer=rasterizer,
-        **settings.for_manifest(),
-    )
+    manifest = Manifest(scene=replace(reference, kind=loaded.kind), rasterizer=rasterizer, **settings.for_manifest())
     return RunArchive.create(out, manifest, overwrite), loaded, settings
 
 
@@ -365,8 +361,7 @@ def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:
     masks = [view.mask for view in (*scene.train, *scene.test)]
     if any(mask is not None for mask in masks):
         console.print(
-            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured",
-            markup=False,
+            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured", markup=False
         )
 
 

@@ -237,11 +237,7 @@ class _GroupBuilder:
     """Builds one group of a table, of runs that share their data set, from the rows of all finished runs."""
 
     def __init__(
-        self,
-        experiment: Experiment,
-        paper: PaperTable | None,
-        runs: Sequence[PlannedRun],
-        records: Mapping[str, Row],
+        self, experiment: Experiment, paper: PaperTable | None, runs: Sequence[PlannedRun], records: Mapping[str, Row]
     ) -> None:
         self._experiment, self._paper, self._dataset = experiment, paper, runs[0].spec.dataset
         self._variants = {variant.name: variant for variant in experiment.variants}

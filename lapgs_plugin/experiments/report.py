@@ -20,16 +20,7 @@ from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import (
-    Arrow,
-    Bar,
-    BarChart,
-    Chart,
-    draw_arrows,
-    draw_bars,
-    number_text,
-    seconds_text,
-)
+from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
 from lapgs_plugin.runs.archive import RunArchive

@@ -172,11 +172,7 @@ def _chart_row(
 ) -> list[Chart]:
     marks = [] if marked is None else _stage_marks(marked, x_of)
     charts = []
-    for key, title in (
-        ("loss", "Loss"),
-        ("psnr", "Held-out PSNR (dB)"),
-        ("num_gaussians", "Gaussians in training"),
-    ):
+    for key, title in (("loss", "Loss"), ("psnr", "Held-out PSNR (dB)"), ("num_gaussians", "Gaussians in training")):
         by_stage = key != "psnr"  # which is of the composed image, so that stages continue each other
         series = [
             Series(kind, points)

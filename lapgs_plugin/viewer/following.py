@@ -138,12 +138,7 @@ class RunFollower:
     """
 
     def __init__(
-        self,
-        viewer: Viewer,
-        page: Page,
-        run: FollowedRun,
-        other: FollowedRun | None,
-        report: Callable[[str], None],
+        self, viewer: Viewer, page: Page, run: FollowedRun, other: FollowedRun | None, report: Callable[[str], None]
     ) -> None:
         self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
