@@ -11,16 +11,14 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.expansion import PlannedRun
+from lapgs_plugin.experiments.exports import Row
 from lapgs_plugin.experiments.schema import Experiment, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.untrusted import shortened
 
-Row = Mapping[str, Any]
-"""Row of results, see `rows`."""
 LEVELS = "_level_"
 """End of a source that stands for one column for each level."""
 TIMES = ("minutes", "train_seconds", "iteration_ms")

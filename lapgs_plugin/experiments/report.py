@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 
 from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.options import RenderOptions
@@ -40,8 +40,6 @@ COUNTS = {
 
 FIGURES = ("train_seconds", "gaussians")
 """Columns with numbers that every row has."""
-
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -184,10 +182,9 @@ def _breakdown(results: Results) -> BarChart | None:
 
 def _overhead(results: Results) -> BarChart | None:
     """Draw seconds of overhead, means over scenes and seeds."""
-    columns = dict.fromkeys(name for row in results.rows for name in row)
     names = {
         column: column.removeprefix("overhead_").removesuffix("_seconds")
-        for column in columns
+        for column in columns_of(results.rows)
         if column.startswith("overhead_") and column != "overhead_seconds"
     }
     return _bars(results, "Overhead", names, seconds_text)
