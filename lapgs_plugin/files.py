@@ -97,6 +97,22 @@ def write_text(path: Path, text: str, *, training: bool = False) -> None:
         stream.write(text.encode())
 
 
+def is_file(path: Path) -> bool:
+    """Return whether a file exists; False also for names that the file system does not allow."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder exists; False also for names that the file system does not allow."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
 def require_manifest(folder: Path) -> None:
     """Check that a folder holds a run, without reading it or importing anything heavy.
 

@@ -107,3 +107,18 @@ def check_values(settings: Any) -> None:
             raise UserInputError(f"{name} {value}: expected at least {declared.least:g}")
         if declared.most is not None and not value <= declared.most:
             raise UserInputError(f"{name} {value}: expected at most {declared.most:g}")
+
+
+def refuse(options: Mapping[str, object], why: str) -> None:
+    """Refuse options that would have no effect.
+
+    Args:
+        options: values by name; None or False for an option that was not given.
+        why: the reason, as it follows the option's name.
+
+    Raises:
+        UserInputError: one was given.
+    """
+    for name, value in options.items():
+        if value is not None and value is not False:
+            raise UserInputError(f"{name} {why}; leave it out")

@@ -43,11 +43,7 @@ class Commands(TyperGroup):
 
 
 app = typer.Typer(
-    name="lapgs",
-    cls=Commands,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+    name="lapgs", cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False
 )
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from lapgs_plugin.cli.bench_blend import blend
-from lapgs_plugin.cli.bench_experiment import bench_experiment
 from lapgs_plugin.cli.bench_raster import raster
+from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.experiments.settings import BenchSettings
 
 EXPERIMENT = "run"
 """The default subcommand: `lapgs bench smoke.toml`."""
@@ -24,6 +26,29 @@ class _ExperimentByDefault(TyperGroup):
         if args and args[0] not in (*self.commands, "--help"):
             args = [EXPERIMENT, *args]
         return super().parse_args(ctx, args)
+
+
+@takes_settings
+def experiment(
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
+    ],
+    settings: BenchSettings,
+) -> None:
+    """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
+
+    Each run is a process of its own. Repeat the command to continue after Ctrl-C or a crash; finished runs are kept and
+    failed ones are tried again. Several commands can work on one folder at the same time.
+
+    Examples:
+
+        lapgs bench benchmarks/smoke.toml
+
+        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360
+    """
+    from lapgs_plugin.cli.bench_experiment import run_experiment
+
+    run_experiment(experiment, settings)
 
 
 def ops(
@@ -71,7 +96,7 @@ bench_app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-bench_app.command(EXPERIMENT)(bench_experiment)
+bench_app.command(EXPERIMENT)(experiment)
 bench_app.command("raster")(raster)
 bench_app.command("ops")(ops)
 bench_app.command("blend")(blend)

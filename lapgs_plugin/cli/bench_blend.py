@@ -50,7 +50,7 @@ def blend(
         raise UserInputError("lapgs bench blend: PyTorch finds no CUDA device; `lapgs doctor` says why")
     if find_spec("triton") is None:
         raise UserInputError("lapgs bench blend: Triton is not installed; it comes with PyTorch for CUDA on Linux")
-    bench_blend.parse_shapes(shapes)
+    parsed = bench_blend.parse_shapes(shapes)
     table = Table(title=f"Blending on {torch.cuda.get_device_name()}, ms for one view", box=box.SIMPLE)
     for heading in ("field", "views", "kernels", "forward", "backward", "both", "speed-up", "difference"):
         table.add_column(heading, justify="right" if heading not in ("field", "kernels") else "left")
@@ -62,7 +62,7 @@ def blend(
             fields[f"{ply.name}/{len(field)}"] = field, around
         for name, (one, cameras) in fields.items():
             by_gsplat, shown = 0.0, name
-            for found in bench_blend.run_case(one, cameras, repeats, shapes, torch.device("cuda")):
+            for found in bench_blend.run_case(one, cameras, repeats, parsed):
                 both = found.forward + found.backward
                 by_gsplat = by_gsplat or both
                 table.add_row(

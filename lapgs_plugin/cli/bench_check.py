@@ -10,31 +10,27 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import typer
 
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.experiments.commands import LAPGS
-from lapgs_plugin.experiments.expansion import SceneSpec
-from lapgs_plugin.experiments.mistakes import Mistakes, keys_of
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.settings import Selection
+from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec, SceneSpec
+from lapgs_plugin.experiments.mistakes import Mistakes
+from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution
-
-if TYPE_CHECKING:
-    from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec
-    from lapgs_plugin.experiments.store import Job
-    from lapgs_plugin.runner.settings import RunSettings
-    from lapgs_plugin.runs.manifest import SceneReference
-    from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import TrainSettings
 
 READS_SCENES = ("OpenImageIO", "pycolmap")
 """Packages without which no scene can be read."""
@@ -50,8 +46,6 @@ Sizes = Callable[[str], tuple[int, int] | None]
 
 
 def check_runs(
-    experiment: Experiment,
-    selection: Selection,
     planned: Sequence[PlannedRun],
     jobs: Sequence[Job],
     scenes: Mapping[str, tuple[SceneSpec, Path]],
@@ -62,7 +56,6 @@ def check_runs(
     """Collect the mistakes in these runs.
 
     Args:
-        experiment, selection: where the runs come from.
         planned: the runs.
         jobs: their commands.
         scenes: the scenes that exist or will be made, with their folders, by name.
@@ -70,9 +63,9 @@ def check_runs(
         here: whether the runs are for this machine; if so, what it lacks is a mistake.
     """
     by_id = {job.run_id: job for job in jobs}
-    sizes = _sizes_of(scenes)
+    sizes = {name: cache(partial(_smallest_size, *scene)) for name, scene in scenes.items()}
     for run in planned:
-        spec, keys = run.spec, keys_of(experiment, selection, run)
+        spec, keys = run.spec, mistakes.keys_of(run)
         try:
             HierarchySettings(seed=spec.seed)
             parse_resolution(spec.resolution)
@@ -152,8 +145,6 @@ def _without_device(words: Sequence[str]) -> list[str]:
 @cache
 def _command(name: str) -> Any:
     """Return a command as click's object."""
-    from lapgs_plugin.cli.app import app
-
     return cast(Any, typer.main.get_command(app)).commands[name]
 
 
@@ -207,30 +198,20 @@ def _sets(arguments: Sequence[str], *options: str) -> bool:
     return any(word == option or word.startswith(f"{option}=") for word in arguments for option in options)
 
 
-def _sizes_of(scenes: Mapping[str, tuple[SceneSpec, Path]]) -> dict[str, Sizes]:
-    """Return a cached lookup of image sizes for each scene."""
-    return {name: cache(_SceneSizes(*where)) for name, where in scenes.items()}
+def _smallest_size(scene: SceneSpec, folder: Path, resolution: str) -> tuple[int, int] | None:
+    """Return the smallest width and height of a scene's images; None without the packages that read scenes.
 
+    Raises:
+        SceneError: the scene cannot be used.
+    """
+    if scene.sample is not None and not folder.is_dir():
+        from lapgs_plugin.scenes.sample import parse_size
 
-@dataclass(frozen=True)
-class _SceneSizes:
-    scene: SceneSpec
-    folder: Path
+        return parse_resolution(resolution).size_for(*parse_size(scene.sample.size))
+    if any(find_spec(name) is None for name in READS_SCENES):
+        return None
+    from lapgs_plugin.scenes import load_cameras
 
-    def __call__(self, resolution: str) -> tuple[int, int] | None:
-        """Return the smallest width and height from image headers; None without the packages that read scenes.
-
-        Raises:
-            SceneError: the scene cannot be used.
-        """
-        if self.scene.sample is not None and not self.folder.is_dir():
-            from lapgs_plugin.scenes.sample import parse_size
-
-            return parse_resolution(resolution).size_for(*parse_size(self.scene.sample.size))
-        if any(find_spec(name) is None for name in READS_SCENES):
-            return None
-        from lapgs_plugin.scenes import load_cameras
-
-        train, test = load_cameras(self.folder, resolution=resolution, images=self.scene.images, eval=True)
-        cameras = [*train.values(), *test.values()]
-        return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+    train, test = load_cameras(folder, resolution=resolution, images=scene.images, eval=True)
+    cameras = [*train.values(), *test.values()]
+    return min(camera.width for camera in cameras), min(camera.height for camera in cameras)

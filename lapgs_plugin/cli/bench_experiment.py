@@ -1,26 +1,35 @@
-"""Run an experiment file and make tables of its results: `lapgs bench EXPERIMENT.toml`."""
+"""Run an experiment file and make tables of its results. Imports more than `lapgs --help` has time for."""
 
 from __future__ import annotations
 
-import os
+import shlex
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-import typer
+from rich.markdown import Markdown
+from rich.markup import escape
 
-from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin import __version__
+from lapgs_plugin.cli.bench_check import READS_SCENES, check_runs
 from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.run import run as run_script
+from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.experiments import exports
+from lapgs_plugin.experiments.aggregate import baseline_of, check_table, make_table
+from lapgs_plugin.experiments.commands import Locations
+from lapgs_plugin.experiments.expansion import PlannedRun, plan_runs, scenes_of
+from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
+from lapgs_plugin.experiments.mistakes import Mistakes
+from lapgs_plugin.experiments.runner import LOGS, STORE, execute, make_samples, prepare
+from lapgs_plugin.experiments.schema import Experiment, load_experiment
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
-
-if TYPE_CHECKING:
-    from lapgs_plugin.experiments.commands import Locations
-    from lapgs_plugin.experiments.expansion import PlannedRun
-    from lapgs_plugin.experiments.mistakes import Mistakes
-    from lapgs_plugin.experiments.runner import Folder
-    from lapgs_plugin.experiments.schema import Experiment
-    from lapgs_plugin.experiments.store import Job, Outcome
+from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
+from lapgs_plugin.experiments.tables import latex, markdown
+from lapgs_plugin.files import is_file, write_text
+from lapgs_plugin.progress import item_progress
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
@@ -35,86 +44,39 @@ class RunsFailedError(LapgsError):
     exit_code = 1
 
 
-@takes_settings
-def bench_experiment(
-    experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
-    ],
-    settings: BenchSettings,
-) -> None:
-    """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
-
-    Each run is a process of its own. Repeat the command to continue after Ctrl-C or a crash; finished runs are kept and
-    failed ones are tried again. Several commands can work on one folder at the same time.
-
-    Examples:
-
-        lapgs bench benchmarks/smoke.toml
-
-        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360
-    """
-    from lapgs_plugin.experiments.aggregate import check_table
-    from lapgs_plugin.experiments.commands import Locations
-    from lapgs_plugin.experiments.expansion import plan_runs
-    from lapgs_plugin.experiments.mistakes import Mistakes
-    from lapgs_plugin.experiments.runner import Folder
-    from lapgs_plugin.experiments.schema import load_experiment
-
-    mistakes = Mistakes(experiment)
-    loaded = load_experiment(experiment, _option_names())
+def run_experiment(file: Path, settings: BenchSettings) -> None:
+    """Do what `lapgs bench EXPERIMENT.toml` says in its help."""
+    experiment = load_experiment(file, _option_names())
+    mistakes = Mistakes(file, experiment, settings.selection)
     with mistakes.at("table"):
-        check_table(loaded)
-    planned = plan_runs(loaded, settings.selection)
-    folder = Folder(Path("runs", "bench", loaded.name) if settings.out is None else settings.out)
+        check_table(experiment)
+    planned = plan_runs(experiment, settings.selection)
+    folder = Path("runs", "bench", experiment.name) if settings.out is None else settings.out
     if settings.tables_only:
         mistakes.refuse()
-    else:
-        locations = Locations(settings.folders, experiment.parent)
-        _run(loaded, planned, folder, locations, settings, mistakes)
-    if settings.tables_only or not settings.dry_run:
-        _write(loaded, planned, folder)
-
-
-def _run(
-    experiment: Experiment,
-    planned: Sequence[PlannedRun],
-    folder: Folder,
-    locations: Locations,
-    settings: BenchSettings,
-    mistakes: Mistakes,
-) -> None:
-    """Check all runs, then execute them, or print their commands with --dry-run."""
-    from lapgs_plugin.cli.bench_check import check_runs
-    from lapgs_plugin.experiments.expansion import scenes_of
-    from lapgs_plugin.experiments.launchers import check_launcher
-    from lapgs_plugin.experiments.runner import make_samples, prepare
-
+        _write(experiment, planned, folder)
+        return
     if not settings.dry_run:
         check_launcher(settings.engine)
-        require_place(folder.path)
-    selection = settings.selection
-    scenes = scenes_of(experiment, selection)
-    measuring = _measuring(settings)
-    jobs, found = prepare(planned, scenes, locations, folder, measuring, experiment, selection, mistakes)
+        require_place(folder)
+    scenes, places = scenes_of(experiment, settings.selection), Locations(settings.folders, file.parent)
+    jobs, found = prepare(planned, scenes, places, folder, _measuring(settings), mistakes)
     here = settings.engine.launcher == "local" and not settings.dry_run
-    check_runs(experiment, selection, planned, jobs, found, mistakes, here=here)
+    check_runs(planned, jobs, found, mistakes, here=here)
     mistakes.refuse()
     if settings.dry_run:
         _print_commands(jobs)
         return
     make_samples(scenes, folder)
     _follow(jobs, folder, settings.engine)
+    _write(experiment, planned, folder)
 
 
 def _option_names() -> dict[str, set[str]]:
     """Return the options that an experiment may set, by command."""
-    from lapgs_plugin.cli.run import run
-    from lapgs_plugin.cli.train import train
-
-    functions = {"train": train, "run": run}
     return {
         name: {p for p in function.__annotations__ if p not in ("return", "context")} - SET_BY_EXPERIMENTS
-        for name, function in functions.items()
+        for name, function in (("train", train), ("run", run_script))
     }
 
 
@@ -124,15 +86,11 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
     Raises:
         UserInputError: a package that reads scenes or a file of weights is missing.
     """
-    from importlib.util import find_spec
-
-    from lapgs_plugin.cli.bench_check import READS_SCENES
-
     if not settings.evaluate:
         return None
     weights = settings.lpips_weights or []
     for file in weights:
-        if not os.path.isfile(file):  # noqa: PTH113  # Path.is_file raises where a name is too long
+        if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
     missing = [name for name in READS_SCENES if find_spec(name) is None]
     if missing:
@@ -144,27 +102,18 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
 
 
 def _print_commands(jobs: Sequence[Job]) -> None:
-    import shlex
-
     for job in jobs:
         print(f"# {job.run_id}")
         for step in job.steps:
             print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
-def _follow(jobs: Sequence[Job], folder: Folder, engine: WorkerSettings) -> None:
+def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:
     """Run the jobs with a progress bar and a line for each finished run."""
-    from rich.markup import escape
-
-    from lapgs_plugin.experiments.launchers import WorkOrder, launch
-    from lapgs_plugin.experiments.runner import execute
-    from lapgs_plugin.experiments.store import DONE, FAILED, ResultStore
-    from lapgs_plugin.progress import item_progress
-
-    store = ResultStore.create(folder.store)
+    store = ResultStore.create(folder / STORE)
     store.plan(jobs)
     run_ids = [job.run_id for job in jobs]
-    order = WorkOrder(folder.store.absolute(), run_ids, folder.logs("workers").absolute(), engine)
+    order = WorkOrder(folder.absolute() / STORE, run_ids, folder.absolute() / LOGS / "workers", engine)
     finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
     if finished:
         make_console(stderr=True).print(f"{finished} of {len(run_ids)} runs are done already")
@@ -190,42 +139,32 @@ def _summary(record: dict[str, Any]) -> str:
     return ", ".join(pattern.format(record[name]) for name, pattern in patterns.items() if name in record)
 
 
-def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Folder) -> None:
+def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) -> None:
     """Write the results, print their table, and report the runs that failed.
 
     Raises:
         RunsFailedError: some did.
     """
-    import shlex
-
-    from rich.markdown import Markdown
-
-    from lapgs_plugin.experiments import exports
-    from lapgs_plugin.experiments.aggregate import make_table
-    from lapgs_plugin.experiments.store import FAILED, ResultStore
-    from lapgs_plugin.experiments.tables import latex, markdown
-    from lapgs_plugin.files import write_text
-
-    store = ResultStore(folder.store)
-    outcomes = {o.run_id: o for o in store.outcomes({run.spec.run_id for run in planned})}
+    path = folder / STORE
+    outcomes = {o.run_id: o for o in ResultStore(path).outcomes({run.spec.run_id for run in planned})}
     records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}
     try:
         table = make_table(experiment, planned, records)
     except RunFolderError as error:
-        raise RunFolderError(f"{folder.store}: {error}") from None
+        raise RunFolderError(f"{path}: {error}") from None
     text = markdown(table)
-    write_text(folder.path / exports.MARKDOWN, text)
-    write_text(folder.path / exports.LATEX, latex(table))
-    _write_rows(experiment, planned, records, folder.path)
+    write_text(folder / exports.MARKDOWN, text)
+    write_text(folder / exports.LATEX, latex(table))
+    _write_rows(experiment, planned, records, folder)
     console = make_console()
     console.print(Markdown(text)) if console.is_terminal else print(text)
     _name_versions(records)
-    print(f"{folder.path} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
-    print(f"next: lapgs report {shlex.quote(str(folder.path))} writes a page with curves and images")
+    print(f"{folder} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    print(f"next: lapgs report {shlex.quote(str(folder))} writes a page with curves and images")
     if failed := [o for o in outcomes.values() if o.state == FAILED]:
         raise RunsFailedError(
             f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "
-            f"{folder.path / 'logs'}"
+            f"{folder / LOGS}"
         )
 
 
@@ -233,11 +172,6 @@ def _write_rows(
     experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, dict[str, Any]], folder: Path
 ) -> None:
     """Write the figures of each run, as CSV and, where pyarrow is installed, as Parquet."""
-    from rich.markup import escape
-
-    from lapgs_plugin.experiments import exports
-    from lapgs_plugin.experiments.aggregate import baseline_of
-
     names: dict[str, list[str]] = {}
     for run in planned:
         names.setdefault(run.spec.backbone, []).append(run.variant)
@@ -261,8 +195,6 @@ def _write_rows(
 
 def _name_versions(records: Mapping[str, dict[str, Any]]) -> None:
     """Say on stderr if results were made by other versions of this package."""
-    from lapgs_plugin import __version__
-
     others = sorted({str(r["lapgs_version"]) for r in records.values()} - {__version__})
     if others:
         make_console(stderr=True).print(

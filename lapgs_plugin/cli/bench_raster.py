@@ -12,6 +12,7 @@ import typer
 
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_folder, write_text
 
 if TYPE_CHECKING:
     import torch
@@ -51,12 +52,10 @@ def raster(
 
     if dtype not in DTYPES:
         raise UserInputError(f"--dtype {dtype}: expected {' or '.join(DTYPES)}")
-    # Not Path.is_dir, which raises where a name is too long for the file system.
-    folder = "." if json_file is None else os.fspath(json_file.parent)
     if json_file is not None and (
-        not os.path.isdir(folder)  # noqa: PTH112
-        or not os.access(folder, os.W_OK)
-        or os.path.isdir(json_file)  # noqa: PTH112
+        not is_folder(json_file.parent)
+        or not os.access(json_file.parent, os.W_OK)
+        or is_folder(json_file)
         or len(os.fsencode(json_file.name)) > LONGEST_NAME
     ):
         raise UserInputError(f"--json {json_file}: expected a file in a folder that exists and may be written")
@@ -64,7 +63,6 @@ def raster(
     import torch
 
     from lapgs_plugin.evaluation import bench_raster
-    from lapgs_plugin.files import write_text
 
     precision: torch.dtype = getattr(torch, dtype)
     results = _measure(bench_raster.parse_cases(sizes), repeats, precision)

@@ -69,10 +69,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 
     found: dict[str, Callable[[], list[Subject]]] = {
-        "cpu": lambda: [
-            Subject("cpu", CpuRasterizer()),
-            Subject("cpu, float64", CpuRasterizer(), torch.float64),
-        ],
+        "cpu": lambda: [Subject("cpu", CpuRasterizer()), Subject("cpu, float64", CpuRasterizer(), torch.float64)],
         "oracle": lambda: [Subject("oracle, float32", OracleRasterizer())],
     }
     if torch.cuda.is_available():

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table
-from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
+from lapgs_plugin.cli.output import make_console, make_table, show_log
 from lapgs_plugin.errors import counted, printable
-from lapgs_plugin.options import check_values, option
+from lapgs_plugin.options import check_values, option, refuse
+from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -92,7 +92,7 @@ def evaluate(
     wanted = LpipsRequest.parse(settings.lpips, settings.lpips_weights or ())
     archive = RunArchive.open(run)
     show_log()
-    metrics = evaluate_run(archive, options.scene, device=options.device, rasterizer=options.rasterizer, lpips=wanted)
+    metrics = evaluate_run(archive, options, wanted)
     _print(metrics)
     print(f"{archive.path(METRICS)} holds these figures")
 
@@ -108,9 +108,7 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
     other = None if settings.baseline is None else RunArchive.open(settings.baseline)
     show_log()
     cameras = path_cameras(archive, trajectory, settings.frames, FLICKER_FRAMES, options.scene)
-    figures = evaluate_stability(
-        archive, other, trajectory, cameras, device=options.device, rasterizer=options.rasterizer
-    )
+    figures = evaluate_stability(archive, other, trajectory, cameras, options)
     table = make_table("", "mean difference", "PSNR (dB)")
     for name, each in figures["flicker"].items():
         table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")
@@ -136,14 +134,13 @@ def _print(metrics: dict[str, Any]) -> None:
 def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     from rich.markup import escape
 
-    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+    from lapgs_plugin.evaluation.lpips import lpips_titles
 
-    measured = [name for name in VARIANTS if LPIPS_KEY.format(name) in metrics]
-    headings = [f"LPIPS ({title_of(name)})" for name in measured]
-    table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *headings)
+    measured = lpips_titles(metrics)
+    table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *measured.values())
     ranked = sorted(metrics["views"], key=lambda view: float(view["psnr"]))
     for view in ranked[:SHOWN_VIEWS]:
-        distances = [f"{view[LPIPS_KEY.format(name)]:.4f}" for name in measured]
+        distances = [f"{view[key]:.4f}" for key in measured]
         figures = f"{view['psnr']:.2f}", f"{view['fitted_psnr']:.2f}", f"{view['ssim']:.4f}"
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
@@ -160,8 +157,7 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
             *(f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}"),
         )
     console.print(
-        "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels",
-        table,
+        "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels", table
     )
 
 
@@ -176,27 +172,27 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 
 
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
-    from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, missing_lines
+    from lapgs_plugin.evaluation.lpips import lpips_titles, missing_lines
 
     kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
     where = " inside their masks" if metrics["masked"] else ""
-    if where and any(LPIPS_KEY.format(name) in metrics for name in VARIANTS):
+    if where and lpips_titles(metrics):
         where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
         f"{counted(metrics['num_views'], kind + ' view')}{where}; "
         f"optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
-        f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second",
+        f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second"
     )
     console.print(
         f"[bold]{metrics['fitted_psnr']:.2f} dB[/bold] PSNR of the right half of each view after a colour fit on its "
         "left half; compare this one where photos differ in exposure or white balance"
-        + (", as they do here" if metrics["exposure_compensated"] else ""),
+        + (", as they do here" if metrics["exposure_compensated"] else "")
     )
     if metrics["exposure_predicted"]:
         console.print(
-            "all other figures give each view the exposure of its neighbours by name among the training photos",
+            "all other figures give each view the exposure of its neighbours by name among the training photos"
         )
     if (peak := metrics["peak_memory_bytes"]) is not None:
         bare = metrics["peak_memory_without_images_bytes"]

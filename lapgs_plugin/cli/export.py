@@ -10,9 +10,8 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import require_place
-from lapgs_plugin.cli.rendering import refuse
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option
+from lapgs_plugin.options import check_values, option, refuse
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField

@@ -21,8 +21,7 @@ def import_run(
         Path | None, typer.Option("--scene", "-s", help="Scene folder, if it was moved after training.")
     ] = None,
     backbone: Annotated[
-        str | None,
-        typer.Option(help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}."),
+        str | None, typer.Option(help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}.")
     ] = None,
     iteration: Annotated[
         int | None, typer.Option(help="Import the model saved at this iteration. Default: the last one.")

@@ -1,13 +1,15 @@
-"""Print tables, name the command that comes next, and check where results go."""
+"""Print tables and logs, name the command that comes next, and check where results go."""
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
@@ -39,6 +41,12 @@ def make_table(*headings: str) -> Table:
     return Table(*headings, box=box.SIMPLE_HEAD)
 
 
+def show_log() -> None:
+    """Print on stderr which rasterizer renders a run, and why."""
+    logging.basicConfig(format="lapgs: %(message)s")
+    logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
+
+
 def train_command(scene: Path, options: str = "") -> str:
     """Return the command that trains a scene with further options, as a user can paste it."""
     run = Path("runs") / scene.absolute().name
@@ -57,7 +65,7 @@ def require_place(folder: Path) -> None:
         if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
             raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
         existing = os.path.dirname(existing)  # noqa: PTH120
-    if not os.path.isdir(existing):  # noqa: PTH112
+    if not is_folder(Path(existing)):
         raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")

@@ -31,8 +31,7 @@ app = typer.Typer(
 )
 
 Checkout = Annotated[
-    Path,
-    typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer."),
+    Path, typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer.")
 ]
 SetName = Annotated[
     str,
@@ -85,19 +84,10 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
     chosen = _targets(checkout, set_name, opt_in=False)
     with _alone(chosen):
         planned = _planned(chosen)
-        if not planned:
+        if planned:
+            _write("patched", planned, allow_dirty)
+        else:
             typer.echo(f"{checkout}: nothing to do, these edits are applied already: {set_name}")
-            return
-        changes = [change for _, change in planned]
-        _refuse_read_only(changes)
-        dirty = [] if allow_dirty else uncommitted(change.path for change in changes)
-        if dirty:
-            raise PatchError(
-                f"uncommitted changes in {_listed(dirty)}; commit them first, or pass --allow-dirty (`lapgs patch "
-                "revert` removes only the patch in either case); nothing was changed"
-            )
-        write_all(changes)
-    _report("patched", planned)
 
 
 @app.command("revert")
@@ -106,13 +96,10 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         planned = [(target, change) for target, sets in chosen for change in plan_revert(target, sets)]
-        if not planned:
+        if planned:
+            _write("reverted", planned, allow_dirty=True)
+        else:
             typer.echo(f"{checkout}: nothing to remove, none of these edits is applied: {set_name}")
-            return
-        changes = [change for _, change in planned]
-        _refuse_read_only(changes)
-        write_all(changes)
-    _report("reverted", planned)
 
 
 @contextmanager
@@ -148,14 +135,22 @@ def _planned(chosen: Sequence[tuple[Target, Collection[str]]]) -> list[tuple[Tar
     return [(target, change) for target, sets in chosen for change in plan_apply(target, sets)]
 
 
-def _refuse_read_only(changes: Sequence[FileChange]) -> None:
-    blocked = read_only(changes)
-    if blocked:
+def _write(verb: str, planned: Sequence[tuple[Target, FileChange]], allow_dirty: bool) -> None:
+    """Write all changes, and print them with the commands that come next.
+
+    Raises:
+        PatchError: a file is read-only, or has uncommitted changes that are not allowed.
+    """
+    changes = [change for _, change in planned]
+    if blocked := read_only(changes):
         raise PatchError(f"read-only: {_listed(blocked)}; make them writable first; nothing was changed")
-
-
-def _report(verb: str, planned: Sequence[tuple[Target, FileChange]]) -> None:
-    for _, change in planned:
+    if not allow_dirty and (dirty := uncommitted(change.path for change in changes)):
+        raise PatchError(
+            f"uncommitted changes in {_listed(dirty)}; commit them first, or pass --allow-dirty (`lapgs patch revert` "
+            "removes only the patch in either case); nothing was changed"
+        )
+    write_all(changes)
+    for change in changes:
         typer.echo(f"{verb} {change.path}")
     commands = [target.recipe.reinstall.format(folder=target.folder) for target, _ in planned]
     typer.echo("Next, reinstall the changed extensions:")

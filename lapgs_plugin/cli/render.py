@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, require_place
-from lapgs_plugin.cli.rendering import RenderOptions, refuse, show_log
+from lapgs_plugin.cli.output import make_console, require_place, show_log
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option
+from lapgs_plugin.options import check_values, option, refuse
+from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

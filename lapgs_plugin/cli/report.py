@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table
-from lapgs_plugin.cli.rendering import RenderOptions, show_log
+from lapgs_plugin.cli.output import make_console, make_table, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,22 +46,21 @@ def report(
     from lapgs_plugin.runs.archive import RunArchive
 
     run = run or _newest(Path("runs"))
-    scene, where = options.scene, {"device": options.device, "rasterizer": options.rasterizer}
     if (run / CSV).is_file():
-        if baseline or scene:
+        if baseline or options.scene:
             raise UserInputError(
                 f"{run} is an experiment with baselines and scenes of its own; leave out --baseline and --scene"
             )
         from lapgs_plugin.experiments.report import write_experiment_report
 
         show_log()
-        page = write_experiment_report(run, **where)
+        page = write_experiment_report(run, options)
         print(f"{page} shows the experiment")
         return
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
     show_log()
-    runs = [MeasuredRun(archive, run_metrics(archive, scene, **where)) for archive in archives]
-    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, scene, **where)
+    runs = [MeasuredRun(archive, run_metrics(archive, options)) for archive in archives]
+    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, options)
     _print(runs)
     print(f"{page} shows this with curves and images")
 

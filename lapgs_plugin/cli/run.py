@@ -13,7 +13,7 @@ import typer
 from lapgs_plugin.adapters.registry import OWN, adapter_class
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.rehearsal import Rehearsal
-from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
+from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runner.settings import RunSettings
@@ -128,6 +128,7 @@ def _execute(
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
+    from lapgs_plugin.viewer.preview import save_run_preview
 
     on_device: AbstractContextManager[None] = nullcontext()
     if device == "cpu":
@@ -151,7 +152,7 @@ def _execute(
             )
             driver.run()
         if driver.folder is not None:
-            keep_preview(driver.folder, device)
+            save_run_preview(driver.folder, device)
     except ImportError as error:
         line = None if options.off else explain_import_error(error, script, on_cpu=device == "cpu")
         if line is None:

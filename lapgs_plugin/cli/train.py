@@ -15,7 +15,7 @@ from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import ConfigOption, extend_config, write_config
 from lapgs_plugin.cli.output import make_console, require_place
 from lapgs_plugin.cli.rehearsal import Rehearsal
-from lapgs_plugin.cli.viewing import ViewOptions, keep_preview, watching
+from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option, option_values
@@ -146,7 +146,9 @@ def _finish(out: Path, scene: Path) -> None:
     """Render a preview of the run from its scene's folder, and say what can be done with it."""
     from rich.markup import escape
 
-    keep_preview(out.absolute(), scene=scene)
+    from lapgs_plugin.viewer.preview import save_run_preview
+
+    save_run_preview(out.absolute(), moved_to=scene)
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
@@ -286,11 +288,7 @@ def _create(
     if choose_iterations:
         settings = _for_photos(len(loaded.train), settings)
     require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
-    manifest = Manifest(
-        scene=replace(reference, kind=loaded.kind),
-        rasterizer=rasterizer,
-        **settings.for_manifest(),
-    )
+    manifest = Manifest(scene=replace(reference, kind=loaded.kind), rasterizer=rasterizer, **settings.for_manifest())
     return RunArchive.create(out, manifest, overwrite), loaded, settings
 
 
@@ -363,8 +361,7 @@ def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:
     masks = [view.mask for view in (*scene.train, *scene.test)]
     if any(mask is not None for mask in masks):
         console.print(
-            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured",
-            markup=False,
+            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured", markup=False
         )
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.rendering import RenderOptions, show_log
+from lapgs_plugin.cli.output import show_log
 from lapgs_plugin.cli.viewing import HOST, PORT, open_page, require_viser
 from lapgs_plugin.files import require_manifest
+from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from lapgs_plugin.viewer.page import Page
@@ -66,10 +67,10 @@ def _serve(page: Page, run: Path, baseline: Path | None, options: RenderOptions)
     from lapgs_plugin.viewer.following import FollowedRun, RunFollower
     from lapgs_plugin.viewer.viewer import Viewer
 
-    shown = FollowedRun(run, options.device, options.rasterizer)
-    other = None if baseline is None else FollowedRun(baseline, options.device, options.rasterizer)
+    shown = FollowedRun(run, options)
+    other = None if baseline is None else FollowedRun(baseline, options)
     viewer, stop = Viewer(page), threading.Event()
-    following = RunFollower(viewer, page, shown, other, options.scene, report=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, report=lambda line: print(line, flush=True))
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)

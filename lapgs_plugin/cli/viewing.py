@@ -6,7 +6,6 @@ import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError
@@ -92,18 +91,3 @@ def watching(options: ViewOptions, label: str, device: str = "auto") -> Iterator
         from lapgs_plugin.viewer.live import LiveView
 
         yield LiveView(page, device)
-
-
-def keep_preview(run: Path, device: str = "auto", scene: Path | None = None) -> None:
-    """Render a preview of a trained run, which `lapgs view` shows first. A failure is only logged.
-
-    Args:
-        run: the run folder.
-        device: where to render.
-        scene: the scene's folder, if it was moved.
-    """
-    from lapgs_plugin.jit.threads import one_pool
-    from lapgs_plugin.viewer.preview import save_run_preview
-
-    with one_pool():
-        save_run_preview(run, device, scene)

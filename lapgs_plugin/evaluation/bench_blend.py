@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
@@ -95,10 +95,10 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
 
 
 @torch.no_grad()
-def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera], device: torch.device) -> ToBlend:
+def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> ToBlend:
     """Project a field on a GPU for some views, and sort it into tiles."""
-    field = field.to(device)
-    on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device=device)
+    field = field.to("cuda")
+    on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device="cuda")
     found = direct.forward(
         field.means.contiguous(), field.quaternions.contiguous(), field.log_scales.contiguous(),
         field.opacity_logits.contiguous(), field.sh.contiguous(), on_device, background, field.sh_degree, field.signed,
@@ -107,7 +107,7 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera], device: to
     return found.given
 
 
-def contenders(given: ToBlend, size: tuple[int, int], shapes: str | None) -> dict[str, Kernels]:
+def contenders(given: ToBlend, size: tuple[int, int], shapes: Mapping[str, Shape]) -> dict[str, Kernels]:
     """Return gsplat's kernels, and ours in several shapes."""
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
 
@@ -126,16 +126,16 @@ def contenders(given: ToBlend, size: tuple[int, int], shapes: str | None) -> dic
         partial(blend_gradients.blend, given, size, ours=False),
         partial(blend_gradients.gradients, given, absolute=False),
     )
-    return {"gsplat": gsplat, **{name: ours(shape) for name, shape in parse_shapes(shapes).items()}}
+    return {"gsplat": gsplat, **{name: ours(shape) for name, shape in shapes.items()}}
 
 
 def run_case(
-    field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: str | None, device: torch.device
+    field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: Mapping[str, Shape]
 ) -> Iterator[BlendTime]:
     """Time all kernels for some views of a field, in turns."""
-    given, (width, height) = sorted_gaussians(field, cameras, device), (cameras[0].width, cameras[0].height)
+    given, (width, height) = sorted_gaussians(field, cameras), (cameras[0].width, cameras[0].height)
     generator = torch.Generator().manual_seed(0)
-    by_images = torch.randn(len(cameras), height, width, 3, generator=generator).to(device)
+    by_images = torch.randn(len(cameras), height, width, 3, generator=generator).cuda()
     kernels = contenders(given, (width, height), shapes)
     results = {}
     for name, one in kernels.items():

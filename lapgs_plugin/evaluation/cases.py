@@ -160,12 +160,7 @@ def random_case(
     sizes = torch.exp(low + (high - low) * torch.rand(n, 3, generator=generator, dtype=torch.float64))
     opacities = 0.02 + 0.96 * torch.rand(n, generator=generator, dtype=torch.float64)
     field = make_field(
-        means,
-        scales=sizes * depth / camera.fx,
-        opacities=opacities,
-        sh_degree=sh_degree,
-        signed=signed,
-        seed=seed + 3,
+        means, scales=sizes * depth / camera.fx, opacities=opacities, sh_degree=sh_degree, signed=signed, seed=seed + 3
     )
     return Case(name, field, camera, background)
 

@@ -29,33 +29,28 @@ class Bounds:
     Attributes:
         image: error of a pixel of the image or the transmittance, relative to the largest colour or 1.
         element: error of a gradient, relative to its largest element.
-        row: error of one Gaussian's gradient, relative to its norm or to `row_floor` times the largest norm.
-        row_floor: see `row`.
+        row: error of one Gaussian's gradient, relative to its norm or to `ROW_FLOOR` times the largest norm.
         relative_l2: distance of the whole gradient, relative to its norm.
         mean2d: error of a projected centre in pixels, relative to the larger image side or the coordinate.
-        roundings: width of the band, in epsilon of the float type.
     """
 
     image: float
     element: float
     row: float
-    row_floor: float
     relative_l2: float
     mean2d: float
-    roundings: float
 
 
 BOUNDS = {
     # Worst seen, oracle and CPU rasterizer in float32: image 2e-5, element 4e-5, row 6e-4, L2 2e-5, all by needles.
-    torch.float32: Bounds(
-        image=1e-4, element=3e-4, row=1e-2, row_floor=1e-3, relative_l2=3e-4, mean2d=1e-5, roundings=16
-    ),
+    torch.float32: Bounds(image=1e-4, element=3e-4, row=1e-2, relative_l2=3e-4, mean2d=1e-5),
     # Worst seen, CPU rasterizer: image 2e-14, element 7e-14.
-    torch.float64: Bounds(
-        image=1e-12, element=1e-11, row=1e-9, row_floor=1e-3, relative_l2=1e-11, mean2d=1e-13, roundings=16
-    ),
+    torch.float64: Bounds(image=1e-12, element=1e-11, row=1e-9, relative_l2=1e-11, mean2d=1e-13),
 }
 """By the rasterizer's float type."""
+ROW_FLOOR = 1e-3
+ROUNDINGS = 16
+"""Width of the band, in epsilon of the float type."""
 
 EXPANDED_CONIC: dict[str, dict[str, dict[str, float]]] = {
     "needles": {
@@ -164,7 +159,6 @@ def check(subject: Subject, cases: Sequence[Case]) -> Iterator[Outcome]:
 
 def check_case(subject: Subject, case: Case) -> Outcome:
     """Check one case as it is, see `check`."""
-    bounds = BOUNDS[subject.dtype]
     case = case.to(subject.dtype)
     exact = case.to(torch.float64)
     cut = subject.semantics.three_sigma_cut
@@ -172,7 +166,7 @@ def check_case(subject: Subject, case: Case) -> Outcome:
         exact.field,
         exact.camera,
         sh_degree=case.sh_degree,
-        tolerance=bounds.roundings * torch.finfo(subject.dtype).eps,
+        tolerance=ROUNDINGS * torch.finfo(subject.dtype).eps,
         three_sigma_cut=cut,
     )
     if case.name in subject.semantics.departures:
@@ -340,7 +334,7 @@ def _compare_gradients(
         problems.append(f"gradient of {name}: longer at a kink than {KINK_FACTOR:g} times the longest elsewhere")
     rows, wanted = rows[~kinks], wanted[~kinks]
     difference = rows - wanted
-    norms = wanted.norm(dim=1).clamp(min=max(bounds.row_floor * longest, 1e-30))  # (n,)
+    norms = wanted.norm(dim=1).clamp(min=max(ROW_FLOOR * longest, 1e-30))  # (n,)
     measured = {
         "its largest element": (_largest(difference) / max(_largest(wanted), 1e-30), bounds.element),
         "the Gaussian's own norm": (_largest(difference.norm(dim=1) / norms), bounds.row),

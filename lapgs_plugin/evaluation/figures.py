@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -20,6 +19,7 @@ from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.options import AS_TRAINED, RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import RunArchive
@@ -101,12 +101,7 @@ def measure_view(
 
 
 def evaluate_run(
-    archive: RunArchive,
-    moved_to: Path | None = None,
-    *,
-    device: str = "auto",
-    rasterizer: str = "auto",
-    lpips: LpipsRequest | None = None,
+    archive: RunArchive, options: RenderOptions = AS_TRAINED, lpips: LpipsRequest | None = None
 ) -> dict[str, Any]:
     """Measure a complete run on its held-out views, or on its training views when none were held out.
 
@@ -114,8 +109,7 @@ def evaluate_run(
 
     Args:
         archive: the run.
-        moved_to: the scene's folder now; None when it did not move.
-        device, rasterizer: see `rendering.run.run_renderer`.
+        options: where the scene is, and what renders the run.
         lpips: distances to measure, those of VGG by default. Distances without weights are left out, and
             "lpips_missing" says so.
 
@@ -127,9 +121,9 @@ def evaluate_run(
         UserInputError: a file of LPIPS weights cannot be used.
     """
     require_complete(archive)
-    renderer = run_renderer(archive, device, rasterizer)
+    renderer = run_renderer(archive, options.device, options.rasterizer)
     with one_pool():
-        scene = run_scene(archive, moved_to)
+        scene = run_scene(archive, options.scene)
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
         smallest = min(min(view.camera.width, view.camera.height) for view in views)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
@@ -153,9 +147,7 @@ def evaluate_run(
     return metrics
 
 
-def run_metrics(
-    archive: RunArchive, moved_to: Path | None = None, *, device: str = "auto", rasterizer: str = "auto"
-) -> dict[str, Any]:
+def run_metrics(archive: RunArchive, options: RenderOptions) -> dict[str, Any]:
     """Return the run's metrics.json, or measure it with `evaluate_run` when it does not exist.
 
     Raises:
@@ -164,7 +156,7 @@ def run_metrics(
     require_complete(archive)
     metrics = archive.metrics()
     if metrics is None:
-        return evaluate_run(archive, moved_to, device=device, rasterizer=rasterizer)
+        return evaluate_run(archive, options)
     if missing := METRIC_KEYS - metrics.keys():
         raise RunFolderError(
             f"{archive.path(METRICS)} lacks {', '.join(sorted(missing))}; write it again with `lapgs eval`"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -131,9 +131,13 @@ def network_of(variant: str) -> str:
     return "vgg" if variant == AS_3DGS else variant
 
 
-def title_of(variant: str) -> str:
-    """Return the name of one of `VARIANTS` for people."""
-    return NETWORKS[network_of(variant)].title + (" as 3DGS" if variant == AS_3DGS else "")
+def lpips_titles(keys: Container[str]) -> dict[str, str]:
+    """Return the titles of the variants whose key in metrics.json is among these keys, by key."""
+    titles = {
+        LPIPS_KEY.format(name): f"LPIPS ({NETWORKS[network_of(name)].title}{' as 3DGS' if name == AS_3DGS else ''})"
+        for name in VARIANTS
+    }
+    return {key: title for key, title in titles.items() if key in keys}
 
 
 class Lpips(nn.Module):

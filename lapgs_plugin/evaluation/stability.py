@@ -24,6 +24,7 @@ from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.depth import DepthImage, render_depth
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 
@@ -160,13 +161,7 @@ def path_frames(
 
 
 def evaluate_stability(
-    archive: RunArchive,
-    single: RunArchive | None,
-    path: str,
-    cameras: Sequence[Camera],
-    *,
-    device: str = "auto",
-    rasterizer: str = "auto",
+    archive: RunArchive, single: RunArchive | None, path: str, cameras: Sequence[Camera], options: RenderOptions
 ) -> dict[str, Any]:
     """Measure the flicker of a run along a path, and write it to the run's stability.json.
 
@@ -175,7 +170,7 @@ def evaluate_stability(
         single: a single field of the same scene, or None.
         path: name of the path in the figures.
         cameras: one for each frame.
-        device, rasterizer: see `rendering.run.run_renderer`.
+        options: what renders the runs.
 
     Returns:
         JSON values: "path", "size", "frames", "compared" (share of all pixels), "baseline", and in "flicker", by image,
@@ -193,8 +188,8 @@ def evaluate_stability(
         )
     if len(cameras) < 2:
         raise UserInputError(f"--trajectory {path} has one camera, expected two or more; give --frames")
-    renderer = run_renderer(archive, device, rasterizer)
-    other = None if single is None else run_renderer(single, device, rasterizer)
+    renderer = run_renderer(archive, options.device, options.rasterizer)
+    other = None if single is None else run_renderer(single, options.device, options.rasterizer)
     with one_pool(), item_progress("frames") as progress:
         frames = path_frames(renderer, other, cameras)
         tracked = progress.track(frames, total=len(cameras), description=f"Following {path}")

@@ -11,16 +11,14 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.expansion import PlannedRun
+from lapgs_plugin.experiments.exports import Row
 from lapgs_plugin.experiments.schema import Experiment, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.untrusted import shortened
 
-Row = Mapping[str, Any]
-"""Row of results, see `rows`."""
 LEVELS = "_level_"
 """End of a source that stands for one column for each level."""
 TIMES = ("minutes", "train_seconds", "iteration_ms")
@@ -156,20 +154,14 @@ class ResultTable:
     """A table of results, to be written as Markdown and LaTeX.
 
     Attributes:
-        title: title of the experiment.
-        label: name of the experiment.
+        experiment: the experiment, whose `table` says how the results are shown.
         measured: machines, versions and numbers of iterations.
-        columns: names of `COLUMNS`.
-        transposed: show columns as rows.
         groups: data sets in the experiment's order.
         scenes: scenes, if the experiment asks for them.
     """
 
-    title: str
-    label: str
+    experiment: Experiment
     measured: str
-    columns: tuple[str, ...]
-    transposed: bool
     groups: tuple[Group, ...]
     scenes: tuple[Group, ...]
 
@@ -208,33 +200,20 @@ def baseline_of(experiment: Experiment, names: Sequence[str]) -> str:
 
 
 def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> ResultTable:
-    """Make the table of an experiment.
-
-    Args:
-        experiment: the experiment.
-        planned: its runs.
-        records: rows of finished runs, by run.
-    """
+    """Make the table of an experiment from its runs and, by the names of runs, the rows of those that are finished."""
     paper = check_table(experiment)
     by_dataset: dict[str, list[PlannedRun]] = defaultdict(list)
     by_scene: dict[tuple[str, str], list[PlannedRun]] = defaultdict(list)
     for run in planned:
         by_dataset[run.spec.dataset].append(run)
         by_scene[run.spec.dataset, run.spec.scene].append(run)
-    groups = [_GroupBuilder(experiment, paper, dataset, runs, records).group() for dataset, runs in by_dataset.items()]
-    single = [
-        _GroupBuilder(experiment, paper, dataset, runs, records).group(scene)
-        for (dataset, scene), runs in by_scene.items()
-    ]
-    return ResultTable(
-        title=experiment.title,
-        label=experiment.name,
-        measured=_measured(planned, records),
-        columns=tuple(experiment.table.columns),
-        transposed=experiment.table.transposed,
-        groups=tuple(groups),
-        scenes=tuple(single) if experiment.table.by_scene and len(single) > len(groups) else (),
-    )
+    groups = tuple(_GroupBuilder(experiment, paper, runs, records).group() for runs in by_dataset.values())
+    scenes: tuple[Group, ...] = ()
+    if experiment.table.by_scene and len(by_scene) > len(groups):
+        scenes = tuple(
+            _GroupBuilder(experiment, paper, runs, records).group(scene) for (_, scene), runs in by_scene.items()
+        )
+    return ResultTable(experiment, _measured(planned, records), groups, scenes)
 
 
 def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
@@ -253,25 +232,12 @@ def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
 
 
 class _GroupBuilder:
-    """Builds one group of a table.
-
-    Args:
-        experiment: the experiment.
-        paper: the paper's table, or None.
-        dataset: data set of the runs, "" for other scenes.
-        runs: runs of the group.
-        records: rows of all finished runs.
-    """
+    """Builds one group of a table, of runs that share their data set, from the rows of all finished runs."""
 
     def __init__(
-        self,
-        experiment: Experiment,
-        paper: PaperTable | None,
-        dataset: str,
-        runs: Sequence[PlannedRun],
-        records: Mapping[str, Row],
+        self, experiment: Experiment, paper: PaperTable | None, runs: Sequence[PlannedRun], records: Mapping[str, Row]
     ) -> None:
-        self._experiment, self._paper, self._dataset = experiment, paper, dataset
+        self._experiment, self._paper, self._dataset = experiment, paper, runs[0].spec.dataset
         self._variants = {variant.name: variant for variant in experiment.variants}
         asked = {(run.spec.backbone, run.variant) for run in runs}
         self._keys: list[RowKey] = [
@@ -323,23 +289,17 @@ class _GroupBuilder:
 
     def _row(self, key: RowKey, cells: Mapping[RowKey, Mapping[str, Cell]]) -> TableRow:
         backbone, variant = key
-        base = self._baseline(backbone)
+        base = backbone, baseline_of(self._experiment, [name for own, name in self._keys if own == backbone])
         time = next((name for name in TIMES if name in cells[key]), None)
+        title = self._experiment.backbones[backbone].title or backbone
         return TableRow(
-            label=variant if len({b for b, _ in self._keys}) == 1 else f"{variant} ({self._backbone_title(backbone)})",
+            label=variant if len({b for b, _ in self._keys}) == 1 else f"{variant} ({title})",
             section=self._variants[variant].section,
             cells=cells[key],
             speedup=_compare(cells[base].get(time or ""), cells[key].get(time or ""), lambda base, own: base / own),
             psnr_gain=_compare(cells[base].get("psnr"), cells[key].get("psnr"), lambda base, own: own - base),
             is_baseline=key == base,
         )
-
-    def _backbone_title(self, backbone: str) -> str:
-        return self._experiment.backbones[backbone].title or backbone
-
-    def _baseline(self, backbone: str) -> RowKey:
-        """Return the key of a backbone's baseline."""
-        return backbone, baseline_of(self._experiment, [name for own, name in self._keys if own == backbone])
 
     def _notes(self, cells: Mapping[RowKey, Mapping[str, Cell]]) -> list[str]:
         notes = []

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.scenes.resolution import BACKBONE_DIVISORS, parse_resolution
@@ -25,12 +26,8 @@ SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
-NEGATIONS = {
-    "dry-run": ["--no-dry-run"],
-    "fused-adam": ["--no-fused-adam"],
-    "prune-by-size": ["--no-prune-by-size"],
-}
-"""Words that switch off options which are on by default."""
+ON_BY_DEFAULT = ("dry-run", "fused-adam", "prune-by-size")
+"""Options that --no-NAME switches off."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""
 
@@ -75,7 +72,7 @@ class Locations:
         names = [scene.name, *([scene.dataset] if scene.dataset else [])]
         folder = self._require_folder(f"scene {scene.name}", folder, names)
         transforms = any(folder.glob("transforms*.json"))
-        if not transforms and not _is_folder(folder / scene.images):
+        if not transforms and not is_folder(folder / scene.images):
             raise UserInputError(
                 f"scene {scene.name}: {folder} has no image folder {scene.images}; expected a COLMAP or Blender-style "
                 f'scene; give another folder with --path {scene.name}=FOLDER or set images = "..." in the experiment'
@@ -104,13 +101,9 @@ class Locations:
         ways = " or ".join(f"--path {name}=FOLDER ({_environment_variable(name)})" for name in names)
         if folder is None:
             raise UserInputError(f"{what}: its folder is not given; give {ways}")
-        if not _is_folder(folder):
+        if not is_folder(folder):
             raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
         return folder.absolute()
-
-
-def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises when a name is too long for the file system
 
 
 def _environment_variable(name: str) -> str:
@@ -137,7 +130,9 @@ def run_steps(
         steps = [Step(_train(spec, scene, folder), str(folder.parent))]
     else:
         bare = spec.method == "bare"
-        steps = [Step((*_lapgs_run(spec, bare), *_script(spec, scene, checkout, folder)), str(checkout))]
+        how = ("--off", "--record") if bare else ("--overwrite", "--seed", str(spec.seed))
+        command = *LAPGS, "run", *how, *_as_options(spec.options), *_script(spec, scene, checkout, folder)
+        steps = [Step(command, str(checkout))]
         if bare and evaluate is not None:
             steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))
     if evaluate is not None:
@@ -178,12 +173,6 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         # Backbones compensate no exposure, and tables compare views as they are.
         *_as_options({"exposure": "off", **spec.options, **levels}),
     )
-
-
-def _lapgs_run(spec: RunSpec, bare: bool) -> tuple[str, ...]:
-    if bare:
-        return (*LAPGS, "run", "--off", "--record", *_as_options(spec.options))
-    return (*LAPGS, "run", "--overwrite", "--seed", str(spec.seed), *_as_options(spec.options))
 
 
 def _script(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:
@@ -230,10 +219,10 @@ def _as_options(options: Mapping[str, Any]) -> list[str]:
     words = []
     for name, value in options.items():
         option = name.replace("_", "-")
-        if isinstance(value, bool):
-            words += [f"--{option}"] if value else NEGATIONS.get(option, [])
-        else:
+        if not isinstance(value, bool):
             words += [f"--{option}", str(value)]
+        elif value or option in ON_BY_DEFAULT:
+            words.append(f"--{option}" if value else f"--no-{option}")
     return words
 
 

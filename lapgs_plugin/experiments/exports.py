@@ -17,6 +17,7 @@ NAMES = ("variant", "baseline", "run", "scene", "backbone")
 """Columns of names, which every row has; one such as 0.50 is no number."""
 
 Row = Mapping[str, Any]
+"""Row of results, see `rows`."""
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -64,23 +64,18 @@ class Launcher(ABC):
     def stop(self) -> None:
         """End all workers and wait for them; their runs are returned, or count as abandoned later."""
 
+    @abstractmethod
     def failures(self) -> list[str]:
         """Return failures of the workers themselves, one line each."""
-        return []
 
 
 def launch(order: WorkOrder) -> Launcher:
-    """Start workers.
-
-    Raises:
-        UserInputError, MissingExtraError: see `check_launcher`.
-    """
-    check_launcher(order.settings)
+    """Start workers, with settings that `check_launcher` accepts."""
     return _KINDS[order.settings.launcher](order)
 
 
 def check_launcher(settings: WorkerSettings) -> None:
-    """Refuse settings that `launch` would refuse, before anything is written.
+    """Refuse settings that `launch` cannot use, before anything is written.
 
     Raises:
         UserInputError: the launcher or an option of it is not known.

@@ -19,10 +19,12 @@ class Mistakes:
 
     Args:
         file: the experiment file.
+        experiment: its content.
+        selection: the part of it to run.
     """
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    def __init__(self, file: Path, experiment: Experiment, selection: Selection) -> None:
+        self._file, self._experiment, self._selection = file, experiment, selection
         self._lines: dict[str, None] = {}
 
     def add(self, key: str, message: str) -> None:
@@ -46,43 +48,40 @@ class Mistakes:
         if self._lines:
             raise ExperimentError(self._lines)
 
+    def scene_key(self, name: str) -> str:
+        """Return the key of a scene in the file."""
+        return f"{self._scene(name)} ({name})"
 
-def scene_key(experiment: Experiment, name: str) -> str:
-    """Return the key of a scene in the file."""
-    number = next(i for i, entry in enumerate(experiment.scenes) if name in entry.names)
-    return f"scenes.{number} ({name})"
+    def keys_of(self, run: PlannedRun) -> dict[str, str]:
+        """Return the keys in the file, or on the command line, that define a run: by option, the key and its value.
 
+        "run" is the key of the whole run, "scene" that of its scene.
+        """
+        experiment, selection, spec, scene = self._experiment, self._selection, run.spec, self._scene(run.spec.scene)
+        number = next(i for i, variant in enumerate(experiment.variants) if variant.name == run.variant)
+        variant, backbone = experiment.variants[number], experiment.backbones[spec.backbone]
+        own, its = f"variants.{number}", f"backbones.{spec.backbone}"
+        keys: dict[str, tuple[str, Any]] = {
+            "seed": ("--seeds" if selection.seeds else f"seeds.{experiment.seeds.index(spec.seed)}", spec.seed),
+            "iterations": (
+                "--iterations" if selection.iterations else f"{own}.iterations" if variant.iterations else "iterations",
+                spec.iterations,
+            ),
+            "resolution": (f"{own if variant.resolution else scene}.resolution", spec.resolution),
+            "images": (f"{scene}.images", spec.images),
+        }
+        if spec.rasterizer is not None:
+            keys["rasterizer"] = (f"{its}.rasterizer", spec.rasterizer)
+        for name, value in spec.options.items():
+            if name in variant.options or name in backbone.options:
+                keys[name] = (f"{own if name in variant.options else its}.options.{name}", value)
+        whole = f"{own} ({json.dumps(variant.name, ensure_ascii=False)} on {spec.backbone})"
+        return {
+            "run": whole,
+            "scene": self.scene_key(spec.scene),
+            **{name: f"{key} = {json.dumps(value):.80}" for name, (key, value) in keys.items()},
+        }
 
-def keys_of(experiment: Experiment, selection: Selection, run: PlannedRun) -> dict[str, str]:
-    """Return the keys in the file, or on the command line, that define a run: by option, the key and its value.
-
-    "run" is the key of the whole run, "scene" that of its scene.
-    """
-    spec = run.spec
-    scene = next(i for i, entry in enumerate(experiment.scenes) if spec.scene in entry.names)
-    number = next(i for i, variant in enumerate(experiment.variants) if variant.name == run.variant)
-    variant, backbone = experiment.variants[number], experiment.backbones[spec.backbone]
-    own, its = f"variants.{number}", f"backbones.{spec.backbone}"
-    keys: dict[str, tuple[str, Any]] = {
-        "seed": (
-            "--seeds" if selection.seeds else f"seeds.{experiment.seeds.index(spec.seed)}",
-            spec.seed,
-        ),
-        "iterations": (
-            "--iterations" if selection.iterations else f"{own}.iterations" if variant.iterations else "iterations",
-            spec.iterations,
-        ),
-        "resolution": (f"{own if variant.resolution else f'scenes.{scene}'}.resolution", spec.resolution),
-        "images": (f"scenes.{scene}.images", spec.images),
-    }
-    if spec.rasterizer is not None:
-        keys["rasterizer"] = (f"{its}.rasterizer", spec.rasterizer)
-    for name, value in spec.options.items():
-        if name in variant.options or name in backbone.options:
-            keys[name] = (f"{own if name in variant.options else its}.options.{name}", value)
-    whole = f"{own} ({json.dumps(variant.name, ensure_ascii=False)} on {spec.backbone})"
-    return {
-        "run": whole,
-        "scene": scene_key(experiment, spec.scene),
-        **{name: f"{key} = {json.dumps(value):.80}" for name, (key, value) in keys.items()},
-    }
+    def _scene(self, name: str) -> str:
+        number = next(i for i, entry in enumerate(self._experiment.scenes) if name in entry.names)
+        return f"scenes.{number}"

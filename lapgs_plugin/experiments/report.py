@@ -15,23 +15,14 @@ from markdown_it import MarkdownIt
 
 from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, read_csv
+from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars
+from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
 from lapgs_plugin.reports.pictures import Strip
-from lapgs_plugin.reports.report import (
-    MeasuredRun,
-    ViewRow,
-    count_text,
-    number_text,
-    render_page,
-    seconds_text,
-    training_charts,
-    view_strips,
-    view_table,
-)
+from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
@@ -50,41 +41,10 @@ COUNTS = {
 FIGURES = ("train_seconds", "gaussians")
 """Columns with numbers that every row has."""
 
-Row = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One scene on one backbone.
-
-    Attributes:
-        title: names of both.
-        charts: charts of training, see `report.training_charts`.
-        names: variants by the style of their lines.
-        strips: views of a variant beside the baseline.
-        view_columns, view_rows: see `report.view_table`.
-        compared: the variants that the views compare, in words.
-        notes: parts that could not be shown, with the reason.
-    """
-
-    title: str
-    charts: dict[str, list[Chart]]
-    names: dict[str, str]
-    strips: list[Strip]
-    view_columns: list[str]
-    view_rows: list[ViewRow]
-    compared: str
-    notes: list[str]
-
 
 @dataclass(frozen=True)
 class Results:
-    """The results of an experiment.
-
-    Attributes:
-        folder: the experiment's folder.
-        rows: rows of results.csv, in order.
-    """
+    """The results in an experiment's folder: the rows of its results.csv, in order."""
 
     folder: Path
     rows: Sequence[Row]
@@ -142,15 +102,8 @@ class Results:
         return f"{scene}, {backbone}" if several else scene
 
 
-def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: str = "auto") -> Path:
-    """Write FOLDER/report.html.
-
-    Args:
-        folder: folder of `lapgs bench`.
-        device, rasterizer: see `rendering.run.run_renderer`.
-
-    Returns:
-        The path of the page.
+def write_experiment_report(folder: Path, options: RenderOptions) -> Path:
+    """Write report.html into a folder of `lapgs bench`, and return its path.
 
     Raises:
         RunFolderError: there are no results, or the file cannot be written.
@@ -166,7 +119,7 @@ def write_experiment_report(folder: Path, *, device: str = "auto", rasterizer: s
         arrows=_time_arrows(results),
         breakdown=_breakdown(results),
         overhead=_overhead(results),
-        parts=[_part(results, scene, backbone, device, rasterizer) for scene, backbone in results.pairs],
+        parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
         machines=_machines(results),
     )
     write_text(folder / REPORT, page)
@@ -212,9 +165,7 @@ def _time_arrows(results: Results) -> Chart | None:
                 arrows.append(Arrow(results.style(variant), label, start, end))
     if not arrows:
         return None
-    return draw_arrows(
-        "Optimization (s) against Gaussians", COUNTS[column], arrows, format_x=count_text, format_y=count_text
-    )
+    return draw_arrows("Optimization (s) against Gaussians", COUNTS[column], arrows)
 
 
 def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
@@ -231,10 +182,9 @@ def _breakdown(results: Results) -> BarChart | None:
 
 def _overhead(results: Results) -> BarChart | None:
     """Draw seconds of overhead, means over scenes and seeds."""
-    columns = dict.fromkeys(name for row in results.rows for name in row)
     names = {
         column: column.removeprefix("overhead_").removesuffix("_seconds")
-        for column in columns
+        for column in columns_of(results.rows)
         if column.startswith("overhead_") and column != "overhead_seconds"
     }
     return _bars(results, "Overhead", names, seconds_text)
@@ -253,14 +203,18 @@ def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable
             ]
             if parts:
                 bars.append(Bar(results.title(variant, backbone), parts))
-    return draw_bars(title, bars, format_value=text) if bars else None
+    return draw_bars(title, bars, text) if bars else None
 
 
 # One scene on one backbone.
 
 
-def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: str) -> Part:
-    """Show the first seed of every variant."""
+def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -> dict[str, Any]:
+    """Return what the page shows of a scene on a backbone, with the first seed of every variant.
+
+    Keys: title; charts of training, and variants by the style of their lines; views of a variant beside the baseline
+    as pictures and as a table, and the variants that these compare, in words; notes on what could not be shown.
+    """
     runs: dict[str, MeasuredRun] = {}
     notes = []
     for variant in results.variants:
@@ -270,27 +224,25 @@ def _part(results: Results, scene: str, backbone: str, device: str, rasterizer: 
             except LapgsError as error:
                 notes.append(f"{variant} is not shown: {error}")
     base = results.baseline(backbone)
-    charts = {}
-    if runs:
-        kinds = [results.style(variant) for variant in runs]
-        charts = training_charts(list(runs.values()), kinds)
-    names = {results.style(variant): variant for variant in runs}
     measured = [name for name in runs if runs[name].metrics.get("views")]
     shown = next((name for name in measured if name != base), base)
+    pair = [runs[name] for name in dict.fromkeys((shown, base)) if name in measured]
     strips: list[Strip] = []
-    columns: list[str] = []
-    rows: list[ViewRow] = []
-    compared = ""
-    if shown in measured:
-        pair = [runs[name] for name in dict.fromkeys((shown, base)) if name in measured]
-        columns, rows = view_table(pair)
-        compared = shown if len(pair) == 1 else f"{shown}, beside {base}"
+    if pair:
         try:
-            renderers = [run_renderer(run.archive, device, rasterizer) for run in pair]
+            renderers = [run_renderer(run.archive, options.device, options.rasterizer) for run in pair]
             strips = view_strips(pair[0], renderers, None, most=1)
         except LapgsError as error:
             notes.append(f"no pictures: {error}")
-    return Part(results.title(scene, backbone), charts, names, strips, columns, rows, compared, notes)
+    return {
+        "title": results.title(scene, backbone),
+        "charts": training_charts(list(runs.values()), [results.style(name) for name in runs]) if runs else {},
+        "styles": {results.style(name): name for name in runs},
+        "strips": strips,
+        "views": view_table(pair) if pair else None,
+        "compared": shown if len(pair) == 1 else f"{shown}, beside {base}",
+        "notes": notes,
+    }
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:

@@ -5,50 +5,32 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
-from lapgs_plugin.experiments.mistakes import Mistakes, keys_of, scene_key
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.settings import Selection
+from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 
 logger = logging.getLogger(__name__)
 
 RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
+"""What an experiment's folder holds."""
 MISSING = Path("SCENE")
 """Placeholder for a missing scene in commands that are only checked."""
 POLL_SECONDS = 0.5
 """Seconds between two checks of the store."""
 
 
-@dataclass(frozen=True)
-class Folder:
-    """The folder of an experiment."""
-
-    path: Path
-
-    @property
-    def store(self) -> Path:
-        return self.path / STORE
-
-    def logs(self, name: str) -> Path:
-        return self.path / LOGS / name
-
-
 def prepare(
     planned: Sequence[PlannedRun],
     scenes: Sequence[SceneSpec],
     places: Locations,
-    folder: Folder,
+    folder: Path,
     evaluate: Sequence[str] | None,
-    experiment: Experiment,
-    selection: Selection,
     mistakes: Mistakes,
 ) -> tuple[list[Job], dict[str, tuple[SceneSpec, Path]]]:
     """Make the jobs of all distinct runs, in order.
@@ -59,7 +41,6 @@ def prepare(
         places: folders of scenes and checkouts.
         folder: the experiment's folder.
         evaluate: options of `lapgs eval`; None leaves it out.
-        experiment, selection: the source of the runs.
         mistakes: receives missing scenes and checkouts, and resolutions that a checkout's script cannot read.
 
     Returns:
@@ -68,7 +49,7 @@ def prepare(
     """
     where: dict[str, tuple[SceneSpec, Path]] = {}
     for scene in scenes:
-        with mistakes.at(scene_key(experiment, scene.name)):
+        with mistakes.at(mistakes.scene_key(scene.name)):
             _check_sample(scene)
             where[scene.name] = (scene, _sample_folder(scene, folder) if scene.sample else places.scene(scene))
     checkouts: dict[str, Path] = {}
@@ -80,12 +61,12 @@ def prepare(
         spec = each.spec
         if spec.checkout is not None and (spec.scene not in where or spec.checkout not in checkouts):
             continue
-        with mistakes.at(keys_of(experiment, selection, each)["resolution"]):
-            own = folder.path.absolute() / RUNS / spec.run_id
+        with mistakes.at(mistakes.keys_of(each)["resolution"]):
+            own = folder.absolute() / RUNS / spec.run_id
             checkout = checkouts[spec.checkout] if spec.checkout else None
             scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
             steps = run_steps(spec, scene_folder, checkout, own, evaluate)
-            log = str(folder.logs(f"{spec.run_id}.log").absolute())
+            log = str(folder.absolute() / LOGS / f"{spec.run_id}.log")
             jobs.setdefault(
                 spec.run_id,
                 Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None, defaults_of(spec)),
@@ -107,7 +88,7 @@ def _check_sample(scene: SceneSpec) -> None:
     check_sample_scene(width, height, scene.sample.views, scene.sample.points)
 
 
-def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
+def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
     """Make the sample scenes that do not exist yet, in one process at a time.
 
     Raises:
@@ -118,7 +99,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Folder) -> None:
         return
     from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs packages that read scenes
 
-    place = folder.path.absolute() / SCENES
+    place = folder.absolute() / SCENES
     with one_line_errors(place):
         place.mkdir(parents=True, exist_ok=True)
     lock = _wait_for_lock(place)
@@ -151,8 +132,8 @@ def _wait_for_lock(place: Path) -> FolderLock:
         time.sleep(POLL_SECONDS)
 
 
-def _sample_folder(scene: SceneSpec, folder: Folder) -> Path:
-    return folder.path.absolute() / SCENES / scene.name
+def _sample_folder(scene: SceneSpec, folder: Path) -> Path:
+    return folder.absolute() / SCENES / scene.name
 
 
 def execute(

@@ -6,9 +6,9 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lapgs_plugin.errors import UserInputError, one_line
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
@@ -30,6 +30,15 @@ class ExperimentError(UserInputError):
 
     def __init__(self, lines: Iterable[str]) -> None:
         Exception.__init__(self, "\n".join(map(one_line, lines)))
+
+
+def _known_preset(name: str) -> str:
+    if name not in PRESETS:
+        raise ValueError(f"expected {', '.join(PRESETS)}")
+    return name
+
+
+PresetName = Annotated[str, AfterValidator(_known_preset)]
 
 
 class _StrictModel(BaseModel):
@@ -104,7 +113,7 @@ class Backbone(_StrictModel):
     title: str = Field("", pattern=LINE)
     rasterizer: str | None = None
     checkout: str | None = Field(None, pattern=NAME)
-    preset: str | None = None
+    preset: PresetName | None = None
     arguments: list[str] = []
     options: Options = {}
 
@@ -114,8 +123,6 @@ class Backbone(_StrictModel):
             raise ValueError("give either rasterizer (the built-in trainer) or checkout (a script of its own)")
         if self.rasterizer is not None and (self.preset is not None or self.arguments):
             raise ValueError("preset and arguments are for the script of a checkout")
-        if self.preset is not None:
-            _require_preset(self.preset)
         return self
 
     @property
@@ -143,7 +150,7 @@ class Variant(_StrictModel):
     name: str = Field(pattern=LINE, min_length=1)
     method: Literal["hierarchy", "bare"] = "hierarchy"
     backbones: list[str] = []
-    preset: dict[str, str] = {}
+    preset: dict[str, PresetName] = {}
     iterations: int | None = Field(None, ge=1)
     resolution: str | None = None
     options: Options = {}
@@ -151,13 +158,6 @@ class Variant(_StrictModel):
     section: str = Field("", pattern=LINE)
     paper: str | dict[str, str] = ""
     baseline: bool = False
-
-    @field_validator("preset")
-    @classmethod
-    def _known_presets(cls, presets: dict[str, str]) -> dict[str, str]:
-        for name in presets.values():
-            _require_preset(name)
-        return presets
 
     def paper_row(self, backbone: str) -> str:
         """Return the name of its row in the paper's table, "" without one."""
@@ -266,11 +266,6 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     if problems:
         raise ExperimentError(f"{path}: {problem}" for problem in problems)
     return experiment
-
-
-def _require_preset(name: str) -> None:
-    if name not in PRESETS:
-        raise ValueError(f"preset {name!r} is not known, expected {', '.join(PRESETS)}")
 
 
 def _first_duplicate(names: Sequence[T]) -> T | None:

@@ -42,9 +42,9 @@ LOCK_TIMEOUT = 60.0
 
 PENDING, RUNNING, DONE, FAILED = "pending", "running", "done", "failed"
 
-_TABLES = """
-CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE runs (
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS about (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
+    """CREATE TABLE IF NOT EXISTS runs (
     run_id TEXT PRIMARY KEY,
     position INTEGER NOT NULL,
     spec TEXT NOT NULL,
@@ -55,8 +55,8 @@ CREATE TABLE runs (
     claims INTEGER NOT NULL DEFAULT 0,
     record TEXT,
     error TEXT
-);
-"""
+)""",
+)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class ResultStore:
         self._path = path
         if not path.is_file():
             raise RunFolderError(f"{path} does not exist; `lapgs bench EXPERIMENT.toml` makes it")
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             about = dict(connection.execute("SELECT key, value FROM about").fetchall())
         if about.get("format") != str(FORMAT_VERSION):
             raise RunFolderError(
@@ -162,24 +162,15 @@ class ResultStore:
     @classmethod
     def create(cls, path: Path) -> ResultStore:
         """Open the store at `path`; make it if it does not exist."""
-        if not path.is_file():
-            with one_line_errors(path):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                # Two processes may do this at once: each makes a whole file, and the second keeps the first's.
-                fresh = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-                connection = sqlite3.connect(fresh)
-                try:
-                    connection.executescript(_TABLES)
-                    values = [("format", str(FORMAT_VERSION)), ("created_by", f"lapgs_plugin {__version__}")]
-                    connection.executemany("INSERT INTO about VALUES (?, ?)", values)
-                    connection.commit()
-                finally:
-                    connection.close()
-                try:
-                    if not path.exists():
-                        _put_if_absent(fresh, path)
-                finally:
-                    fresh.unlink(missing_ok=True)
+        with one_line_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            missing = not path.exists() or path.stat().st_size == 0
+        if missing:
+            with _transaction(path) as connection:  # several processes may come here at once
+                for table in _TABLES:
+                    connection.execute(table)
+                values = [("format", str(FORMAT_VERSION)), ("created_by", f"lapgs_plugin {__version__}")]
+                connection.executemany("INSERT OR IGNORE INTO about VALUES (?, ?)", values)
         return cls(path)
 
     def plan(self, jobs: Sequence[Job]) -> None:
@@ -188,7 +179,7 @@ class ResultStore:
         Raises:
             RunFolderError: the other runs would have other defaults than those that are finished or running.
         """
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             self._require_same_defaults(connection, jobs)
             for position, job in enumerate(jobs):
                 values = (job.run_id, position, json.dumps(asdict(job.spec)), job.to_json(), PENDING)
@@ -216,7 +207,7 @@ class ResultStore:
 
     def claim(self, run_ids: Collection[str]) -> Claim | None:
         """Claim the first free run of these; None when none is free."""
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             for run_id, job, claims in _free(connection, run_ids):
                 if claims >= MAX_CLAIMS:
                     connection.execute(
@@ -234,7 +225,7 @@ class ResultStore:
 
     def has_free(self, run_ids: Collection[str]) -> bool:
         """Tell whether `claim` would find one of these runs."""
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             return any(True for _ in _free(connection, run_ids))
 
     def renew(self, claim: Claim) -> bool:
@@ -256,7 +247,7 @@ class ResultStore:
     def outcomes(self, run_ids: Collection[str] | None = None) -> list[Outcome]:
         """Return all runs, or these, in order."""
         wanted = None if run_ids is None else set(run_ids)
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             found = connection.execute("SELECT run_id, state, record, error FROM runs ORDER BY position").fetchall()
         return [
             Outcome(run_id, state, None if record is None else self._row(run_id, record), error or "")
@@ -271,30 +262,31 @@ class ResultStore:
         return row
 
     def _update(self, claim: Claim, changes: str, values: tuple[Any, ...]) -> bool:
-        with self._transaction() as connection:
+        with _transaction(self._path) as connection:
             cursor = connection.execute(
                 f"UPDATE runs SET {changes} WHERE run_id = ? AND owner = ? AND state = ?",
                 (*values, claim.job.run_id, claim.owner, RUNNING),
             )
             return cursor.rowcount == 1
 
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        """Open a transaction that locks out other processes."""
-        connection = sqlite3.connect(self._path, timeout=LOCK_TIMEOUT, isolation_level=None)
-        try:
-            connection.execute("BEGIN IMMEDIATE")
-            yield connection
-            connection.execute("COMMIT")
-        except sqlite3.OperationalError as error:
-            raise RunFolderError(
-                f"{self._path} cannot be read or written ({error}); expected a store of results on a disk with room "
-                "and file locks"
-            ) from error
-        except sqlite3.DatabaseError as error:
-            raise RunFolderError(f"{self._path} is no store of results ({error}); choose another folder") from error
-        finally:
-            connection.close()  # rolls back what was not committed
+
+@contextmanager
+def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a transaction that locks out other processes."""
+    connection = sqlite3.connect(path, timeout=LOCK_TIMEOUT, isolation_level=None)
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        yield connection
+        connection.execute("COMMIT")
+    except sqlite3.OperationalError as error:
+        raise RunFolderError(
+            f"{path} cannot be read or written ({error}); expected a store of results on a disk with room and file "
+            "locks"
+        ) from error
+    except sqlite3.DatabaseError as error:
+        raise RunFolderError(f"{path} is no store of results ({error}); choose another folder") from error
+    finally:
+        connection.close()  # rolls back what was not committed
 
 
 def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[tuple[str, str, int]]:
@@ -321,16 +313,6 @@ def _differences(one: str, other: str) -> str:
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     words = [f"{name} was {shortened(before.get(name))}, is {shortened(now.get(name))}" for name in names]
     return "; ".join(words[:SHOWN])
-
-
-def _put_if_absent(source: Path, target: Path) -> None:
-    """Rename a file, unless the target exists."""
-    try:
-        os.link(source, target)
-    except FileExistsError:
-        pass
-    except OSError:  # no hard links on this file system
-        source.replace(target)
 
 
 def _new_owner() -> str:

@@ -10,9 +10,8 @@ from lapgs_plugin.experiments.aggregate import COLUMNS, Cell, Column, Group, Rat
 GROUPS_BESIDE = 3
 """Data sets or scenes side by side in a LaTeX table, as in the paper."""
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
-TEX_ARROWS = {"lower": r"$\downarrow$", "higher": r"$\uparrow$", "": ""}
 TEX = {
-    **{"N_GS": r"$N_{\mathrm{GS}}$", "rho": r"$\rho$"},
+    **{"N_GS": r"$N_{\mathrm{GS}}$", "rho": r"$\rho$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "±": r"$\pm$"},
     **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"},
 }
 """Words and characters in LaTeX, besides the characters that a backslash escapes."""
@@ -23,13 +22,12 @@ PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 
 
 def markdown(table: ResultTable) -> str:
     """Write the table as Markdown."""
-    lines = [f"# {table.title}", "", _legend(table), ""]
+    lines = [f"# {table.experiment.title}", "", _legend(table), ""]
+    shape = table.experiment.table
+    write = _markdown_transposed if shape.transposed else _markdown_rows
     for group in (*table.groups, *table.scenes):
-        lines += [f"## {group.title}", ""]
-        lines += (
-            _markdown_transposed(group, table.columns) if table.transposed else _markdown_rows(group, table.columns)
-        )
-        lines += ["", *group.notes, *([""] if group.notes else [])]
+        lines += [f"## {group.title}", "", *write(group, shape.columns), ""]
+        lines += [*group.notes, ""] if group.notes else []
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -39,9 +37,10 @@ def latex(table: ResultTable) -> str:
         "% Needs \\usepackage{booktabs,multirow}. Measured figures; the paper's in small print.",
         r"\providecommand{\paper}[1]{{\scriptsize\,[#1]}}",
     ]
-    parts += _latex_table(table, table.groups, table.title, table.label)
+    title, label = table.experiment.title, table.experiment.name
+    parts += _latex_table(table, table.groups, title, label)
     if table.scenes:
-        parts += ["", *_latex_table(table, table.scenes, f"{table.title}, scene by scene", f"{table.label}-scenes")]
+        parts += ["", *_latex_table(table, table.scenes, f"{title}, scene by scene", f"{label}-scenes")]
     return "\n".join(parts) + "\n"
 
 
@@ -56,8 +55,7 @@ def _legend(table: ResultTable) -> str:
 
 
 def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
-    headings = [COLUMNS[name].heading + ARROWS[COLUMNS[name].better] for name in columns]
-    yield _markdown_line(["", *headings, SPEEDUP, GAIN])
+    yield _markdown_line(["", *map(_heading, columns), SPEEDUP, GAIN])
     yield _markdown_line(["---"] * (len(columns) + 3))
     section = ""
     for row in group.rows:
@@ -65,6 +63,10 @@ def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
             section = row.section
             yield _markdown_line([f"**{section}**", *[""] * (len(columns) + 2)])
         yield _markdown_line([row.label, *(_text(row.cells[name], COLUMNS[name]) for name in columns), *_ratios(row)])
+
+
+def _heading(column: str) -> str:
+    return COLUMNS[column].heading + ARROWS[COLUMNS[column].better]
 
 
 def _markdown_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
@@ -109,11 +111,12 @@ def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label:
         rf"\label{{tab:{label}}}",
         r"\small",
     ]
-    if table.transposed:
+    shape = table.experiment.table
+    if shape.transposed:
         for group in groups:
-            lines += _latex_transposed(group, table.columns)
+            lines += _latex_transposed(group, shape.columns)
     else:
-        lines += _latex_blocks(groups, table.columns)
+        lines += _latex_blocks(groups, shape.columns)
     notes = dict.fromkeys([_legend(table), *(note for group in groups for note in group.notes)])
     return [*lines, *(rf"\par\footnotesize {_escaped(note)}" for note in notes), r"\end{table*}"]
 
@@ -131,7 +134,7 @@ def _latex_blocks(groups: Sequence[Group], columns: Sequence[str]) -> Iterator[s
         titles = [rf"\multicolumn{{{width}}}{{c}}{{\textbf{{{_escaped(group.title)}}}}}" for group in block]
         yield " & ".join(["", *titles]) + r" \\"
         yield "".join(rf"\cmidrule(lr){{{2 + i * width}-{1 + (i + 1) * width}}}" for i in range(len(block)))
-        headings = [_escaped(COLUMNS[name].heading) + TEX_ARROWS[COLUMNS[name].better] for name in columns]
+        headings = [_escaped(_heading(name)) for name in columns]
         yield " & ".join(["", *[*headings, SPEEDUP, r"$\Delta$PSNR"] * len(block)]) + r" \\"
         yield r"\midrule"
         yield from _latex_rows(block, columns, 1 + width * beside)
@@ -153,8 +156,8 @@ def _latex_rows(block: Sequence[Group], columns: Sequence[str], width: int) -> I
             if own is None:
                 cells += [""] * (len(columns) + 2)
                 continue
-            cells += [_latex_text(own.cells[name], COLUMNS[name]) for name in columns]
-            cells += [_latex_marked(text) for text in _ratios(own)]
+            texts = [*(_text(own.cells[name], COLUMNS[name]) for name in columns), *_ratios(own)]
+            cells += map(_latex_marked, texts)
         yield " & ".join([_escaped(label), *cells]) + r" \\"
 
 
@@ -164,22 +167,17 @@ def _latex_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
     yield " & ".join([_escaped(group.title), *(_escaped(row.label) for row in group.rows)]) + r" \\"
     yield r"\midrule"
     for name in columns:
-        cells = [_latex_text(row.cells[name], COLUMNS[name]) for row in group.rows]
+        cells = [_latex_marked(_text(row.cells[name], COLUMNS[name])) for row in group.rows]
         yield " & ".join([_escaped(COLUMNS[name].heading), *cells]) + r" \\"
     yield r"\bottomrule"
     yield r"\end{tabular}"
 
 
-def _latex_text(cell: Cell, column: Column) -> str:
-    return _latex_marked(_text(cell, column))
-
-
 def _latex_marked(text: str) -> str:
     r"""Convert 1.0 ±0.1 [2.0] to 1.0 $\pm$0.1\paper{2.0}."""
     measured, bracket, paper = text.partition(" [")
-    tex = _escaped(measured).replace("±", r"$\pm$")
-    return tex + (rf"\paper{{{_escaped(paper.removesuffix(']'))}}}" if bracket else "")
+    return _escaped(measured) + (rf"\paper{{{_escaped(paper.removesuffix(']'))}}}" if bracket else "")
 
 
 def _escaped(text: str) -> str:
-    return re.sub(r"N_GS|\brho\b|[&%#_${}~^\\]", lambda found: TEX.get(found[0], f"\\{found[0]}"), text)
+    return re.sub(r"N_GS|\brho\b|[&%#_${}~^\\↓↑±]", lambda found: TEX.get(found[0], f"\\{found[0]}"), text)

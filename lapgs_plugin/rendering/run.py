@@ -9,6 +9,7 @@ from pathlib import Path
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.pose import corrected
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rasterizers.choice import rasterizer_for
@@ -20,7 +21,6 @@ from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.masks import ALPHA, NONE
 from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene
-from lapgs_plugin.scenes.source import is_folder
 
 PATHS = ("orbit", "spline")
 

@@ -19,6 +19,24 @@ ARROW_HEAD = 4.0
 """Length of an arrow's head in chart units; the line ends so far before its point."""
 
 
+def count_text(value: float) -> str:
+    """Format a number for an axis: 1.5k, 20k, 1.2M."""
+    for size, suffix in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{number_text(value / size)}{suffix}"
+    return f"{value:g}"
+
+
+def number_text(value: float) -> str:
+    """Format a number with three digits, or with all that are before its point."""
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
+
+
+def seconds_text(value: float) -> str:
+    """Format seconds."""
+    return f"{number_text(value)} s"
+
+
 @dataclass(frozen=True)
 class Frame:
     """The size of a chart and the margins around its plot, in chart units."""
@@ -209,8 +227,7 @@ def draw_lines(
     *,
     marks: Sequence[Mark] = (),
     from_zero: bool = True,
-    format_x: Callable[[float], str] = "{:g}".format,
-    format_y: Callable[[float], str] = "{:g}".format,
+    text: Callable[[float], str] = count_text,
     inset_until: float | None = None,
     frame: Frame = WHOLE,
 ) -> Chart:
@@ -219,7 +236,7 @@ def draw_lines(
     Args:
         series: at least one; none is empty.
         from_zero: start the y axis at 0; otherwise just below the smallest value.
-        format_x, format_y: format a tick's value.
+        text: formats a tick's value.
         inset_until: also draw the part before this x as an inset, if it has enough points.
         frame: size of the chart.
     """
@@ -228,7 +245,7 @@ def draw_lines(
     count = TICKS if frame is WHOLE else INSET_TICKS
     right, highest = max(xs) or 1.0, max(ys)
     y_ticks = _ticks(0.0 if from_zero else min(ys), highest * HEADROOM if from_zero else highest, count)
-    inset = None if inset_until is None else _start(x_label, series, inset_until, format_x, format_y)
+    inset = None if inset_until is None else _start(x_label, series, inset_until, text)
     if inset is not None:
         y_ticks = _clear_inset(series, right, y_ticks)
     bottom, top = y_ticks[0], y_ticks[-1]
@@ -240,27 +257,21 @@ def draw_lines(
         title,
         x_label,
         frame,
-        x_ticks=_x_ticks(right, count, format_x, frame),
-        y_ticks=tuple(Tick(frame.y((y - bottom) / (top - bottom)), format_y(y)) for y in y_ticks),
+        x_ticks=_x_ticks(right, count, text, frame),
+        y_ticks=tuple(Tick(frame.y((y - bottom) / (top - bottom)), text(y)) for y in y_ticks),
         lines=tuple(lines),
         marks=_place_marks([(frame.x(mark.x / right), mark.label) for mark in marks], frame),
         inset=inset,
     )
 
 
-def _start(
-    x_label: str,
-    series: Sequence[Series],
-    until: float,
-    format_x: Callable[[float], str],
-    format_y: Callable[[float], str],
-) -> Chart | None:
+def _start(x_label: str, series: Sequence[Series], until: float, text: Callable[[float], str]) -> Chart | None:
     """Draw the part before `until` as an inset; None if it has too few points."""
     begins = [Series(line.kind, [point for point in line.points if point[0] <= until]) for line in series]
     begins = [line for line in begins if len(line.points) > 1]
     if not any(len(line.points) >= INSET_POINTS for line in begins):
         return None
-    return draw_lines("the start", x_label, begins, from_zero=False, format_x=format_x, format_y=format_y, frame=INSET)
+    return draw_lines("the start", x_label, begins, from_zero=False, text=text, frame=INSET)
 
 
 def _clear_inset(series: Sequence[Series], right: float, ticks: list[float]) -> list[float]:
@@ -281,19 +292,12 @@ def _clear_inset(series: Sequence[Series], right: float, ticks: list[float]) -> 
     return ticks
 
 
-def draw_arrows(
-    title: str,
-    x_label: str,
-    arrows: Sequence[Arrow],
-    *,
-    format_x: Callable[[float], str] = "{:g}".format,
-    format_y: Callable[[float], str] = "{:g}".format,
-) -> Chart:
+def draw_arrows(title: str, x_label: str, arrows: Sequence[Arrow], text: Callable[[float], str] = count_text) -> Chart:
     """Lay out a chart of arrows, with both axes from 0.
 
     Args:
         arrows: at least one.
-        format_x, format_y: format a tick's value.
+        text: formats a tick's value.
     """
     points = [point for arrow in arrows for point in (arrow.start, arrow.end)]
     right = max(x for x, _ in points) * HEADROOM or 1.0
@@ -314,18 +318,18 @@ def draw_arrows(
         title,
         x_label,
         WHOLE,
-        x_ticks=_x_ticks(right, TICKS, format_x, WHOLE),
-        y_ticks=tuple(Tick(WHOLE.y(y / top), format_y(y)) for y in y_ticks),
+        x_ticks=_x_ticks(right, TICKS, text, WHOLE),
+        y_ticks=tuple(Tick(WHOLE.y(y / top), text(y)) for y in y_ticks),
         arrows=tuple(placed),
     )
 
 
-def draw_bars(title: str, bars: Sequence[Bar], *, format_value: Callable[[float], str] = "{:g}".format) -> BarChart:
+def draw_bars(title: str, bars: Sequence[Bar], text: Callable[[float], str]) -> BarChart:
     """Lay out bars, each with its label above it and its total at its end.
 
     Args:
         bars: at least one.
-        format_value: format a part or a total.
+        text: formats a part or a total.
     """
     step = BAR_STEP + LINE_HEIGHT
     frame = Frame(WHOLE.width, step * len(bars), left=0, right=62, top=0, bottom=0)
@@ -335,12 +339,12 @@ def draw_bars(title: str, bars: Sequence[Bar], *, format_value: Callable[[float]
         segments, before = [], 0.0
         for name, value in bar.parts:
             width = frame.plot_width * value / longest
-            text = format_value(value)
-            shown = text if width > CHARACTER_WIDTH * len(text) else ""
-            segments.append(Segment(name, frame.x(before / longest), round(width, 1), text, shown))
+            words = text(value)
+            shown = words if width > CHARACTER_WIDTH * len(words) else ""
+            segments.append(Segment(name, frame.x(before / longest), round(width, 1), words, shown))
             before += value
         y = step * row + LINE_HEIGHT + 4
-        placed.append(PlacedBar(bar.label, y, tuple(segments), format_value(bar.total), frame.x(before / longest)))
+        placed.append(PlacedBar(bar.label, y, tuple(segments), text(bar.total), frame.x(before / longest)))
     names = dict.fromkeys(name for bar in bars for name, _ in bar.parts)
     return BarChart(title, frame, tuple(placed), tuple(names))
 

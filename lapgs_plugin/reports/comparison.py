@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+from lapgs_plugin.evaluation.lpips import lpips_titles
 from lapgs_plugin.runs.manifest import Manifest
 
 Metrics = dict[str, Any]
@@ -15,7 +15,6 @@ Metrics = dict[str, Any]
 
 OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
-PAIR = 2
 
 
 @dataclass(frozen=True)
@@ -51,19 +50,14 @@ class Row:
 
 
 def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
-    """Return the rows of a run, with its baseline if there is one.
-
-    Args:
-        metrics: of the run, then of the baseline if there is one.
-    """
+    """Return the rows for the metrics of a run, and then of its baseline if there is one."""
     views = "held-out" if metrics[0]["split"] == "test" else "training"
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
         *(
-            (LPIPS_KEY.format(name), f"LPIPS ({title_of(name)}), {views} views", "{:.4f}", _difference("{:+.4f}"))
-            for name in VARIANTS
-            if any(LPIPS_KEY.format(name) in each for each in metrics)
+            (key, f"{title}, {views} views", "{:.4f}", _difference("{:+.4f}"))
+            for key, title in lpips_titles({name for each in metrics for name in each}).items()
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),
@@ -82,7 +76,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         values = [cell.value for cell in cells if cell.value is not None]
         if not values and key in OPTIONAL_ROWS:
             continue
-        rows.append(Row(key, label, cells, compare(*values) if len(values) == PAIR else ""))
+        rows.append(Row(key, label, cells, compare(*values) if len(values) == 2 else ""))
     return tuple(rows)
 
 

@@ -10,12 +10,13 @@ from typing import Any
 import jinja2
 
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.evaluation.lpips import LPIPS_KEY, VARIANTS, title_of
+from lapgs_plugin.evaluation.lpips import lpips_titles
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.reports.charts import (
     INSET_AT,
@@ -28,6 +29,8 @@ from lapgs_plugin.reports.charts import (
     draw_arrows,
     draw_bars,
     draw_lines,
+    number_text,
+    seconds_text,
 )
 from lapgs_plugin.reports.comparison import Metrics, comparison_rows, setup_differences
 from lapgs_plugin.reports.pictures import Strip, make_strip
@@ -62,44 +65,27 @@ class MeasuredRun:
 
 
 @dataclass(frozen=True)
-class ViewRow:
-    """One view in the table of all views.
+class ViewTable:
+    """The table of all views.
 
     Attributes:
-        name: of the view.
-        cells: value and text of every metric of the run, then of the baseline's PSNR and of the gain over it.
+        columns: headings.
+        rows: by view, value and text of every metric of the run, then of the baseline's PSNR and of the gain over it.
     """
 
-    name: str
-    cells: tuple[tuple[float, str], ...]
+    columns: list[str]
+    rows: dict[str, list[tuple[float, str]]]
 
 
-def write_report(
-    run: MeasuredRun,
-    baseline: MeasuredRun | None = None,
-    moved_to: Path | None = None,
-    *,
-    device: str = "auto",
-    rasterizer: str = "auto",
-) -> Path:
-    """Write RUN/report.html.
-
-    Args:
-        run: the run that the page is about.
-        baseline: the run that it is compared with.
-        moved_to: the scene's folder now; None when it did not move.
-        device, rasterizer: see `rendering.run.run_renderer`.
-
-    Returns:
-        The path of the page.
+def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: RenderOptions) -> Path:
+    """Write report.html into the folder of a run, compared with its baseline if there is one, and return its path.
 
     Raises:
         RunFolderError: the scene is missing, or the file cannot be written.
     """
     runs = [run] if baseline is None else [run, baseline]
     kinds = [RUN, BASELINE][: len(runs)]
-    renderers = [run_renderer(each.archive, device, rasterizer) for each in runs]
-    view_columns, view_rows = view_table(runs)
+    renderers = [run_renderer(each.archive, options.device, options.rasterizer) for each in runs]
     page = render_page(
         TEMPLATE,
         name=run.name,
@@ -113,9 +99,8 @@ def write_report(
         arrows=_time_arrows(run, baseline) if baseline else None,
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
-        strips=view_strips(run, renderers, moved_to),
-        view_columns=view_columns,
-        view_rows=view_rows,
+        strips=view_strips(run, renderers, options.scene),
+        views=view_table(runs),
         settings=_settings(run),
     )
     path = run.archive.path(REPORT)
@@ -187,29 +172,16 @@ def _chart_row(
 ) -> list[Chart]:
     marks = [] if marked is None else _stage_marks(marked, x_of)
     charts = []
-    for key, title, from_zero, by_stage, format_y in (
-        ("loss", "Loss", True, True, "{:g}".format),
-        ("psnr", "Held-out PSNR (dB)", False, False, "{:g}".format),
-        ("num_gaussians", "Gaussians in training", True, True, count_text),
-    ):
+    for key, title in (("loss", "Loss"), ("psnr", "Held-out PSNR (dB)"), ("num_gaussians", "Gaussians in training")):
+        by_stage = key != "psnr"  # which is of the composed image, so that stages continue each other
         series = [
             Series(kind, points)
             for run, kind in reversed(list(zip(runs, kinds, strict=True)))  # draws the first on top
             for points in _lines(run, key, by_stage, x_of)
         ]
         if series:
-            charts.append(
-                draw_lines(
-                    title,
-                    x_label,
-                    series,
-                    marks=marks,
-                    from_zero=from_zero,
-                    format_x=count_text,
-                    format_y=format_y,
-                    inset_until=start if key == "psnr" else None,
-                )
-            )
+            inset = None if by_stage else start
+            charts.append(draw_lines(title, x_label, series, marks=marks, from_zero=by_stage, inset_until=inset))
     return charts
 
 
@@ -232,37 +204,14 @@ def _stage_marks(run: MeasuredRun, x_of: Position) -> list[Mark]:
     return [Mark(x, f"level {level}") for level, x in begins.items()] if len(begins) > 1 else []
 
 
-def count_text(value: float) -> str:
-    """Format a number for an axis: 1.5k, 20k, 1.2M."""
-    for size, suffix in ((1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
-            return f"{number_text(value / size)}{suffix}"
-    return f"{value:g}"
-
-
 # Time and number of Gaussians.
-
-
-def number_text(value: float) -> str:
-    """Format a number with three digits, or with all that are before its point."""
-    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
-
-
-def seconds_text(value: float) -> str:
-    """Format seconds."""
-    return f"{number_text(value)} s"
 
 
 def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
     """Draw time against Gaussians, as an arrow from the baseline to the run."""
     ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
-    return draw_arrows(
-        "Optimization (s) against Gaussians",
-        "Gaussians, mean of levels by iterations",
-        [Arrow(RUN, "", *ends)],
-        format_x=count_text,
-        format_y=count_text,
-    )
+    label = "Gaussians, mean of levels by iterations"
+    return draw_arrows("Optimization (s) against Gaussians", label, [Arrow(RUN, "", *ends)])
 
 
 def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
@@ -275,13 +224,13 @@ def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
                 total = sum(record.breakdown_seconds.values())
                 label = f"{run.name}{what}: {number_text(1e3 * total / record.iterations)} ms an iteration"
                 bars.append(Bar(label, list(record.breakdown_seconds.items())))
-    return draw_bars("Optimization", bars, format_value=seconds_text) if bars else None
+    return draw_bars("Optimization", bars, seconds_text) if bars else None
 
 
 def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
     """Draw the time outside the optimization."""
     bars = [Bar(run.name, list(run.metrics["overhead_seconds"].items())) for run in runs]
-    return draw_bars("Overhead", bars, format_value=seconds_text) if any(b.parts for b in bars) else None
+    return draw_bars("Overhead", bars, seconds_text) if any(b.parts for b in bars) else None
 
 
 # Views.
@@ -328,29 +277,20 @@ def _select_views(metrics: Metrics) -> dict[str, str]:
     return reasons
 
 
-def view_table(runs: Sequence[MeasuredRun]) -> tuple[list[str], list[ViewRow]]:
-    """Return headings and rows of all views, sorted by the run's PSNR, the worst first.
-
-    Args:
-        runs: the run, then its baseline if there is one.
-    """
+def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
+    """Make the table of all views of a run, the worst PSNR first, beside those of its baseline if there is one."""
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
-    keys = {"psnr": "PSNR (dB)", "ssim": "SSIM"}
-    keys |= {
-        LPIPS_KEY.format(name): f"LPIPS ({title_of(name)})"
-        for name in VARIANTS
-        if all(LPIPS_KEY.format(name) in view for view in views)
-    }
+    keys = {"psnr": "PSNR (dB)", "ssim": "SSIM", **lpips_titles(set.intersection(*map(set, views)))}
     others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]
-    rows = []
+    rows = {}
     for view in views:
         cells = [(view[key], f"{view[key]:.2f}" if key == "psnr" else f"{view[key]:.4f}") for key in keys]
         for other in others:
             # The baseline may have been measured on other views.
             if (theirs := other.get(view["name"])) is not None:
                 cells += [(theirs, f"{theirs:.2f}"), (view["psnr"] - theirs, f"{view['psnr'] - theirs:+.2f}")]
-        rows.append(ViewRow(view["name"], tuple(cells)))
-    return [*keys.values(), *(["baseline PSNR", "gain"] if others else [])], rows
+        rows[view["name"]] = cells
+    return ViewTable([*keys.values(), *(["baseline PSNR", "gain"] if others else [])], rows)
 
 
 def _settings(run: MeasuredRun) -> dict[str, str]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.ply import read_ply, scalar_names
+from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.source import (
     LARGEST,
@@ -29,7 +30,6 @@ from lapgs_plugin.scenes.source import (
     check_camera,
     hold_out,
     in_name_order,
-    is_file,
 )
 from lapgs_plugin.untrusted import read_json
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out, is_file, is_folder
+from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out
 
 MODEL_FILES = ("cameras", "images", "points3D")
 

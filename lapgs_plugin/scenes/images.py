@@ -21,8 +21,8 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.files import is_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
-from lapgs_plugin.scenes.source import is_file
 
 JPEG_QUALITY = 95
 PNG_LEVEL = 4

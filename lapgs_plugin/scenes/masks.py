@@ -10,8 +10,8 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.scenes.images import has_alpha, image_size, read_image, same_shape
-from lapgs_plugin.scenes.source import is_folder
 
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
@@ -31,7 +32,7 @@ from lapgs_plugin.scenes.masks import (
 )
 from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
-from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource, is_folder
+from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1

@@ -99,22 +99,6 @@ def check_camera(path: Path, name: str, camera: Camera) -> None:
         )
 
 
-def is_file(path: Path) -> bool:
-    """Return whether a file exists; False also for names that the file system does not allow."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def is_folder(path: Path) -> bool:
-    """Return whether a folder exists; False also for names that the file system does not allow."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
-
-
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     """Return the frames sorted by name."""
     return tuple(sorted(frames, key=lambda frame: frame.name))

@@ -98,12 +98,7 @@ class Controls:
         self._divider.value = min(max(share, 0.0), 1.0)
 
     def report(self, picture: Picture, seconds: float) -> None:
-        """Show the times of a picture.
-
-        Args:
-            picture: the picture.
-            seconds: from its request until it was sent.
-        """
+        """Show the times of a picture, and the seconds from its request until it was sent."""
         height, width = picture.image.shape[1:]
         rows = ["| band | Gaussians | ms |", "|:--|--:|--:|"]
         for level, count in self._run.counts.items():
@@ -137,23 +132,21 @@ class Controls:
         gain = self._gui.add_slider(
             f"gain {level}", min=0.0, max=MAX_GAIN, step=GAIN_STEP, initial_value=1.0, marks=(0.0, 1.0, 2.0, 3.0)
         )
-        for handle in (drawn, gain):
-            handle.on_update(lambda _: self._changed())
-        return drawn, gain
+        return self._watched(drawn), self._watched(gain)
 
     def _add_choice(self, label: str, choices: Sequence[str]) -> Any:
-        handle = self._gui.add_dropdown(label, tuple(choices), initial_value=choices[0])
-        handle.on_update(lambda _: self._changed())
-        return handle
+        return self._watched(self._gui.add_dropdown(label, tuple(choices), initial_value=choices[0]))
 
     def _add_split(self, other: ShownRun | None) -> tuple[Any, Any]:
         if other is None:
             return None, None
         split = self._gui.add_checkbox("split", initial_value=True, hint=f"{self._run.name} | {other.name}")
         divider = self._gui.add_slider("divider", min=0.0, max=1.0, step=0.005, initial_value=0.5)
-        for handle in (split, divider):
-            handle.on_update(lambda _: self._changed())
-        return split, divider
+        return self._watched(split), self._watched(divider)
+
+    def _watched(self, handle: Any) -> Any:
+        handle.on_update(lambda _: self._changed())
+        return handle
 
     def _add_cameras(
         self, views: Sequence[str], go_to: Callable[[int], None], show_cameras: Callable[[bool], None]

@@ -17,6 +17,7 @@ from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.viewer.page import Page
@@ -49,22 +50,19 @@ class FollowedRun:
     """The levels of a run that can be shown: finished, undamaged, from the coarsest on without gaps.
 
     Attributes:
+        options: where the scene is, and what renders the run.
         archive: the archive when last read.
         shown: the run; None while it has no level.
         problem: one line about the first level that is missing or damaged; None without.
-
-    Args:
-        folder: the run folder.
-        device, rasterizer: see `rasterizer_for`.
 
     Raises:
         RunFolderError: there is no run, it has another version, or its coarsest level is damaged.
         UserInputError, MissingExtraError: see `rasterizer_for`.
     """
 
-    def __init__(self, folder: Path, device: str, rasterizer: str) -> None:
+    def __init__(self, folder: Path, options: RenderOptions) -> None:
         self._folder = folder.absolute()  # whose name is shown
-        self._device, self._rasterizer = device, rasterizer
+        self.options = options
         self._fields: dict[int, tuple[Stamp, GaussianField]] = {}
         self._placed: PlacedRasterizer | None = None
         self._created = ""
@@ -109,7 +107,7 @@ class FollowedRun:
         archive = RunArchive.open(self._folder, check=False)
         manifest = archive.manifest
         if self._placed is None or manifest.created != self._created:
-            self._placed = rasterizer_for(manifest, self._device, self._rasterizer)
+            self._placed = rasterizer_for(manifest, self.options.device, self.options.rasterizer)
             self._created = manifest.created
             self._fields = {}
             if self._placed.device.type == "cuda":  # while the fields are read
@@ -134,29 +132,16 @@ class FollowedRun:
 
 
 class RunFollower:
-    """Keeps a viewer up to date with a run, and with a second one beside it.
+    """Keeps a viewer and the status on its page up to date with a run, and perhaps with another one beside it.
 
-    Args:
-        viewer: shows the runs.
-        page: shows the status.
-        run: the run.
-        other: the run to compare with, or None.
-        scene: the scene's folder now; None when it did not move.
-        report: called with each new line of status.
+    `report` is called with each new line of status.
     """
 
     def __init__(
-        self,
-        viewer: Viewer,
-        page: Page,
-        run: FollowedRun,
-        other: FollowedRun | None,
-        scene: Path | None,
-        report: Callable[[str], None],
+        self, viewer: Viewer, page: Page, run: FollowedRun, other: FollowedRun | None, report: Callable[[str], None]
     ) -> None:
         self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
-        self._scene = scene
         self._cameras: SceneCameras | None = None
         self._said: set[str] = set()
         self._placed_clients = False
@@ -167,10 +152,11 @@ class RunFollower:
         Raises:
             RunFolderError, SceneError: the given scene is not the run's.
         """
+        scene = self._runs[0].options.scene
         try:
-            self._cameras = SceneCameras.of(self._runs[0].archive, self._scene)
+            self._cameras = SceneCameras.of(self._runs[0].archive, scene)
         except (RunFolderError, SceneError) as error:
-            if self._scene is not None:
+            if scene is not None:
                 raise
             self._report(f"without the scene's cameras: {error}")
         else:

@@ -59,12 +59,7 @@ class Pacing:
         return self._moving
 
     def end(self, scale: float, seconds: float) -> None:
-        """Note that a picture was drawn and sent.
-
-        Args:
-            scale: the result of `begin`.
-            seconds: its time.
-        """
+        """Note that a picture at the scale of `begin` was drawn and sent in so many seconds."""
         self._drawn = scale
         # A damped step keeps noise out of the size.
         self._moving = math.sqrt(self._moving * _fitting(scale, seconds, self._moving_seconds))

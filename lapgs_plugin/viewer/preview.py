@@ -52,13 +52,7 @@ def crop_to_aspect(image: Image.Image, aspect: float) -> Image.Image:
 
 
 def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> None:
-    """Render a run from the initial view and save the picture in its folder; errors are logged.
-
-    Args:
-        archive: the run.
-        shown: the run with all its finished levels.
-        start: the initial view.
-    """
+    """Render all finished levels of a run from the initial view, and save the picture in its folder; log errors."""
     with _logged(archive.path()):
         from lapgs_plugin.scenes.images import as_bytes
         from lapgs_plugin.viewer.pictures import PictureSettings, draw
@@ -72,23 +66,19 @@ def save_preview(archive: RunArchive, shown: ShownRun, start: InitialView) -> No
 
 
 def save_run_preview(run: Path, device: str = "auto", moved_to: Path | None = None) -> None:
-    """Save the preview of a run that was just trained, see `save_preview`.
-
-    Args:
-        run: the run folder.
-        device: where to render, see `rasterizer_for`.
-        moved_to: the scene's folder now; None if it did not move.
-    """
+    """Save the preview of a run that was just trained, rendered on `device` from a scene that may have been moved."""
     with _logged(run):
         # Imported here, because a backbone's environment may lack such packages as OpenImageIO.
+        from lapgs_plugin.jit.threads import one_pool
         from lapgs_plugin.rendering.run import run_renderer
         from lapgs_plugin.runs.archive import RunArchive
         from lapgs_plugin.viewer.pictures import ShownRun
         from lapgs_plugin.viewer.poses import SceneCameras
 
-        archive = RunArchive.open(run)
-        cameras = SceneCameras.of(archive, moved_to)
-        save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
+        with one_pool():
+            archive = RunArchive.open(run)
+            cameras = SceneCameras.of(archive, moved_to)
+            save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
 
 
 @contextmanager

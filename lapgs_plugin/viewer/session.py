@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import viser
@@ -37,13 +36,7 @@ REPORT_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """The content that all clients see.
-
-    Attributes:
-        run: the run.
-        other: the run to compare with, or None.
-        cameras: the scene's cameras; None when unknown.
-    """
+    """What all clients see: a run, perhaps another one to compare it with, and the scene's cameras if known."""
 
     run: ShownRun
     other: ShownRun | None
@@ -252,9 +245,6 @@ class Session:
             text = json.dumps(trajectory_json([with_size(camera, size) for camera in self._kept]), indent=1)
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
-    def _clicked(self, index: int, _: object) -> None:
-        self._go_to(index)
-
     def _show_cameras(self, wanted: bool) -> None:
         if wanted and not self._frustums:
             self._frustums = self._add_frustums()
@@ -276,6 +266,10 @@ class Session:
                 wxyz=pose.wxyz,
                 position=pose.position,
             )
-            frustum.on_click(partial(self._clicked, index))
+
+            @frustum.on_click
+            def _(_: object, index: int = index) -> None:
+                self._go_to(index)
+
             frustums.append(frustum)
         return frustums

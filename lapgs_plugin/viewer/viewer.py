@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import viser
 
-from lapgs_plugin.rendering.rig import Vector
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.poses import InitialView
 from lapgs_plugin.viewer.session import PictureBudget, Session, ViewerContent
@@ -41,8 +40,7 @@ class Viewer:
         server = self._page.server
         server.scene.set_up_direction(start.up)
         first = server.initial_camera
-        first.position, first.look_at, first.up = _triple(start.position), _triple(start.look_at), _triple(start.up)
-        first.fov = start.fov
+        first.position, first.look_at, first.up, first.fov = start.position, start.look_at, start.up, start.fov
         with self._awake:
             self._start = start
             sessions = list(self._sessions.values())
@@ -134,7 +132,3 @@ class Viewer:
     def _wake(self) -> None:
         with self._awake:
             self._awake.notify()
-
-
-def _triple(vector: Vector) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])

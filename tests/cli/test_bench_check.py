@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli import bench_check
+from lapgs_plugin.cli import bench_check, bench_experiment
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments import launchers, runner
+from lapgs_plugin.experiments import launchers
 from lapgs_plugin.experiments.schema import load_experiment
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import CHECKOUTS
@@ -76,8 +76,8 @@ def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object) -> None:
         raise AssertionError("something was started or written")
 
-    monkeypatch.setattr(launchers, "launch", started)
-    monkeypatch.setattr(runner, "make_samples", started)
+    monkeypatch.setattr(bench_experiment, "launch", started)
+    monkeypatch.setattr(bench_experiment, "make_samples", started)
 
 
 def lines_about(text: str, *words: str) -> list[str]:
@@ -309,7 +309,7 @@ def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytes
 def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
-    monkeypatch.setattr(bench_check._SceneSizes, "__call__", lambda self, resolution: (1600, 1066))
+    monkeypatch.setattr(bench_check, "_smallest_size", lambda scene, folder, resolution: (1600, 1066))
     for path in sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml")):
         experiment = load_experiment(path, _option_names())
         names = {name for entry in experiment.scenes for name in entry.names}

@@ -59,7 +59,7 @@ def test_a_run_on_few_photos_has_iterations_by_their_number(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lapgs_plugin.training.trainer.Trainer.run", lambda *_: None)
-    monkeypatch.setattr("lapgs_plugin.cli.train.keep_preview", lambda *_, **__: None)
+    monkeypatch.setattr("lapgs_plugin.viewer.preview.save_run_preview", lambda *_, **__: None)
     for name, more, expected in (("open", [], 5000), ("given", ["--iterations", "30000"], 30_000)):
         result = CliRunner().invoke(app, ["train", str(scene), "-o", str(tmp_path / name), *more])
         assert result.exit_code == 0, result.output

@@ -218,8 +218,7 @@ def test_a_store_without_its_tables_or_in_use(tmp_path: Path, monkeypatch: pytes
     path.touch()
     with pytest.raises(RunFolderError, match=r"cannot be read or written \(no such table"):
         ResultStore(path)
-    path.unlink()
-    store = ResultStore.create(path)
+    store = ResultStore.create(path)  # as after a command that was killed while it made the file
     monkeypatch.setattr(store_module, "LOCK_TIMEOUT", 0.1)
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN IMMEDIATE")

@@ -31,7 +31,7 @@ from lapgs_plugin.experiments.commands import Locations
 from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
-from lapgs_plugin.experiments.runner import Folder, prepare
+from lapgs_plugin.experiments.runner import STORE, prepare
 from lapgs_plugin.experiments.schema import load_experiment
 from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import ResultStore
@@ -246,11 +246,10 @@ def _write_experiment(folder: Path, reader: Reader) -> None:
     file.write_text(as_toml(values))
     experiment = load_experiment(file, {"train": {"levels"}, "run": {"levels"}})
     planned, scenes = plan_runs(experiment, Selection()), scenes_of(experiment, Selection())
-    jobs, _ = prepare(
-        planned, scenes, Locations({}, bench), Folder(bench), [], experiment, Selection(), mistakes := Mistakes(file)
-    )
+    mistakes = Mistakes(file, experiment, Selection())
+    jobs, _ = prepare(planned, scenes, Locations({}, bench), bench, [], mistakes)
     mistakes.refuse()
-    store = ResultStore.create(Folder(bench).store)
+    store = ResultStore.create(bench / STORE)
     store.plan(jobs)
     for job in jobs:
         claim = store.claim([job.run_id])

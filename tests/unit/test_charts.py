@@ -21,8 +21,8 @@ from lapgs_plugin.reports.charts import (
     draw_arrows,
     draw_bars,
     draw_lines,
+    number_text,
 )
-from lapgs_plugin.reports.report import number_text
 
 LEFT, RIGHT, TOP, BOTTOM = WHOLE.left, WHOLE.right, WHOLE.top, WHOLE.bottom
 WIDTH, HEIGHT = WHOLE.width, WHOLE.height
@@ -33,7 +33,7 @@ values = st.floats(-1e7, 1e7, allow_nan=False).map(lambda value: round(value, 3)
 @given(low=values, span=st.floats(1e-3, 1e7))
 def test_ticks_are_round_few_and_enclose_the_data(low: float, span: float) -> None:
     high = low + span
-    chart = draw_lines("t", "x", [Series("run", [(0, low), (1, high)])], from_zero=False, format_y=repr)
+    chart = draw_lines("t", "x", [Series("run", [(0, low), (1, high)])], from_zero=False, text=repr)
     ticks = [float(tick.label) for tick in chart.y_ticks]
     assert 2 <= len(ticks) <= 8
     slack = 1e-6 * max(abs(low), abs(high), span)
@@ -132,7 +132,7 @@ coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 def test_arrows_begin_and_point_where_the_axes_say(
     ends: list[tuple[tuple[float, float], tuple[float, float]]],
 ) -> None:
-    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], format_x=repr, format_y=repr)
+    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], repr)
     right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
     top = float(chart.y_ticks[-1].label)
     for arrow, (start, end) in zip(chart.arrows, ends, strict=True):
@@ -153,7 +153,7 @@ amounts = st.lists(st.tuples(st.sampled_from("abcdef"), st.floats(0.0, 1e5)), ma
 @settings(deadline=None)
 @given(bars=st.lists(amounts, min_size=1, max_size=5))
 def test_bars_share_a_scale_and_their_parts_lie_end_to_end(bars: list[list[tuple[str, float]]]) -> None:
-    chart = draw_bars("t", [Bar(f"bar {i}", parts) for i, parts in enumerate(bars)], format_value=repr)
+    chart = draw_bars("t", [Bar(f"bar {i}", parts) for i, parts in enumerate(bars)], repr)
     longest = max(math.fsum(value for _, value in parts) for parts in bars) or 1.0
     width = chart.frame.width - chart.frame.right
     assert [bar.label for bar in chart.bars] == [f"bar {i}" for i in range(len(bars))]

@@ -20,6 +20,7 @@ from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
@@ -268,11 +269,11 @@ def test_neighbours_say_nothing_where_exposure_jumps() -> None:
 def test_evaluation_measures_renders_with_the_predicted_exposure(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     run = write_run(tmp_path / "run", scene)
-    plain = evaluate_run(RunArchive.open(run), rasterizer="cpu", lpips=LpipsRequest(()))
+    plain = evaluate_run(RunArchive.open(run), RenderOptions(rasterizer="cpu"), LpipsRequest(()))
     learned = {f"photos/{name}.png": (1.25 * np.eye(3, 4)).tolist() for name in ("01", "07", "09", "10")}
     (run / "level_0" / EXPOSURE).write_text(json.dumps(learned))
     archive = RunArchive.open(run)
-    brighter = evaluate_run(archive, rasterizer="cpu", lpips=LpipsRequest(()))
+    brighter = evaluate_run(archive, RenderOptions(rasterizer="cpu"), LpipsRequest(()))
     (run / "level_0" / EXPOSURE).rename(run / "level_0" / "exposure.json")
     assert RunArchive.open(run).exposure(0) == learned, "the file's name in older runs"
     assert brighter["exposure_predicted"]

@@ -20,6 +20,7 @@ from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.viewer import following
 from lapgs_plugin.viewer.following import FollowedRun, RunFollower
 from tests.waiting import wait_for
@@ -67,7 +68,7 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     read: list[str] = []
     load: Callable[[Path], GaussianField] = GaussianField.load_ply
     monkeypatch.setattr(GaussianField, "load_ply", lambda path: read.append(path.parent.name) or load(path))
-    run = FollowedRun(folder, "cpu", "auto")
+    run = FollowedRun(folder, RenderOptions(device="cpu"))
     assert levels(run) == []
     assert not run.refresh()
     finish(folder, complete)
@@ -82,7 +83,7 @@ def test_new_levels_are_read_and_old_ones_are_not_read_again(
     assert not run.refresh()
     assert len(read) == before
     monkeypatch.chdir(folder)
-    assert FollowedRun(Path(), "cpu", "auto").status() == "run: 2 levels", "of `lapgs view .`"
+    assert FollowedRun(Path(), RenderOptions(device="cpu")).status() == "run: 2 levels", "of `lapgs view .`"
 
 
 def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_a_repaired_level_is_shown_again(scene: Path, tmp_path: Path) -> None:
     ply = folder / "level_0" / "point_cloud.ply"
     whole = ply.read_bytes()
     ply.write_bytes(whole[: len(whole) // 2])
-    run = FollowedRun(folder, "cpu", "auto")
+    run = FollowedRun(folder, RenderOptions(device="cpu"))
     assert levels(run) == [1]
     assert "cut short" in run.status()
     ply.write_bytes(whole)
@@ -105,14 +106,14 @@ def test_nan_in_a_residual_leaves_the_base(scene: Path, tmp_path: Path) -> None:
     content = bytearray(ply.read_bytes())
     content[-4:] = np.float32("nan").tobytes()
     ply.write_bytes(content)
-    run = FollowedRun(folder, "cpu", "auto")
+    run = FollowedRun(folder, RenderOptions(device="cpu"))
     assert levels(run) == [1]
     assert "NaN" in run.status()
 
 
 def test_another_run_in_the_same_folder_is_another_field(scene: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", scene)
-    run = FollowedRun(folder, "cpu", "auto")
+    run = FollowedRun(folder, RenderOptions(device="cpu"))
     assert run.shown is not None
     first = run.shown.renderer.fields[1].means.clone()
     other = write_run(tmp_path / "other", scene, seed=9)
@@ -148,7 +149,7 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
     complete = write_run(tmp_path / "complete", scene)
     folder = write_run(tmp_path / "run", scene, finished=1)
     viewer, page, said = FakeViewer(), FakePage(), list[str]()
-    follow = RunFollower(viewer, page, FollowedRun(folder, "cpu", "auto"), None, None, said.append)  # type: ignore[arg-type]  # fakes
+    follow = RunFollower(viewer, page, FollowedRun(folder, RenderOptions(device="cpu")), None, said.append)  # type: ignore[arg-type]  # fakes
     follow.begin()
     stop = threading.Event()
     thread = threading.Thread(target=follow.watch, args=(stop,))
@@ -172,4 +173,4 @@ def test_without_a_level_to_show_damage_is_an_error(scene: Path, tmp_path: Path)
     folder = write_run(tmp_path / "run", scene, finished=1)
     (folder / "level_1" / "point_cloud.ply").unlink()
     with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
-        FollowedRun(folder, "cpu", "auto")
+        FollowedRun(folder, RenderOptions(device="cpu"))

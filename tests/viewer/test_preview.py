@@ -25,6 +25,7 @@ from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
 
+from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.viewer.following import FollowedRun, RunFollower
 from lapgs_plugin.viewer.page import Page
 from lapgs_plugin.viewer.viewer import Viewer
@@ -115,7 +116,7 @@ def test_a_viewer_saves_a_preview_after_drawing(run: Path) -> None:
     stop = threading.Event()
     with Page("127.0.0.1", 8960, "run") as page:
         viewer = Viewer(page)
-        following = RunFollower(viewer, page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following = RunFollower(viewer, page, FollowedRun(run, RenderOptions(device="cpu")), None, lambda _: None)
         following.begin()
         serving = threading.Thread(target=viewer.serve, args=(stop, following.save_preview))
         serving.start()
@@ -145,7 +146,7 @@ def test_a_damaged_run_has_no_preview(run: Path) -> None:
     ply = run / "level_0" / "point_cloud.ply"
     ply.write_bytes(ply.read_bytes()[:-1000])
     with Page("127.0.0.1", 8965, "run") as page:
-        following = RunFollower(Viewer(page), page, FollowedRun(run, "cpu", "auto"), None, None, lambda _: None)
+        following = RunFollower(Viewer(page), page, FollowedRun(run, RenderOptions(device="cpu")), None, lambda _: None)
         following.begin()
         following.save_preview()
     assert not (run / PREVIEW).exists()

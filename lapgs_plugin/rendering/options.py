@@ -1,0 +1,25 @@
+"""Declare where a run's scene is, and where and with what the run is rendered. Imports no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lapgs_plugin.options import option
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Choose where a run's scene is, and where and with which rasterizer the run is rendered."""
+
+    scene: Path | None = option(None, "Scene folder, if it was moved after training.")
+    device: str = option("auto", "cuda, cpu, or auto: CUDA if there is a CUDA device, else the CPU.")
+    rasterizer: str = option(
+        "auto",
+        "cpu, oracle, gsplat, or the module of an installed CUDA rasterizer such as diff_gaussian_rasterization. "
+        "auto: the rasterizer that the run was trained with, else gsplat, else cpu.",
+    )
+
+
+AS_TRAINED = RenderOptions()
+"""The scene where the run was trained, and the most similar rasterizer of this machine."""
