@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
@@ -45,27 +46,20 @@ class Adapter(BackboneAdapter):
         if SCHEDULER not in sys.modules:
             return []
         scheduler = sys.modules[SCHEDULER].TrainingScheduler
+        later, start = "training() when it densifies", "training() at its start"
         return [
+            Replacement(scheduler, "get_res_scale", partial(_full_size, window_of), later, ("self", "iteration")),
             Replacement(
-                scheduler,
-                "get_res_scale",
-                lambda original: _full_size_after_the_base(original, window_of),
-                "training() when it densifies",
-                ("self", "iteration"),
-            ),
-            Replacement(
-                scheduler,
-                "__init__",
-                lambda original: _budget_of_inherited(original, window_of),
-                "training() at its start",
-                ("self", "opt", "pipe", "gaussians"),
+                scheduler, "__init__", partial(_budget, window_of), start, ("self", "opt", "pipe", "gaussians")
             ),
         ]
 
 
-def _full_size_after_the_base(
-    original: Callable[[Any, int], int], window_of: Callable[[], StageWindow | None]
+def _full_size(
+    window_of: Callable[[], StageWindow | None], original: Callable[[Any, int], int]
 ) -> Callable[[Any, int], int]:
+    """Render fields that inherit at the full size of their level."""
+
     def get_res_scale(self: Any, iteration: int) -> int:
         window = window_of()
         return original(self, iteration) if window is None or window.start == 0 else 1
@@ -73,9 +67,7 @@ def _full_size_after_the_base(
     return get_res_scale
 
 
-def _budget_of_inherited(
-    original: Callable[..., None], window_of: Callable[[], StageWindow | None]
-) -> Callable[..., None]:
+def _budget(window_of: Callable[[], StageWindow | None], original: Callable[..., None]) -> Callable[..., None]:
     """Start a field that inherits Gaussians with a budget of as many, and without the momentum of five times that."""
 
     def __init__(self: Any, opt: Any, pipe: Any, gaussians: Any, *others: Any, **more: Any) -> None:

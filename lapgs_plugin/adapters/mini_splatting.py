@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
@@ -54,28 +55,15 @@ class Adapter(BackboneAdapter):
             window = window_of()
             return window is not None and window.stage.signed
 
-        model = self.profile.model
+        model, start = self.profile.model, "Scene, and fields that inherit"
+        clock = "training() at the start of every iteration"
         return [
-            Replacement(
-                model, "reinitial_pts", lambda original: _unless(original, signed), "training()", ("self", "pts", "rgb")
-            ),
-            Replacement(
-                model,
-                "create_from_pcd",
-                lambda original: self._with_sh(original, signed),
-                "Scene, and fields that inherit",
-                ("self", "pcd"),
-            ),
-            Replacement(
-                model,
-                "update_learning_rate",
-                lambda original: _unlocking_sh(original, signed),
-                "training() at the start of every iteration",
-                ("self", "iteration"),
-            ),
+            Replacement(model, "reinitial_pts", partial(_unless, signed), "training()", ("self", "pts", "rgb")),
+            Replacement(model, "create_from_pcd", partial(self._with_sh, signed), start, ("self", "pcd")),
+            Replacement(model, "update_learning_rate", partial(_unlocking_sh, signed), clock, ("self", "iteration")),
         ]
 
-    def _with_sh(self, original: Callable[..., None], signed: Callable[[], bool]) -> Callable[..., None]:
+    def _with_sh(self, signed: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
         """Give a residual all SH coefficients; the checkout makes its model without."""
 
         def create_from_pcd(gaussians: Any, pcd: Any, *others: Any) -> None:
@@ -86,7 +74,7 @@ class Adapter(BackboneAdapter):
         return create_from_pcd
 
 
-def _unless(original: Callable[..., None], signed: Callable[[], bool]) -> Callable[..., None]:
+def _unless(signed: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
     """Keep a residual's Gaussians where the checkout would make them anew."""
 
     def reinitial_pts(gaussians: Any, pts: Any, rgb: Any) -> None:
@@ -96,7 +84,7 @@ def _unless(original: Callable[..., None], signed: Callable[[], bool]) -> Callab
     return reinitial_pts
 
 
-def _unlocking_sh(original: Callable[[Any, int], Any], signed: Callable[[], bool]) -> Callable[[Any, int], Any]:
+def _unlocking_sh(signed: Callable[[], bool], original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
     """Unlock a residual's SH at the checkout's interval."""
 
     def update_learning_rate(gaussians: Any, iteration: int) -> Any:
