@@ -319,11 +319,11 @@ class BackboneAdapter:
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
         return call.changed(**values)
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         """Return the symbols to replace besides those that the runner replaces in every backbone.
 
         Args:
-            window_of: returns the running stage, None between stages.
+            in_residual: returns whether a residual is being trained, by a call of its own.
         """
         return []
 

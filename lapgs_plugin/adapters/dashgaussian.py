@@ -42,38 +42,34 @@ class Adapter(BackboneAdapter):
             changed.pipe.resolution_mode = "const"
         return changed
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         if SCHEDULER not in sys.modules:
             return []
         scheduler = sys.modules[SCHEDULER].TrainingScheduler
         later, start = "training() when it densifies", "training() at its start"
         return [
-            Replacement(scheduler, "get_res_scale", partial(_full_size, window_of), later, ("self", "iteration")),
+            Replacement(scheduler, "get_res_scale", partial(_full_size, in_residual), later, ("self", "iteration")),
             Replacement(
-                scheduler, "__init__", partial(_budget, window_of), start, ("self", "opt", "pipe", "gaussians")
+                scheduler, "__init__", partial(_budget, in_residual), start, ("self", "opt", "pipe", "gaussians")
             ),
         ]
 
 
-def _full_size(
-    window_of: Callable[[], StageWindow | None], original: Callable[[Any, int], int]
-) -> Callable[[Any, int], int]:
-    """Render fields that inherit at the full size of their level."""
+def _full_size(in_residual: Callable[[], bool], original: Callable[[Any, int], int]) -> Callable[[Any, int], int]:
+    """Render residuals at the full size of their level."""
 
     def get_res_scale(self: Any, iteration: int) -> int:
-        window = window_of()
-        return original(self, iteration) if window is None or window.start == 0 else 1
+        return 1 if in_residual() else original(self, iteration)
 
     return get_res_scale
 
 
-def _budget(window_of: Callable[[], StageWindow | None], original: Callable[..., None]) -> Callable[..., None]:
+def _budget(in_residual: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
     """Start a field that inherits Gaussians with a budget of as many, and without the momentum of five times that."""
 
     def __init__(self: Any, opt: Any, pipe: Any, gaussians: Any, *others: Any, **more: Any) -> None:
         original(self, opt, pipe, gaussians, *others, **more)
-        window = window_of()
-        if window is not None and window.start > 0 and self.momentum != -1:  # -1: the user set the budget
+        if in_residual() and self.momentum != -1:  # -1: the user set the budget
             self.momentum, self.max_n_gaussian = 0, self.init_n_gaussian
 
     return __init__

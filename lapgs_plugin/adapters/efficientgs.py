@@ -46,7 +46,7 @@ class Adapter(BackboneAdapter):
             opt.use_sparse_shs = False
         return changed
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         return [
             Replacement(self.train, "prepare_output_and_logger", _in_any_folder, "training() at its start", ("args",))
         ]

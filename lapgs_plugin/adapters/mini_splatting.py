@@ -50,45 +50,43 @@ class Adapter(BackboneAdapter):
             setattr(args, name, never if window.start > 0 else window.scaled(getattr(args, name)))
         return changed.changed(args=args)
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
-        def signed() -> bool:
-            window = window_of()
-            return window is not None and window.stage.signed
-
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         model, start = self.profile.model, "Scene, and fields that inherit"
         clock = "training() at the start of every iteration"
         return [
-            Replacement(model, "reinitial_pts", partial(_unless, signed), "training()", ("self", "pts", "rgb")),
-            Replacement(model, "create_from_pcd", partial(self._with_sh, signed), start, ("self", "pcd")),
-            Replacement(model, "update_learning_rate", partial(_unlocking_sh, signed), clock, ("self", "iteration")),
+            Replacement(model, "reinitial_pts", partial(_unless, in_residual), "training()", ("self", "pts", "rgb")),
+            Replacement(model, "create_from_pcd", partial(self._with_sh, in_residual), start, ("self", "pcd")),
+            Replacement(
+                model, "update_learning_rate", partial(_unlocking_sh, in_residual), clock, ("self", "iteration")
+            ),
         ]
 
-    def _with_sh(self, signed: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
+    def _with_sh(self, in_residual: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
         """Give a residual all SH coefficients; the checkout makes its model without."""
 
         def create_from_pcd(gaussians: Any, pcd: Any, *others: Any) -> None:
-            if signed():
+            if in_residual():
                 gaussians.max_sh_degree = self._degree
             original(gaussians, pcd, *others)
 
         return create_from_pcd
 
 
-def _unless(signed: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
+def _unless(in_residual: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
     """Keep a residual's Gaussians where the checkout would make them anew."""
 
     def reinitial_pts(gaussians: Any, pts: Any, rgb: Any) -> None:
-        if not signed():
+        if not in_residual():
             original(gaussians, pts, rgb)
 
     return reinitial_pts
 
 
-def _unlocking_sh(signed: Callable[[], bool], original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
+def _unlocking_sh(in_residual: Callable[[], bool], original: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
     """Unlock a residual's SH at the checkout's interval."""
 
     def update_learning_rate(gaussians: Any, iteration: int) -> Any:
-        if signed() and iteration % SH_EVERY == 0:
+        if in_residual() and iteration % SH_EVERY == 0:
             gaussians.oneupSHdegree()
         return original(gaussians, iteration)
 

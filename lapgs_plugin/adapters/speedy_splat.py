@@ -8,7 +8,6 @@ from typing import Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.checkouts.training_call import StageWindow
 
 
 class Adapter(BackboneAdapter):
@@ -24,7 +23,7 @@ class Adapter(BackboneAdapter):
         density_scores=("score_func",),
     )
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         import torch
 
         return [

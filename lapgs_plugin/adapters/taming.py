@@ -57,7 +57,7 @@ class Adapter(BackboneAdapter):
         # Half way through training it replaces the sigmoid by the absolute value, and saves the value before that.
         return field.with_parameters({"opacity_logits": logits_of(stored.abs())})
 
-    def replacements(self, window_of: Callable[[], StageWindow | None]) -> list[Replacement]:
+    def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         consumer = "densify_with_score(), which cannot sample nothing"
         model = self.profile.model
         return [

@@ -39,9 +39,6 @@ class ActiveStage:
             copied once the loop has a scene: some checkouts refuse an output folder that is there before they make it.
     """
 
-    keeps_schedule = False
-    """Whether the schedule is the checkout's own, for the whole run."""
-
     def __init__(
         self,
         context: RunContext,

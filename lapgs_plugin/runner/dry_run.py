@@ -23,11 +23,11 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
-from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.plan import StagePlan, level_size
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
@@ -96,7 +96,7 @@ class DryRun:
                 rendering.accumulated = _Nothing(sizes, self._context.device)
                 rendering.composed = frozenset(self._cameras)
             call = self._scratch_call(folder)
-            stage = _DryStage(call, rendering, self._window, lambda gaussians: self._scene_for(call, gaussians))
+            stage = _DryStage(call, rendering, self._stage, lambda gaussians: self._scene_for(call, gaussians))
             self._iterate(stage, works)
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
@@ -153,15 +153,10 @@ class DryRun:
                 f"or one step of the positions, an iteration; {OFF}"
             )
 
-    @property
-    def _window(self) -> StageWindow | None:
-        """The residual's stage; None for levels that keep the checkout's own schedule."""
-        return self._context.window(self._plan, self._stage) if self._stage.signed else None
-
     def _scratch_call(self, folder: Path) -> TrainingCall:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""
-        if self._window is not None:
-            call = self._adapter.stage_call(self._call, self._window, str(folder))
+        if self._stage.signed:
+            call = self._adapter.stage_call(self._call, self._context.window(self._plan, self._stage), str(folder))
         else:
             values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
             values["dataset"].model_path = str(folder)
@@ -301,11 +296,11 @@ class _DryStage:
         self,
         call: TrainingCall,
         rendering: StageRendering,
-        window: StageWindow | None,
+        stage: Stage,
         make_scene: Callable[[Any], Any],
     ) -> None:
-        self.call, self.rendering, self.window, self._make_scene = call, rendering, window, make_scene
-        self.keeps_schedule, self.iteration = window is None, 0
+        self.call, self.rendering, self.stage, self._make_scene = call, rendering, stage, make_scene
+        self.iteration = 0
         self.record = LoopRecord(torch.device("cpu"))  # what it measures is dropped
         self.gaussians: Any = None
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
-from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
@@ -56,15 +56,14 @@ class StageReplacements:
             *self._in_rendering(profile),
             *timing_replacements(profile, self._running),
             *self._in_model(profile),
-            *adapter.replacements(self._window),
+            *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
             *parts.replacements(profile, adapter.info),
         ]
 
-    def _window(self) -> StageWindow | None:
-        """Return the running stage if its schedule is not the checkout's own."""
+    def _in_residual(self) -> bool:
         stage = self._running()
-        return None if stage is None or stage.keeps_schedule else stage.window
+        return stage is not None and stage.stage.signed
 
     def _in_training(self, profile: Profile) -> list[Replacement]:
         scenes = profile.script_names(profile.scene)

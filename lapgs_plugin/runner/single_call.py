@@ -40,8 +40,6 @@ class NestedStage(ActiveStage):
         others: as of `ActiveStage`.
     """
 
-    keeps_schedule = True
-
     def __init__(self, *others: Any, advance: Callable[[Any], ActiveStage]) -> None:
         super().__init__(*others)
         self._advance = advance
