@@ -26,7 +26,6 @@ from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError, typed_line
-from lapgs_plugin.hierarchy.plan import Hierarchy
 
 if TYPE_CHECKING:
     import torch
@@ -230,8 +229,8 @@ class BackboneAdapter:
         }
         return {name: value for name, value in sorted(values.items()) if isinstance(value, (bool, int, float))}
 
-    def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
-        """Refuse options of this call that a hierarchy cannot honour.
+    def refuse(self, call: TrainingCall, residuals: bool) -> None:
+        """Refuse options of this call that a hierarchy cannot honour; `residuals` says whether it has any.
 
         Raises:
             UserInputError: there is one; the line says why, and what to do.
@@ -241,8 +240,7 @@ class BackboneAdapter:
                 f"--start_checkpoint {call.checkpoint}: a checkpoint holds one field, not a hierarchy; "
                 "continue a run of ours with `lapgs run --resume`, or train with `lapgs run --off`"
             )
-        adds = levels > 1 and hierarchy is Hierarchy.LAPLACIAN
-        if adds and getattr(call.opt, "random_background", False):
+        if residuals and getattr(call.opt, "random_background", False):
             raise UserInputError(
                 "--random_background: residual stages build on images rendered over one background; "
                 "leave it out, or train with --levels 1 or --hierarchy nested"

@@ -37,7 +37,7 @@ class Adapter(BackboneAdapter):
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
-        if window.start > 0 and hasattr(changed.pipe, "resolution_mode"):
+        if window.stage.signed and hasattr(changed.pipe, "resolution_mode"):
             # Its learning rates wait for the renders to reach full size, which they have.
             changed.pipe.resolution_mode = "const"
         return changed

@@ -41,8 +41,8 @@ class Adapter(BackboneAdapter):
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
         opt = changed.opt
-        opt.oneupSHdegree_from_iter = 0 if window.start > 0 else window.scaled(opt.oneupSHdegree_from_iter)
-        if window.start > 0:
+        opt.oneupSHdegree_from_iter = 0 if window.stage.signed else window.scaled(opt.oneupSHdegree_from_iter)
+        if window.stage.signed:
             opt.use_sparse_shs = False
         return changed
 

@@ -47,7 +47,7 @@ class Adapter(BackboneAdapter):
         args = copy.copy(call.values["args"])
         for name in SIMPLIFICATIONS:
             never = window.stage.iterations + 1
-            setattr(args, name, never if window.start > 0 else window.scaled(getattr(args, name)))
+            setattr(args, name, never if window.stage.signed else window.scaled(getattr(args, name)))
         return changed.changed(args=args)
 
     def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:

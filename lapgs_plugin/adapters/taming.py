@@ -13,7 +13,6 @@ from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, logits_of
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Hierarchy
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,9 +72,9 @@ class Adapter(BackboneAdapter):
             ),
         ]
 
-    def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
-        super().refuse(call, levels, hierarchy)
-        if levels > 1 and hierarchy is Hierarchy.LAPLACIAN and call.values["args"].benchmark_dir:
+    def refuse(self, call: TrainingCall, residuals: bool) -> None:
+        super().refuse(call, residuals)
+        if residuals and call.values["args"].benchmark_dir:
             raise UserInputError(
                 f"--benchmark_dir {call.values['args'].benchmark_dir}: the checkout would write every stage's timings "
                 "over the last one's; leave it out, the manifest holds the time of each stage"
@@ -104,8 +103,6 @@ class Adapter(BackboneAdapter):
         """Return the number of Gaussians that a stage may grow to."""
         given = call.values["args"]
         whole = given.budget * self._points if given.mode == "multiplier" else given.budget
-        if window.levels == 1:
-            return int(whole)
         progress = 1 - window.stage.level / (window.levels - 1)  # 0 for the base, 1 for the finest
         return int(whole * (BASE_SHARE + (FINEST_SHARE - BASE_SHARE) * progress))
 

@@ -123,7 +123,7 @@ class HierarchyDriver:
 
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
-        self._adapter.refuse(call, self._options.levels, self._options.kind)
+        self._adapter.refuse(call, self._has_residuals)
         require_pruning(call, self._options.prune)
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
@@ -139,10 +139,10 @@ class HierarchyDriver:
                 self._options.shares,
                 self._options.kind,
             )
-            if self._signs_nothing:
+            if not self._has_residuals:
                 plan = between_events(plan, self._schedule, _variables(call))
             dry_run = DryRun(self._context, call, scene, plan, self._activate)
-            path = ColorPath.NATIVE if self._signs_nothing else dry_run.color_path()
+            path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
             with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
@@ -150,10 +150,10 @@ class HierarchyDriver:
                 try:
                     run = TrainingRun(call, scene, archive, path)
                     self._log_schedule(call)
-                    if self._signs_nothing:
-                        SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
-                    else:
+                    if self._has_residuals:
                         self._run_stages(run, plan, Path(scratch))
+                    else:
+                        SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
@@ -205,9 +205,9 @@ class HierarchyDriver:
         return Schedule(self._adapter.profile.source.training)
 
     @property
-    def _signs_nothing(self) -> bool:
-        """Whether no field is a residual, so that one call of the script's `training` trains all levels."""
-        return self._options.levels == 1 or self._options.nested
+    def _has_residuals(self) -> bool:
+        """Whether some fields are residuals; without any, one call of the script's `training` trains all levels."""
+        return self._options.levels > 1 and not self._options.nested
 
     def _activate(self, stage: Any) -> None:
         self._active = stage
