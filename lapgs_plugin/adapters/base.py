@@ -1,8 +1,8 @@
-"""Describe a backbone of the 3DGS family to the runner, which drives all of them and knows none by name.
+"""Drive any checkout of the 3DGS family, and describe a backbone to the runner, which knows none by name.
 
 An adapter says how a checkout is recognised, which of its symbols are replaced besides the common ones, how a stage's
-arguments differ from the run's, and how a field gets in and out of its model. Everything that can be found out from the
-checkout itself is in its profile.
+arguments differ from the run's, and how a field gets in and out of its model. What can be found out from the checkout
+itself is in its profile, so an adapter overrides only what is particular about its backbone.
 
 Imports no torch before a method needs it, so that checkouts are recognised quickly.
 """
@@ -13,7 +13,6 @@ import copy
 import inspect
 import logging
 import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -43,6 +42,12 @@ LARGEST_OPACITY = 1 - 1e-6
 
 SPARSE_ADAM = "SparseGaussianAdam"
 """Name that the family's GaussianModel imports for `--optimizer_type sparse_adam`, if its rasterizer has it."""
+
+OF_A_CALL = {
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
+    "scale_modifier", "prefiltered", "debug", "lambda_dssim", "depth_threshold",
+}  # fmt: skip
+"""Settings of rasterizers that are no property of a run."""
 
 FAMILY_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
 """Files of most checkouts of the family, relative to their roots."""
@@ -85,8 +90,8 @@ class BackboneInfo:
         name: for `--backbone` and the manifest.
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
-        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, if it fits.
-        color_rates: its options that are learning rates of SH coefficients; empty finds them by their names.
+        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, where runs are
+            rendered without a checkout, and where it fits the checkout's calls; empty is chosen by the calls alone.
         densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
             them by their names.
         own_files: files of its checkout that tell it from other code bases, relative to the checkout's root.
@@ -102,8 +107,7 @@ class BackboneInfo:
     name: str
     title: str
     rasterizer: str
-    stand_in: str
-    color_rates: tuple[str, ...] = ()
+    stand_in: str = ""
     densify_thresholds: tuple[str, ...] = ()
     own_files: tuple[str, ...] = ()
     family_files: tuple[str, ...] = FAMILY_FILES
@@ -137,8 +141,8 @@ class BackboneInfo:
         return other.name in self.fork_of or set(other.files) < set(self.files)
 
 
-class BackboneAdapter(ABC):
-    """Adapt one backbone, given the definitions of its training script.
+class BackboneAdapter:
+    """Drive a checkout, given the definitions of its training script.
 
     Args:
         script: its train.py, whose definitions have been executed.
@@ -213,13 +217,18 @@ class BackboneAdapter(ABC):
         """The training script's namespace."""
         return self.script.module
 
-    @abstractmethod
     def render(self, call: TrainingCall, view: Any, gaussians: Any, background: Tensor) -> None:
         """Render a view as the script's training loop does. The runner takes the image at the rasterizer."""
+        # Exposure is left out: images are taken before it is applied.
+        self.profile.render(call.values, view, gaussians, background, use_trained_exp=False)
 
-    @abstractmethod
     def raster_settings(self, call: TrainingCall) -> dict[str, Any]:
-        """Return the settings of the rasterizer that change images, to render the run later."""
+        """Return the settings of the rasterizer that the script has options for, such as antialiasing."""
+        names = {name for use in self.profile.source.rasterizers for name in use.settings} - OF_A_CALL
+        values = {
+            name: getattr(of, name) for of in (call.dataset, call.opt, call.pipe) for name in names if hasattr(of, name)
+        }
+        return {name: value for name, value in sorted(values.items()) if isinstance(value, (bool, int, float))}
 
     def refuse(self, call: TrainingCall, levels: int, hierarchy: Hierarchy) -> None:
         """Refuse options of this call that a hierarchy cannot honour.
@@ -288,10 +297,9 @@ class BackboneAdapter(ABC):
         dataset, opt, pipe = copies["dataset"], copies["opt"], copies.get("pipe", SimpleNamespace())
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
-        if hasattr(opt, "densify_until_iter"):
-            opt.densify_until_iter = window.scaled(opt.densify_until_iter)
-        if hasattr(opt, "position_lr_max_steps"):
-            opt.position_lr_max_steps = window.scaled(opt.position_lr_max_steps)
+        for name in ("densify_until_iter", "position_lr_max_steps"):
+            if hasattr(opt, name):
+                setattr(opt, name, window.scaled(getattr(opt, name)))
         for name in self.densify_thresholds(opt):
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
@@ -302,12 +310,10 @@ class BackboneAdapter(ABC):
             # A residual's opacity says where detail is missing, not where surfaces are.
             for name in _options(opt, "depth", "weight"):
                 setattr(opt, name, 0.0)
-            for name in self.info.color_rates or _options(opt, "feature", "_lr"):
+            for name in _options(opt, "feature", "_lr"):
                 setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
         values: dict[str, Any] = {**copies, **dict.fromkeys(CHECKPOINTS)}
-        for name, value in call.values.items():
-            if name.endswith("iterations") and isinstance(value, (list, tuple)):
-                values[name] = window.local(value)
+        values |= {name: window.local(iterations) for name, iterations in call.iteration_lists.items()}
         debug_from = call.values.get("debug_from", -1)
         pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
@@ -321,9 +327,7 @@ class BackboneAdapter(ABC):
         """
         return []
 
-    def level_view(  # noqa: B027 - most backbones have nothing of their own in a view
-        self, view: Any, original: Any, size: tuple[int, int], signed: bool
-    ) -> None:
+    def level_view(self, view: Any, original: Any, size: tuple[int, int], signed: bool) -> None:
         """Bring attributes of a view to a level's size that `make_level_view` does not know.
 
         Args:
@@ -333,10 +337,10 @@ class BackboneAdapter(ABC):
             signed: whether a residual is trained.
         """
 
-    def first_points(self, count: int) -> None:  # noqa: B027 - few need it
+    def first_points(self, count: int) -> None:
         """Receive the number of points of the scene, before the first stage."""
 
-    def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:  # noqa: B027 - few need it
+    def resume(self, call: TrainingCall, gaussians: Any, iteration: int) -> None:
         """Bring a model to the state that its class has after an iteration of the whole run, besides its parameters.
 
         Args:
@@ -432,8 +436,12 @@ class BackboneAdapter(ABC):
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
     def carried_over(self, gaussians: Any) -> dict[str, Any]:
-        """Return parameters besides its Gaussians that the next stage's model takes over, by attribute."""
-        return {}
+        """Return what the next stage's model takes over besides Gaussians, by attribute: exposures of the photos."""
+        if not hasattr(gaussians, "_exposure"):
+            return {}
+        import torch
+
+        return {"_exposure": torch.nn.Parameter(gaussians._exposure.detach().clone())}
 
     def optimizers(self, gaussians: Any) -> list[torch.optim.Optimizer]:
         """Return the optimizers that step Gaussians."""

@@ -10,8 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
@@ -19,7 +18,7 @@ SCHEDULER = "utils.schedule_utils"
 """Module of its scheduler, which only `train_dash.py` imports."""
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a DashGaussian checkout, whose plain `train.py` needs nothing of this.
 
     A residual is rendered at its level's size. It starts with as many Gaussians as it may have, and the budget grows by
@@ -30,7 +29,6 @@ class Adapter(generic.Adapter):
         name="dashgaussian",
         title="DashGaussian",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="graphdeco-aa",
         own_files=("train_dash.py", "utils/schedule_utils.py"),
         family_files=(),
         fork_of=("graphdeco",),

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive an EfficientGS checkout.
 
     In a stage of its own, SH are unlocked at the same share of the iterations. A residual has them from its start,
@@ -26,7 +25,6 @@ class Adapter(generic.Adapter):
         name="efficientgs",
         title="EfficientGS",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="efficientgs",
         own_files=("scene/renderer.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.rasterizer import Semantics
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a FastGS checkout.
 
     Its score functions get composed images and the level's ground truth, because both are replaced below them.

@@ -9,22 +9,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import OF_A_CALL, BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.source import readable_source
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.rasterizer import Semantics
 
 
-SETTINGS = {*generic.OF_A_CALL, "antialiasing"}
+SETTINGS = {*OF_A_CALL, "antialiasing"}
 """Settings of graphdeco's rasterizers."""
 
 OTHER_INPUTS = {"scores", "culling"}
 
 
-class Adapter(generic.Adapter):
-    """Drive a checkout of the graphdeco repository, or a fork that no other adapter recognises.
+class Adapter(BackboneAdapter):
+    """Drive a checkout of the graphdeco repository, or a fork that renders with its rasterizers.
 
     Its render applies a view's exposure and clamps to [0, 1] after the rasterizer, so both act on the composed image.
     Residuals are trained without depth supervision: their opacity says where detail is missing, not where surfaces are.

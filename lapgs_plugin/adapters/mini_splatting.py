@@ -10,8 +10,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
@@ -22,7 +21,7 @@ SH_EVERY = 1000
 """Iterations between two SH degrees."""
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a Mini-Splatting checkout.
 
     The base is simplified at its share of the run's iterations. A residual is neither simplified nor made anew, and
@@ -33,7 +32,6 @@ class Adapter(generic.Adapter):
         name="mini_splatting",
         title="Mini-Splatting",
         rasterizer="diff_gaussian_rasterization_ms",
-        stand_in="mini-splatting",
         own_files=("ms/train.py",),
         family_files=(),
         fork_of=("graphdeco",),

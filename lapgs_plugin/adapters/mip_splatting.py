@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, logits_of
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, logits_of
 from lapgs_plugin.checkouts.training_call import TrainingCall
 
 if TYPE_CHECKING:
@@ -16,14 +15,13 @@ FILTER = "filter_3D"
 """Attribute of its model, (n, 1) standard deviations, and property of its PLY files."""
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a Mip-Splatting checkout; its fields are archived and imported with their filters applied."""
 
     info = BackboneInfo(
         name="mip_splatting",
         title="Mip-Splatting",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="mip-splatting",
         own_files=("create_fused_ply.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

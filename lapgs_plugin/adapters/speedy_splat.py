@@ -6,20 +6,18 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a Speedy-Splat checkout, whose scores must not reach finished fields that are trained jointly."""
 
     info = BackboneInfo(
         name="speedy_splat",
         title="Speedy-Splat",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="speedy-splat",
         own_files=("compute_scene_metrics.py",),
         family_files=("train.py",),
         fork_of=("graphdeco",),

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters import generic
-from lapgs_plugin.adapters.base import BackboneInfo, logits_of
+from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, logits_of
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
@@ -34,7 +33,7 @@ LOW_LOGIT = -1.0
 training prunes), and opacities are hardly below 0."""
 
 
-class Adapter(generic.Adapter):
+class Adapter(BackboneAdapter):
     """Drive a Taming-3DGS checkout.
 
     Both modes of its budget, one of which counts from a stage's first Gaussians, become a final count for each stage.
@@ -44,7 +43,6 @@ class Adapter(generic.Adapter):
         name="taming",
         title="Taming-3DGS",
         rasterizer="diff_gaussian_rasterization",
-        stand_in="taming",
         density_scores=("compute_gaussian_score",),
         own_files=("utils/taming_utils.py",),
         unscaled=("ho_iteration",),

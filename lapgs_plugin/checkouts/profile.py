@@ -77,7 +77,8 @@ class Profile:
         self.source = CheckoutSource.read(script.path)
         self.model = self._find_model()
         self.scene = self._find_scene()
-        self.cameras = tuple(self._find_cameras())
+        makers = [(each, vars(each).get("__init__")) for each in self._classes()]
+        self.cameras = tuple(each for each, make in makers if _names(make) >= CAMERA_ROLES)
         self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
         self.renderers = tuple(self._find_renderers())
         self.density_control = tuple(sorted(_changing(self.model)))
@@ -201,11 +202,6 @@ class Profile:
             f"{self.script.path} imports no class with {' and '.join(SCENE_ROLES)}, expected of a scene; {OTHERWISE}"
         )
 
-    def _find_cameras(self) -> Iterator[type]:
-        for found in self._classes():
-            if "__init__" in vars(found) and _names(vars(found)["__init__"]) >= CAMERA_ROLES:
-                yield found
-
     def _holder(self, use: RasterizerUse) -> ModuleType | None:
         """Return the module that imports a rasterizer; None if it is not imported itself."""
         return self.script.module if use.holder == "__main__" else sys.modules.get(use.holder)
@@ -238,16 +234,11 @@ class Profile:
             settings = tuple(name for name in there if "setting" in name.lower())
             yield BoundRasterizer(use, module, settings, tuple(name for name in there if name not in settings))
 
-    def _classes(self) -> Iterator[type]:
-        """Yield classes of the checkout."""
-        modules = self.modules
-        names = {module.__name__ for module in modules}
-        seen: set[int] = set()
-        for module in modules:
-            for value in list(vars(module).values()):
-                if isinstance(value, type) and value.__module__ in names and id(value) not in seen:
-                    seen.add(id(value))
-                    yield value
+    def _classes(self) -> list[type]:
+        """Return the classes of the checkout."""
+        names = {module.__name__ for module in self.modules}
+        held = [value for module in self.modules for value in vars(module).values() if isinstance(value, type)]
+        return list(dict.fromkeys(value for value in held if value.__module__ in names))
 
     def _first_call(self, names: Container[str]) -> ast.Call | None:
         """Return the training function's first call of one of these names, if possible one that gradients come from.
@@ -313,7 +304,7 @@ def _changing(model: type) -> set[str]:
 
 
 def _names(function: Any) -> set[str]:
-    """Return the names of attributes and globals that a function uses."""
+    """Return the names of attributes and globals that a function uses, none for anything else."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     return set() if code is None else set(code.co_names)
 

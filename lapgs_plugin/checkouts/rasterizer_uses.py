@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lapgs_plugin.checkouts.syntax import parsed_quietly, place
+from lapgs_plugin.checkouts.syntax import executed_on_import, parsed_quietly, place
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RasterizerUse:
 def uses_of_rasterizers(name: str, path: Path, root: Path, modules: Mapping[str, Path]) -> list[RasterizerUse]:
     """Return how the functions of a module use rasterizers."""
     tree = parsed_quietly(path)
-    top = _aliases(_outside_functions(tree.body))
+    top = _aliases(executed_on_import(tree.body))
     found: dict[str, RasterizerUse] = {}
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         local = _aliases(ast.walk(function))
@@ -86,18 +86,6 @@ def _aliases(nodes: Iterable[ast.AST]) -> dict[str, _Alias]:
                 if "raster" in alias.name.lower():
                     found[alias.asname or alias.name.partition(".")[0]] = _Alias(alias.name, None, node.lineno)
     return found
-
-
-def _outside_functions(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
-    """Yield statements that are executed when a module is imported."""
-    for node in body:
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            continue
-        yield node
-        for part in ("body", "orelse", "finalbody"):
-            yield from _outside_functions(getattr(node, part, []))
-        for handler in getattr(node, "handlers", []):
-            yield from _outside_functions(handler.body)
 
 
 def _use(
@@ -154,11 +142,9 @@ def _inputs(function: ast.FunctionDef, renders: list[ast.Call]) -> frozenset[str
 
 
 def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:
-    return RasterizerUse(
-        module=one.module,
+    return replace(
+        one,
         names=tuple(dict.fromkeys((*one.names, *other.names))),
-        holder=one.holder,
-        where=one.where,
         inside=one.inside or other.inside,
         functions=(*one.functions, *other.functions),
         settings=one.settings | other.settings,

@@ -67,12 +67,7 @@ class Operand:
 
     @property
     def option(self) -> tuple[str, str] | None:
-        """(variable, attribute) if it is an option such as `opt.iterations`; the attribute of a variable is empty."""
-        if isinstance(self.node, ast.Name):
-            return self.node.id, ""
-        if isinstance(self.node, ast.Attribute) and isinstance(self.node.value, ast.Name):
-            return self.node.value.id, self.node.attr
-        return None
+        return _option(self.node)
 
     @property
     def name(self) -> str:
@@ -82,6 +77,11 @@ class Operand:
     @property
     def is_list(self) -> bool:
         return self.operator in (ast.In, ast.NotIn)
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether it is an iteration at which something begins, ends or happens."""
+        return not self.periodic and not self.is_list
 
     @property
     def listed(self) -> list[Operand]:
@@ -141,11 +141,6 @@ class Event:
         return any(each.is_list and each.value(variables) in ([], ()) for each in self.operands)
 
     @property
-    def bounds(self) -> tuple[Operand, ...]:
-        """Iterations at which it begins, ends or happens."""
-        return tuple(each for each in self.operands if not each.periodic and not each.is_list)
-
-    @property
     def listed(self) -> tuple[Operand, ...]:
         """Iterations in lists that are written out."""
         return tuple(element for each in self.operands for element in each.listed)
@@ -153,9 +148,9 @@ class Event:
     def last(self, end: int, number: Callable[[Operand], int | None]) -> int:
         """Return the last iteration, up to `end`, at which it happens by its period; 0 if there is none."""
         period = None if self.period is None else number(self.period)
-        for bound in (*self.bounds, *self.around):
-            value = None if bound.periodic or bound.is_list else number(bound)
-            if value is not None and bound.operator in (ast.Lt, ast.LtE):
+        for bound in (*self.operands, *self.around):
+            upper = bound.is_bound and bound.operator in (ast.Lt, ast.LtE)
+            if upper and (value := number(bound)) is not None:
                 end = min(end, value - (bound.operator is ast.Lt))
         return end // period * period if period else 0
 
@@ -167,9 +162,8 @@ class Event:
     def describe(self, variables: Mapping[str, Any]) -> str:
         """Return one line: the condition, with the values of options that are known, and the functions it calls."""
         known = {_place(each.node): each.value(variables) for each in self.operands if each.option is not None}
-        test = _Rewriter({place: value for place, value in known.items() if value is not None}, {}, {}, "").visit(
-            copy.deepcopy(self.test)
-        )
+        rewriter = _Rewriter({place: value for place, value in known.items() if value is not None})
+        test = rewriter.visit(copy.deepcopy(self.test))
         return f"line {self.test.lineno}: {ast.unparse(test)}" + f" ({', '.join(self.calls)})" * bool(self.calls)
 
 
@@ -237,8 +231,8 @@ class Schedule:
         keep = {*keep, *KEPT, *periods}
         late = window.total / RARE
         for event in self.events:
-            found = [(bound, bound.number(whole)) for bound in (*event.bounds, *event.listed)]
-            bounds = [(bound, number) for bound, number in found if number is not None and number > late]
+            found = [*(each for each in event.operands if each.is_bound), *event.listed]
+            bounds = [(each, number) for each in found if (number := each.number(whole) or 0) > late]
             for bound, number in bounds:
                 if bound.name not in keep:
                     changed.set(bound, number, window.scaled(number))
@@ -329,35 +323,41 @@ class StageSchedule:
         return result
 
 
+@dataclass
 class _Rewriter(ast.NodeTransformer):
     """Replace numbers and options by numbers, and add the iteration of a moved event to its comparison."""
 
-    def __init__(
-        self,
-        numbers: Mapping[Place, Any],
-        moved: Mapping[Place, int],
-        options: Mapping[tuple[str, str], int],
-        variable: str,
-    ) -> None:
-        self._numbers, self._moved, self._options, self._variable = numbers, moved, options, variable
+    numbers: Mapping[Place, Any]
+    moved: Mapping[Place, int] = field(default_factory=dict)
+    options: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    variable: str = ""
 
     def visit(self, node: ast.AST) -> Any:
         if not isinstance(node, ast.expr):
             return self.generic_visit(node)
         place = _place(node)
-        if place in self._numbers and not isinstance(node, ast.Compare):
-            return ast.copy_location(ast.Constant(self._numbers[place]), node)
-        option = Operand(node, False, ast.Eq, node).option
-        if option is not None and option in self._options and isinstance(getattr(node, "ctx", None), ast.Load):
-            return ast.copy_location(ast.Constant(self._options[option]), node)
+        if place in self.numbers and not isinstance(node, ast.Compare):
+            return ast.copy_location(ast.Constant(self.numbers[place]), node)
+        option = _option(node)
+        if option is not None and option in self.options and isinstance(getattr(node, "ctx", None), ast.Load):
+            return ast.copy_location(ast.Constant(self.options[option]), node)
         made = cast("ast.expr", self.generic_visit(node))
-        if place in self._moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
-            at = self._moved[place]
-            texts = f"{self._variable} < {at}", f"{self._variable} == {at}"
+        if place in self.moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
+            at = self.moved[place]
+            texts = f"{self.variable} < {at}", f"{self.variable} == {at}"
             before, then = (ast.parse(text, mode="eval").body for text in texts)
             either = ast.BoolOp(ast.Or(), [ast.BoolOp(ast.And(), [made, before]), then])
             return ast.copy_location(either, node)
         return made
+
+
+def _option(node: ast.expr) -> tuple[str, str] | None:
+    """Return (variable, attribute) of an option such as `opt.iterations`; the attribute of a variable is empty."""
+    if isinstance(node, ast.Name):
+        return node.id, ""
+    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+        return node.value.id, node.attr
+    return None
 
 
 def _place(node: ast.expr) -> Place:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
-from lapgs_plugin.checkouts.syntax import parsed, parsed_quietly, place
+from lapgs_plugin.checkouts.syntax import executed_on_import, parsed, parsed_quietly, place
 from lapgs_plugin.errors import UserInputError
 
 MODEL_ROLES = ("get_xyz", "training_setup")
@@ -273,7 +273,7 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
     """Yield imports of modules that are not in the checkout."""
     for path in modules.values():
         tree = parsed_quietly(path)
-        needed = {id(node) for node in _always_executed(tree.body)}
+        needed = {id(node) for node in executed_on_import(tree.body, surely=True)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 imports: dict[str, tuple[str, ...]] = {alias.name: () for alias in node.names}
@@ -285,12 +285,3 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
             for each, names in imports.items():
                 if each not in modules and each.partition(".")[0] not in modules:
                     yield External(each, names, where, id(node) not in needed)
-
-
-def _always_executed(body: Iterable[ast.stmt]) -> Iterator[ast.AST]:
-    """Yield statements that importing a module executes, whatever fails."""
-    for node in body:
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Try, ast.With)):  # `with suppress(ImportError)`
-            continue
-        yield node
-        yield from _always_executed(getattr(node, "body", []))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -32,6 +33,16 @@ def parsed_quietly(path: Path) -> ast.Module:
         return parsed(path)
     except UserInputError:
         return ast.Module(body=[], type_ignores=[])
+
+
+def executed_on_import(body: Iterable[ast.AST], *, surely: bool = False) -> Iterator[ast.AST]:
+    """Yield statements that importing a module may execute; with `surely` those that it does, whatever fails."""
+    excused = (ast.Try, ast.With) if surely else ()  # `with suppress(ImportError)`
+    for node in body:
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, *excused)):
+            yield node
+            for part in ("body",) if surely else ("body", "orelse", "finalbody", "handlers"):
+                yield from executed_on_import(getattr(node, part, []), surely=surely)
 
 
 def place(path: Path, root: Path, line: int) -> str:

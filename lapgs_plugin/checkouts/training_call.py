@@ -89,6 +89,14 @@ class TrainingCall:
         return next((self.values[name] for name in CHECKPOINTS if name in self.values), None)
 
     @property
+    def iteration_lists(self) -> dict[str, Sequence[int]]:
+        """Arguments that list iterations, such as those to save after."""
+        given = self.values.items()
+        return {
+            name: value for name, value in given if name.endswith("iterations") and isinstance(value, (list, tuple))
+        }
+
+    @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
 

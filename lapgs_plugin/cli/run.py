@@ -126,7 +126,7 @@ def _execute(
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.runner.driver import HierarchyDriver
-    from lapgs_plugin.runner.installed_rasterizer import explain_import_error
+    from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
     from lapgs_plugin.viewer.preview import save_run_preview
 

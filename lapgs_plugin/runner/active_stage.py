@@ -80,7 +80,7 @@ class ActiveStage:
         """Make the level's images; from now on the checkout renders for this stage."""
         with self.record.overhead.timed("pyramid"):
             self._views.load_images()
-        self._context.wrapper.stage = self._views.rendering
+        self._context.wrapper.rendering = self._views.rendering
 
     @property
     def resets_opacities(self) -> bool:
@@ -124,8 +124,7 @@ class ActiveStage:
             self._train_jointly(gaussians)
         count = len(gaussians._xyz) + self._joint_count
         self.record.count(iteration, count)
-        if self._context.hooks:
-            self._context.hooks.iteration_begins(iteration)
+        self._context.hooks.iteration_begins(iteration)
         if self.record.write_progress(count) and self._diverged_at is None:
             self._note_divergence(gaussians, iteration - 1)
 
@@ -141,8 +140,7 @@ class ActiveStage:
                 f"{self.stage.iterations}; expected some whose opacity grew: give more --iterations, or options of "
                 f"{self._adapter.info.title} that prune less; finished levels ({self._archived_levels()}) are kept"
             )
-        if self._context.hooks:
-            self._context.hooks.densified()
+        self._context.hooks.densified()
 
     def train(self) -> StageResult:
         """Run the checkout's training for this stage and archive the field.
@@ -170,10 +168,10 @@ class ActiveStage:
         self.record.stop(self._views.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
         gaussians, self.gaussians = self.gaussians, None
-        field = self._adapter.export_field(gaussians, signed=self.stage.signed).to("cpu")
+        field = self._exported(gaussians, self.stage.signed)
         self._require_finite(field)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
-        self.record.archive(result, None if self._joint is None else self._joint.export_fields())
+        self.record.archive(result, None if self._joint is None else self._joint.fields(self._exported))
         if self._views.test and (self.stage.level == 0 or self._context.test_every is not None):
             self._evaluate(gaussians)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
@@ -187,7 +185,7 @@ class ActiveStage:
 
     def close(self) -> None:
         """Drop the stage's images, except the predictions for the next stage."""
-        self._context.wrapper.stage = None
+        self._context.wrapper.rendering = None
         self._joint = self.gaussians = None
         self._views.close()
         if self._context.device.type == "cuda":
@@ -240,8 +238,12 @@ class ActiveStage:
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
         """Return the fields that are being optimized, by level."""
-        joint = {} if self._joint is None else self._joint.fields
-        return {**joint, self.stage.level: self._adapter.snapshot(gaussians, signed=self.stage.signed)}
+        joint = {} if self._joint is None else self._joint.fields(self._adapter.snapshot)
+        return {**joint, self.stage.level: self._adapter.snapshot(gaussians, self.stage.signed)}
+
+    def _exported(self, gaussians: Any, signed: bool) -> GaussianField:
+        """Return a model's field for the archive, on the CPU."""
+        return self._adapter.export_field(gaussians, signed).to("cpu")
 
     def _show(self, gaussians: Any, iteration: int) -> None:
         """Show the fields after an iteration to the run's watcher if it wants to look."""

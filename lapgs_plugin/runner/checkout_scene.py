@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runner.object_values import with_values
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class CheckoutScene:
             UserInputError: the Scene initialised no model from points, or has cameras at several resolutions.
         """
         model = _PointRecorder()
-        own = call.changed(dataset=_with_attributes(call.dataset, model_path=str(folder)))
+        own = call.changed(dataset=with_values(call.dataset, {"model_path": str(folder)}))
         scene = adapter.profile.make_scene(own.values, model)
         if not hasattr(model, "points"):
             raise UserInputError(
@@ -61,13 +61,9 @@ class CheckoutScene:
 
     def copy(self, gaussians: Any, model_path: str, train: list[Any], test: list[Any]) -> Any:
         """Return the checkout's Scene with another model, output folder and cameras."""
-        return _with_attributes(
-            self.scene,
-            gaussians=gaussians,
-            model_path=model_path,
-            train_cameras=dict.fromkeys(self.scene.train_cameras, train),
-            test_cameras=dict.fromkeys(self.scene.test_cameras, test),
-        )
+        cameras = {"train_cameras": train, "test_cameras": test}
+        lists = {name: dict.fromkeys(getattr(self.scene, name), views) for name, views in cameras.items()}
+        return with_values(self.scene, {"gaussians": gaussians, "model_path": model_path, **lists})
 
 
 class _PointRecorder:
@@ -75,11 +71,3 @@ class _PointRecorder:
 
     def create_from_pcd(self, points: Any, *others: Any) -> None:
         self.points, self.others = points, others
-
-
-def _with_attributes(value: Any, **changes: Any) -> Any:
-    """Return a shallow copy with other attributes."""
-    changed = copy.copy(value)
-    for name, new in changes.items():
-        setattr(changed, name, new)
-    return changed

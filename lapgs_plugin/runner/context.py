@@ -48,7 +48,7 @@ class RunContext:
         return StageWindow(stage, start, plan.iterations, plan.levels, *factors)
 
     def render(
-        self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, background: Tensor
+        self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, *, black: bool = False
     ) -> Tensor:
         """Return the image (3, h, w) that the checkout's render makes of a view, before exposure or clamping.
 
@@ -57,13 +57,14 @@ class RunContext:
             call: call of the script's `training` for the stage of these Gaussians.
             view: the checkout's camera at that stage's level.
             gaussians: the checkout's model.
-            background: (3,) behind the Gaussians.
+            black: whether the background is black instead of the call's.
         """
-        outer, self.wrapper.stage = self.wrapper.stage, rendering
+        background = torch.full((3,), 0.0 if black else float(call.white_background), device=self.device)
+        outer, self.wrapper.rendering = self.wrapper.rendering, rendering
         try:
             self.adapter.render(call, view, gaussians, background)
         finally:
-            self.wrapper.stage = outer
+            self.wrapper.rendering = outer
         image, rendering.captured = rendering.captured, None
         assert image is not None, "a rendering that captures"
         return image

@@ -28,11 +28,11 @@ from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import StagePlan, level_size
-from lapgs_plugin.rasterizers.signed_color import ColorPath, explain_fallback
+from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.loop_record import LoopRecord
-from lapgs_plugin.runner.raster_settings import fields_of, with_values
+from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
@@ -40,9 +40,6 @@ logger = logging.getLogger(__name__)
 
 MOST_POINTS = 20_000
 """About how many of the scene's points the dry run starts from."""
-
-SAME_COLOR = 1e-3
-"""Largest difference of two images of one field: rounding gives 1e-6, a wrong colour map about 1."""
 
 SAME_VALUE = 1e-3
 """Largest relative difference of a scale or opacity from the archived one: logits and logarithms round to 1e-6."""
@@ -98,9 +95,8 @@ class DryRun:
             if self._stage.signed:
                 rendering.accumulated = _Nothing(sizes, self._context.device)
                 rendering.composed = frozenset(self._cameras)
-            stage = _DryStage(
-                self._context, self._scratch_call(folder), self._scene, self._view, rendering, self._window
-            )
+            call = self._scratch_call(folder)
+            stage = _DryStage(call, rendering, self._window, lambda gaussians: self._scene_for(call, gaussians))
             self._iterate(stage, works)
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
@@ -138,7 +134,7 @@ class DryRun:
             if stage.iteration == 0 and steps_positions(optimizer, stage.gaussians):
                 raise _Enough  # the loop would run to its end
 
-        self._context.wrapper.stage = stage.rendering
+        self._context.wrapper.rendering = stage.rendering
         self._activate(stage)
         watching = register_optimizer_step_post_hook(stepped)
         try:
@@ -148,7 +144,7 @@ class DryRun:
             pass
         finally:
             watching.remove()
-            self._context.wrapper.stage = None
+            self._context.wrapper.rendering = None
             self._activate(None)
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)
         if stage.iteration == 0:
@@ -170,10 +166,13 @@ class DryRun:
             values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
             values["dataset"].model_path = str(folder)
             call = self._call.changed(**values)
-        lists: dict[str, Any] = {
-            name: [] for name, v in call.values.items() if name.endswith("iterations") and isinstance(v, (list, tuple))
-        }
-        return call.changed(**lists)
+        return call.changed(**{name: [] for name in call.iteration_lists})
+
+    def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
+        """Return the checkout's scene with views of the tried stage, and make Gaussians of some of its points."""
+        train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
+        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+        return self._scene.copy(gaussians, call.dataset.model_path, train, test)
 
     def _view(self, camera: Any) -> Any:
         """Return a camera at the level of the tried stage."""
@@ -190,8 +189,7 @@ class DryRun:
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
-        background = torch.zeros(3, device=self._context.device)
-        image = self._context.render(rendering, self._call, view, gaussians, background)
+        image = self._context.render(rendering, self._call, view, gaussians, black=True)
         self._inputs = rendering.inputs
         return image
 
@@ -257,7 +255,7 @@ class DryRun:
         finally:
             gaussians._features_dc, gaussians._features_rest = kept
         same = all(
-            bool(((a - b).abs() <= SAME_COLOR * (1 + b.abs().max())).all())
+            bool(((a - b).abs() <= PROBE_TOLERANCE * (1 + b.abs().max())).all())
             for a, b in zip(found, expected, strict=True)
         )
         return ColorPath.NATIVE if same else ColorPath.PRECOMPUTED
@@ -301,23 +299,19 @@ class _DryStage:
 
     def __init__(
         self,
-        context: RunContext,
         call: TrainingCall,
-        scene: CheckoutScene,
-        view: Callable[[Any], Any],
         rendering: StageRendering,
         window: StageWindow | None,
+        make_scene: Callable[[Any], Any],
     ) -> None:
-        self._context, self.call, self._scene, self._view = context, call, scene, view
-        self.rendering, self.window, self.keeps_schedule = rendering, window, window is None
-        self.record, self.iteration = LoopRecord(context.device), 0
+        self.call, self.rendering, self.window, self._make_scene = call, rendering, window, make_scene
+        self.keeps_schedule, self.iteration = window is None, 0
+        self.record = LoopRecord(torch.device("cpu"))  # what it measures is dropped
         self.gaussians: Any = None
 
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
-        train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
-        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
-        return self._scene.copy(gaussians, self.call.dataset.model_path, train, test)
+        return self._make_scene(gaussians)
 
     def optimizers_made(self, gaussians: Any) -> None:
         """Do nothing: there is nothing to inherit."""

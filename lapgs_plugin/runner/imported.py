@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from typing_extensions import NotRequired
@@ -33,9 +34,10 @@ from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
+from lapgs_plugin.runner.manifest import scene_reference
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import exists
-from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText, SceneReference
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText
 from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.scenes import smallest_size
 from lapgs_plugin.untrusted import StrictWithMore, checked, read_json, read_text
@@ -98,6 +100,7 @@ class ForeignRun:
         levels: fields, coarsest first, without gaps.
         codebase: name of the backbone, None if the folder does not tell.
         record: measurements by `lapgs run --off --record`, empty without it.
+        is_hierarchy: whether the paper authors' release wrote it.
     """
 
     folder: Path
@@ -105,11 +108,7 @@ class ForeignRun:
     levels: tuple[ForeignLevel, ...]
     codebase: str | None
     record: Mapping[str, Any]
-
-    @property
-    def is_hierarchy(self) -> bool:
-        """Whether the paper authors' release wrote it."""
-        return (self.folder / f"L{self.levels[0].level}").is_dir()
+    is_hierarchy: bool
 
     @property
     def times_are_known(self) -> bool:
@@ -146,11 +145,12 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
             f"{folder} holds {found}, expected point_cloud/, or L<n>/point_cloud/ of the coarsest level and of those "
             "below it without gaps; give the folder that training wrote with -m"
         )
+    is_hierarchy = trained[expected[0]] != folder
     breakdown: dict[str, Any] = {}
     if exists(folder / BREAKDOWN):
         advice = f"{COPY} or remove it"
         breakdown = read_json(folder / BREAKDOWN, BreakdownFile, error=RunFolderError, advice=advice, finite=False)
-    if trained[expected[0]] != folder and options.get("white_background"):
+    if is_hierarchy and options.get("white_background"):
         raise RunFolderError(
             f"{folder} was trained with --white_background, which the release adds again with every residual; "
             "expected a hierarchy over black"
@@ -158,9 +158,8 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
     if breakdown.get("config", {}).get("blur_up") is False:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
-    is_single = levels[0].ply.is_relative_to(folder / "point_cloud")
-    record = read_bare_record(folder / BARE_RECORD) if is_single and exists(folder / BARE_RECORD) else {}
-    return ForeignRun(folder, options, levels, _recognised(options, breakdown), record)
+    record = {} if is_hierarchy or not exists(folder / BARE_RECORD) else read_bare_record(folder / BARE_RECORD)
+    return ForeignRun(folder, options, levels, _recognised(options, breakdown), record, is_hierarchy)
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:
@@ -236,19 +235,19 @@ def import_run(
         for level in run.levels:
             field = fields[level.level]
             # The release's peak includes earlier stages: an unchanged one was theirs.
-            own_peak = level.peak if level.peak is not None and level.peak > peak else len(field)
+            own_peak = level.peak or 0
             record = LevelRecord(
                 level=level.level,
                 signed=field.signed,
                 iterations=level.iterations,
                 num_gaussians=len(field),
-                peak_gaussians=max(own_peak, len(field)),
+                peak_gaussians=max(len(field), own_peak if own_peak > peak else 0),
                 train_seconds=max(0.0, (level.seconds or seconds) - seconds),
                 overhead_seconds={},
                 image_size=level_size(size, level.level),
             )
             archive.finish_level(_as_recorded(record, run.record), field)
-            seconds, peak = level.seconds or seconds, max(peak, level.peak or 0)
+            seconds, peak = level.seconds or seconds, max(peak, own_peak)
         for entry in run.record.get("timeline", ()):
             archive.append_history({"level": 0, **entry})
     return archive
@@ -315,16 +314,8 @@ def _manifest(run: ForeignRun, backbone: BackboneInfo, scene: Path | None, setti
     if not path.is_dir():
         hint = "say where it is now with -s" if scene is None else "give the scene's folder with -s"
         raise RunFolderError(f"the scene {path} of {run.folder} is not there; {hint}")
-    white = bool(options.get("white_background"))
     return Manifest(
-        scene=SceneReference(
-            path=str(path),
-            resolution=f"3dgs:{options['resolution']}",
-            eval=bool(options["eval"]),
-            background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
-            kind="colmap" if (path / "sparse").is_dir() else "transforms",
-            images=options.get("images") or "images",
-        ),
+        scene=scene_reference(path, SimpleNamespace(**options)),
         levels=run.levels[0].level + 1,
         grid=MIXED_GRID if run.is_hierarchy else "camera",
         supervision="reconstructed",

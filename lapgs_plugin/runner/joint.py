@@ -7,7 +7,7 @@ launches of a render of its own to an iteration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,14 +35,12 @@ class _JointField:
         of: the stage that it comes from.
         gaussians: the checkout's model of it.
         rendering: tells the rasterizer's wrapper to render it alone.
-        background: (3,) behind it.
         views: level views by key, made when they are first rendered.
     """
 
     of: FinishedStage
     gaussians: Any
     rendering: StageRendering
-    background: Tensor
     views: dict[str, Any] = field(default_factory=dict)
 
 
@@ -68,8 +66,7 @@ class JointLevels:
         rendering = StageRendering(
             signed=finished.stage.signed, path=self._run.color_path, views=self._views.cameras, capture=True
         )
-        background = torch.full((3,), float(call.white_background), device=device)
-        return _JointField(finished, gaussians, rendering, background)
+        return _JointField(finished, gaussians, rendering)
 
     def follow(self, gaussians: Any, residual_color_rate: float) -> None:
         """Step the finished fields whenever an optimizer of the running stage steps, at its learning rates.
@@ -110,18 +107,11 @@ class JointLevels:
             stage, camera = one.of.stage, self._views.cameras[key]
             size = self._views.size(key, stage.level)
             one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
-        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians, one.background)
+        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians)
 
-    @property
-    def fields(self) -> dict[int, GaussianField]:
-        """Copies of the fields by level, on the device."""
-        adapter = self._context.adapter
-        return {one.of.stage.level: adapter.snapshot(one.gaussians, one.of.stage.signed) for one in self._fields}
-
-    def export_fields(self) -> dict[int, GaussianField]:
-        """Return the fields for the archive by level, on the CPU; see `BackboneAdapter.export_field`."""
-        export, stages = self._context.adapter.export_field, [(one, one.of.stage) for one in self._fields]
-        return {stage.level: export(one.gaussians, stage.signed).to("cpu") for one, stage in stages}
+    def fields(self, read: Callable[[Any, bool], GaussianField]) -> dict[int, GaussianField]:
+        """Return the fields by level; `read` makes one from the checkout's model and whether it is a residual."""
+        return {one.of.stage.level: read(one.gaussians, one.of.stage.signed) for one in self._fields}
 
 
 class _Follow:

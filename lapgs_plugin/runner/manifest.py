@@ -17,19 +17,30 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks
 
 
+def scene_reference(path: Path, dataset: Any, masks: str = "none") -> SceneReference:
+    """Return the scene of a run of a 3DGS code base.
+
+    Args:
+        path: of the scene.
+        dataset: the code base's options of its model.
+        masks: as of `SceneReference`.
+    """
+    return SceneReference(
+        path=str(path.absolute()),
+        resolution=f"3dgs:{dataset.resolution}",
+        eval=bool(dataset.eval),
+        background=(1.0, 1.0, 1.0) if getattr(dataset, "white_background", False) else (0.0, 0.0, 0.0),
+        kind="colmap" if (path / "sparse").is_dir() else "transforms",
+        images=getattr(dataset, "images", None) or "images",
+        masks=masks,
+    )
+
+
 def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan) -> Manifest:
     """Return the manifest of a run before its first stage; `call` is the script's, for the whole run."""
-    dataset = call.dataset
+    dataset, path = call.dataset, Path(call.dataset.source_path)
     return Manifest(
-        scene=SceneReference(
-            path=str(Path(dataset.source_path).absolute()),
-            resolution=f"3dgs:{dataset.resolution}",
-            eval=bool(dataset.eval),
-            background=(1.0, 1.0, 1.0) if call.white_background else (0.0, 0.0, 0.0),
-            kind="colmap" if (Path(dataset.source_path) / "sparse").exists() else "transforms",
-            images=dataset.images or "images",
-            masks=resolve_masks(Path(dataset.source_path), settings.masks),
-        ),
+        scene=scene_reference(path, dataset, resolve_masks(path, settings.masks)),
         levels=plan.levels,
         grid=settings.grid,
         supervision=settings.supervision,

@@ -26,14 +26,14 @@ class RasterizerWrapper:
     """Make the replacements of a checkout's renderers, and of its rasterizers' settings, classes and functions.
 
     Attributes:
-        stage: the running stage; None leaves every call unchanged.
+        rendering: how the running stage is rendered; None leaves every call unchanged.
         noted: key of the view that is being rendered; None outside of the renderers, and for other cameras.
         given: values of each Gaussian (n, k) that the renderer was called with, such as colours to render instead.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
     """
 
     def __init__(self) -> None:
-        self.stage: StageRendering | None = None
+        self.rendering: StageRendering | None = None
         self.noted: str | None = None
         self.given: tuple[Tensor, ...] = ()
         self.mark: Callable[[str], None] = lambda part: None
@@ -60,12 +60,12 @@ class RasterizerWrapper:
         def make_settings(*args: Any, **kwargs: Any) -> Any:
             self.mark("forward")
             settings = original(*args, **kwargs)
-            stage = self.stage
-            if stage is None:
+            rendering = self.rendering
+            if rendering is None:
                 return settings
-            if self.noted is not None and self.noted in stage.views:
-                stage.prefetch(self.noted)
-            return signed_settings(settings, stage.path, self._zero_background) if stage.signed else settings
+            if self.noted is not None and self.noted in rendering.views:
+                rendering.prefetch(self.noted)
+            return signed_settings(settings, rendering.path, self._zero_background) if rendering.signed else settings
 
         return make_settings
 
@@ -81,49 +81,43 @@ class RasterizerWrapper:
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = original(*args, **kwargs)
-            stage, noted, given = self.stage, self.noted, self.given
-            if stage is None:
+            if self.rendering is None:
                 return made
-            settings = next(iter((*args, *kwargs.values())), None)
-            return WrappedRasterizer(
-                made, lambda call, inputs: self._render(stage, call, inputs, settings, noted, given)
-            )
+            return WrappedRasterizer(made, self._call_now(next(iter((*args, *kwargs.values())), None)))
 
         return make_rasterizer
 
     def _function(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def rasterize(*args: Any, **kwargs: Any) -> Any:
-            if self.stage is None:
+            if self.rendering is None:
                 return original(*args, **kwargs)
             inputs = named_inputs(original, args, kwargs)
             settings = next((value for name, value in inputs.items() if "setting" in name), None)
-            return self._render(self.stage, original, inputs, settings, self.noted, self.given)
+            return self._call_now(settings)(original, inputs)
 
         return rasterize
 
-    def _render(
-        self,
-        stage: StageRendering,
-        rasterizer: Callable[..., Any],
-        inputs: dict[str, Any],
-        settings: Any,
-        noted: str | None,
-        given: tuple[Tensor, ...],
-    ) -> Any:
-        """Return what a rasterizer returns, with the image of the running stage if it renders the model's colours."""
-        colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
-        if any(color is each for color in colors for each in given):
-            return stage.render_other(self._marking(rasterizer), inputs, settings)
-        return stage.render(self._marking(rasterizer), inputs, settings, noted)
+    def _call_now(self, settings: Any) -> Callable[[Callable[..., Any], dict[str, Any]], Any]:
+        """Return a function of a rasterizer and its inputs that calls it for the present stage and view.
 
-    def _marking(self, rasterizer: Callable[..., Any]) -> Callable[..., Any]:
-        def rasterize(**inputs: Any) -> Any:
-            outputs = rasterizer(**inputs)
-            self.mark("loss")
-            return outputs
+        The image is that of the stage if the rasterizer renders the model's colours.
+        """
+        rendering, noted, given = self.rendering, self.noted, self.given
+        assert rendering is not None, "calls outside of stages are left as they are"
 
-        return rasterize
+        def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
+            def marked(**inputs: Any) -> Any:
+                outputs = rasterizer(**inputs)
+                self.mark("loss")
+                return outputs
+
+            colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
+            if any(color is each for color in colors for each in given):
+                return rendering.render_other(marked, inputs, settings)
+            return rendering.render(marked, inputs, settings, noted)
+
+        return call
 
     def _zero_background(self, like: Tensor) -> Tensor:
         """Return (3,) zeros on the device of a background, the same ones in every call."""

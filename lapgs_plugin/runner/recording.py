@@ -147,7 +147,7 @@ class BareRunRecorder:
         """Return means of PSNR in dB and SSIM over the held-out views, empty without any."""
         background = torch.full((3,), float(call.white_background), device=self._device)
         wrapper = RasterizerWrapper()
-        wrapper.stage = rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
+        wrapper.rendering = rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
 
         def rendered(camera: Any) -> tuple[Tensor, Tensor]:
             """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""

@@ -13,7 +13,7 @@ from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
-from lapgs_plugin.runner.installed_rasterizer import require_matching_rasterizer
+from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.step_clock import timing_replacements
 
 SIZE_LIMIT = "max_screen_size"

@@ -11,7 +11,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
-from lapgs_plugin.runner.raster_settings import fields_of, with_values
+from lapgs_plugin.runner.object_values import fields_of, with_values
 
 BACKGROUNDS, DEGREES = ("bg", "bg_color", "background"), ("sh_degree", "active_sh_degree")
 """Names that rasterizers give to these settings."""

@@ -14,8 +14,8 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.object_values import fields_of, matrix_keys, size_of
 from lapgs_plugin.runner.raster_outputs import RasterOutputs
-from lapgs_plugin.runner.raster_settings import matrix_keys, size_of, view_matrices
 from lapgs_plugin.runner.signed_calls import with_signed_colors
 from lapgs_plugin.runs.level_images import LevelImages
 
@@ -95,8 +95,8 @@ class StageRendering:
                 for whole in (camera.world_view_transform, getattr(camera, "full_proj_transform", None)):
                     for matrix in () if whole is None else matrix_keys(whole):
                         self._by_matrix.setdefault(matrix, set()).add(key)
-        keys = (self._by_matrix.get(m) for value in view_matrices(settings) for m in matrix_keys(value))
-        found = [each for each in keys if each]
+        values = [each for each in fields_of(settings).values() if isinstance(each, Tensor) and each.shape == (4, 4)]
+        found = [keys for value in values for matrix in matrix_keys(value) if (keys := self._by_matrix.get(matrix))]
         return set.intersection(*found) if found else set()
 
     def prefetch(self, key: str) -> None:

@@ -90,7 +90,7 @@ class StageViews:
         keys = {id(view): key for key, view in self._views.items()}
 
         def prefetch(view: Any) -> None:
-            rendering = self._context.wrapper.stage  # of the running stage: views may outlive this one
+            rendering = self._context.wrapper.rendering  # of the running stage: views may outlive this one
             if rendering is not None:
                 rendering.prefetch(keys[id(view)])
 
@@ -123,8 +123,7 @@ class StageViews:
 
     def render_alone(self, rendering: StageRendering, gaussians: Any, key: str) -> Tensor:
         """Return the image (3, h, w) of a view over black; `rendering` replaces the stage's meanwhile."""
-        background = torch.zeros(3, device=self._device)
-        return self._context.render(rendering, self._call, self._view(key), gaussians, background)
+        return self._context.render(rendering, self._call, self._view(key), gaussians, black=True)
 
     def take_over(self, before: StageViews) -> None:
         """Bring the views of another stage to this one's level: the checkout's training holds the objects."""
@@ -173,8 +172,7 @@ class StageViews:
     def _composed(self, gaussians: Any, key: str) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
         rendering = replace(self.rendering, composed=frozenset(self.cameras), capture=True)
-        background = torch.full((3,), float(self._call.white_background), device=self._device)
-        return self._context.render(rendering, self._call, self._view(key), gaussians, background)
+        return self._context.render(rendering, self._call, self._view(key), gaussians)
 
     def _full_size(self, gaussians: Any, key: str) -> Tensor:
         """Return a view (3, h, w) at full resolution, with finer residuals of zero."""

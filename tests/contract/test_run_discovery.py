@@ -17,7 +17,7 @@ from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.runner.installed_rasterizer import explain_import_error
+from lapgs_plugin.runner.installed_packages import explain_import_error
 from tests.contract.stub_runs import CHECKOUTS, STUBS, loaded, stand_in_is_refused
 
 MODULE = "diff_gaussian_rasterization"

@@ -313,14 +313,14 @@ def test_a_disk_that_is_full_when_a_stage_ends_leaves_what_was_finished(
 def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = two_finished(odd, tmp_path / "run")
     before = plys(RunArchive.open(folder))
-    original = JointLevels.export_fields
+    original = JointLevels.fields
 
-    def poisoned(levels: JointLevels) -> Any:
-        fields = original(levels)
+    def poisoned(levels: JointLevels, read: Any) -> Any:
+        fields = original(levels, read)
         fields[1].means[0, 0] = torch.nan
         return fields
 
-    monkeypatch.setattr(JointLevels, "export_fields", poisoned)
+    monkeypatch.setattr(JointLevels, "fields", poisoned)
     with captured(folder, []), pytest.raises(FieldError, match="level 1: x is NaN or inf for 1 of"):
         three_levels(odd, folder)
     assert plys(RunArchive.open(folder)) == before

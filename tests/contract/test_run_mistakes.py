@@ -24,7 +24,7 @@ from lapgs_plugin.cli import app
 from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
-from lapgs_plugin.runner.installed_rasterizer import explain_import_error
+from lapgs_plugin.runner.installed_packages import explain_import_error
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE

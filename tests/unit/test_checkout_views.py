@@ -92,7 +92,9 @@ def residual(camera: Camera, key: str, below: Tensor) -> tuple[RasterizerWrapper
     """Return a wrapper of a residual's stage with its replacements of `Settings` and `rasterize`."""
     wrapper = RasterizerWrapper()
     store = SimpleNamespace(get=lambda _: below, prefetch=lambda _: None)
-    wrapper.stage = StageRendering(True, ColorPath.NATIVE, {key: camera}, accumulated=store, composed=frozenset({key}))
+    wrapper.rendering = StageRendering(
+        True, ColorPath.NATIVE, {key: camera}, accumulated=store, composed=frozenset({key})
+    )
     return wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
 
 
@@ -107,9 +109,9 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
     """As an image of features, masks or scores, that a loop compares with something else than the photo."""
     camera, images = made()
     wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    assert wrapper.stage is not None
-    wrapper.stage.signed = signed
-    wrapper.stage.on_image = lambda key, image, below: image + 1
+    assert wrapper.rendering is not None
+    wrapper.rendering.signed = signed
+    wrapper.rendering.on_image = lambda key, image, below: image + 1
     function = wrapper._function(colored)
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
     means, own = torch.zeros(2, 3, requires_grad=True), torch.full((2, 3), 0.125)
@@ -161,8 +163,8 @@ def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo(
     """Joint training renders it at each reading."""
     camera, images = made()
     wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    below, read = wrapper.stage.accumulated, []  # type: ignore[union-attr]  # just set
-    wrapper.stage.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))  # type: ignore[union-attr,assignment]
+    below, read = wrapper.rendering.accumulated, []  # type: ignore[union-attr]  # just set
+    wrapper.rendering.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))  # type: ignore[union-attr,assignment]
     place = camera.world_view_transform
     assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), place))[1].unique().tolist() == [0.75]
     assert read == [images.key(camera)]

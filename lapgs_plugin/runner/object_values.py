@@ -1,4 +1,4 @@
-"""Read and change the settings of a checkout's rasterizer, whatever kind of object holds them."""
+"""Read and change values of a checkout's objects, such as settings and scenes, whatever their kind."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 
 def fields_of(settings: Any) -> dict[str, Any]:
@@ -29,11 +28,6 @@ def with_values(settings: Any, changes: Mapping[str, Any]) -> Any:
     for name, value in changes.items():
         setattr(changed, name, value)
     return changed
-
-
-def view_matrices(settings: Any) -> list[Tensor]:
-    """Return the (4, 4) matrices among settings."""
-    return [value for value in fields_of(settings).values() if isinstance(value, Tensor) and value.shape == (4, 4)]
 
 
 def matrix_keys(matrix: Any) -> tuple[bytes, bytes]:

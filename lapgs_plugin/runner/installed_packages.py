@@ -1,4 +1,4 @@
-"""Check that the installed rasterizer is the one that a checkout was written for: several share one module name."""
+"""Check the packages that a checkout needs: its rasterizer, whose module name several share, and what is missing."""
 
 from __future__ import annotations
 
@@ -58,15 +58,17 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
     """
     package = _package(error.name or "")
     purpose = next((why for name, why in known_extensions().items() if _package(name) == package), None)
-    source = _source(script)
-    imports = () if source is None else source.externals
+    try:
+        source = CheckoutSource.read(script)
+        imports, rasterizers = source.externals, source.rasterizer_modules
+    except (UserInputError, OSError):
+        imports, rasterizers = (), ()
     where = next((one.where for one in imports if _package(one.name) == package), None)
     if not package or (purpose is None and where is None):
         return None
     named = f", the {purpose}" if purpose else ""
     problem = f"{where or script} needs {package}{named}, which cannot be imported ({first_line(error)})"
-    rasterizers = () if source is None else map(_package, source.rasterizer_modules)
-    if purpose is None and package not in rasterizers:
+    if purpose is None and package not in map(_package, rasterizers):
         return MissingExtraError(f"{problem}: pip install {DISTRIBUTIONS.get(package, package)}")
     if on_cpu:
         return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA")
@@ -74,13 +76,6 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
         f"{problem}; install it as the checkout's README says, or run on CPU stand-ins with `lapgs run --device cpu`, "
         "if `lapgs doctor CHECKOUT` finds one"
     )
-
-
-def _source(script: Path) -> CheckoutSource | None:
-    try:
-        return CheckoutSource.read(script)
-    except (UserInputError, OSError):
-        return None
 
 
 def _package(module: str) -> str:
