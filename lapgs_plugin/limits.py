@@ -73,6 +73,8 @@ FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
 
 LONGEST_NAME = 255
 """Longest file name in bytes on common file systems."""
+LONGEST_STEM = 230
+"""Longest name in bytes that leaves room for suffixes, such as those of attempts, logs and temporary files."""
 
 
 def usable_processors() -> int:

@@ -27,6 +27,7 @@ from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.limits import LONGEST_STEM
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution
@@ -36,8 +37,6 @@ READS_SCENES = ("OpenImageIO", "pycolmap")
 """Packages without which no scene can be read."""
 ANY_SIZE = (1 << 20, 1 << 20)
 """Size to check when that of the images is unknown: no image is larger."""
-LONGEST_RUN = 230
-"""Characters of a run's name, with room for the suffixes of attempts and logs in a file name of 255."""
 OWN_ARGUMENTS = ("-m", "--model_path", "-s", "--source_path")
 """Options of a checkout's script that the experiment sets itself: output folder and scene."""
 
@@ -172,9 +171,9 @@ def _check_name(spec: RunSpec) -> None:
     Raises:
         UserInputError: the names of its scene and its backbone are too long together.
     """
-    if len(spec.run_id) > LONGEST_RUN:
+    if len(spec.run_id) > LONGEST_STEM:
         raise UserInputError(
-            f"a run called {spec.run_id:.60}... has {len(spec.run_id)} characters, expected at most {LONGEST_RUN}; "
+            f"a run called {spec.run_id:.60}... has {len(spec.run_id)} characters, expected at most {LONGEST_STEM}; "
             "choose shorter names for the scene and the backbone"
         )
 

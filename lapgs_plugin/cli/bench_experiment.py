@@ -20,10 +20,10 @@ from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, T
 from lapgs_plugin.experiments import exports
 from lapgs_plugin.experiments.aggregate import baseline_of, check_table, make_table
 from lapgs_plugin.experiments.commands import Locations
+from lapgs_plugin.experiments.execution import LOGS, STORE, execute, make_samples, prepare
 from lapgs_plugin.experiments.expansion import PlannedRun, plan_runs, scenes_of
 from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
 from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.runner import LOGS, STORE, execute, make_samples, prepare
 from lapgs_plugin.experiments.schema import Experiment, load_experiment
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
 from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore

@@ -13,14 +13,13 @@ import typer
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import is_folder, write_text
+from lapgs_plugin.limits import LONGEST_STEM
 
 if TYPE_CHECKING:
     import torch
 
     from lapgs_plugin.evaluation.bench_raster import BenchCase, CaseResult
 
-LONGEST_NAME = 230
-"""Bytes of a file name, with room left for the suffix of a temporary file."""
 DTYPES = ("float32", "float64")
 
 
@@ -56,7 +55,7 @@ def raster(
         not is_folder(json_file.parent)
         or not os.access(json_file.parent, os.W_OK)
         or is_folder(json_file)
-        or len(os.fsencode(json_file.name)) > LONGEST_NAME
+        or len(os.fsencode(json_file.name)) > LONGEST_STEM
     ):
         raise UserInputError(f"--json {json_file}: expected a file in a folder that exists and may be written")
 

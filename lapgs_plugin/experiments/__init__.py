@@ -6,7 +6,7 @@
     mistakes.py     collects all mistakes of an experiment; cli/bench_check.py finds them by rehearsing every run
     commands.py     a run -> the commands that train and evaluate it
     store.py        claims and results of runs: SQLite, safe against dying and competing workers
-    runner.py       prepares the runs, and follows them until they have ended
+    execution.py    prepares the runs, and follows them until they have ended
     worker.py       takes runs from the store until none is left; leash.py ends a run whose worker died
     launchers.py    workers on this machine, on Slurm, on Ray
     rows.py         a run's folder -> one flat row

@@ -15,8 +15,8 @@ from markdown_it import MarkdownIt
 
 from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
+from lapgs_plugin.experiments.execution import RUNS
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
-from lapgs_plugin.experiments.runner import RUNS
 from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer

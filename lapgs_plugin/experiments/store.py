@@ -18,7 +18,7 @@ import sys
 import time
 import uuid
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -273,11 +273,12 @@ class ResultStore:
 @contextmanager
 def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a transaction that locks out other processes."""
-    connection = sqlite3.connect(path, timeout=LOCK_TIMEOUT, isolation_level=None)
     try:
-        connection.execute("BEGIN IMMEDIATE")
-        yield connection
-        connection.execute("COMMIT")
+        # Closing rolls back what was not committed.
+        with closing(sqlite3.connect(path, timeout=LOCK_TIMEOUT, isolation_level=None)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection
+            connection.execute("COMMIT")
     except sqlite3.OperationalError as error:
         raise RunFolderError(
             f"{path} cannot be read or written ({error}); expected a store of results on a disk with room and file "
@@ -285,8 +286,6 @@ def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
         ) from error
     except sqlite3.DatabaseError as error:
         raise RunFolderError(f"{path} is no store of results ({error}); choose another folder") from error
-    finally:
-        connection.close()  # rolls back what was not committed
 
 
 def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[tuple[str, str, int]]:

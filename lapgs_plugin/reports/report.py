@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         baseline_name=baseline.name if baseline else None,
         differences=setup_differences(run.archive.manifest, baseline.archive.manifest) if baseline else [],
         rows=comparison_rows([each.metrics for each in runs]),
-        charts=training_charts(runs, kinds, marked=run),
+        charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
@@ -122,86 +122,74 @@ def render_page(template: str, **values: Any) -> str:
 
 # Charts of training.
 
+History = list[dict[str, Any]]
+
 
 def training_charts(
-    runs: Sequence[MeasuredRun], kinds: Sequence[str], marked: MeasuredRun | None = None
+    runs: Sequence[MeasuredRun], kinds: Sequence[str], *, marked: bool = False
 ) -> dict[str, list[Chart]]:
     """Draw loss, held-out PSNR and number of Gaussians over time and over iterations, as far as they were recorded.
 
     Args:
         runs: the runs to draw, the first on top.
         kinds: line style of each run.
-        marked: the run whose stages are marked; None marks nothing.
+        marked: mark the stages of the first run.
     """
     longest = max(run.metrics["train_seconds"] for run in runs)
     unit, scale = ("minutes", 60.0) if longest >= MINUTES_FROM else ("seconds", 1.0)
-
-    def elapsed(run: MeasuredRun, entry: dict[str, Any]) -> float:
-        return _elapsed(run, entry) / scale
-
-    start = START_SHARE * longest / scale
+    histories = [_history(run, scale) for run in runs]
+    lines = list(zip(kinds, histories, strict=True))[::-1]  # draws the first on top
     return {
-        "time": _chart_row(runs, kinds, marked, f"{unit} of optimization", elapsed, start),
-        "iterations": _chart_row(runs, kinds, marked, "iterations, all stages", _iteration, None),
+        x: _chart_row(lines, x, label, start, _stage_marks(histories[0], x) if marked else [])
+        for x, label, start in (
+            ("time", f"{unit} of optimization", START_SHARE * longest / scale),
+            ("iterations", "iterations, all stages", None),
+        )
     }
 
 
-def _elapsed(run: MeasuredRun, entry: dict[str, Any]) -> float:
-    """Return the seconds of optimization since the start of the run; entries made after a stage have its end."""
-    if "elapsed" in entry:
-        return float(entry["elapsed"])
-    return sum(record.train_seconds for record in run.archive.manifest.records if record.level >= entry["level"])
+def _history(run: MeasuredRun, scale: float) -> History:
+    """Return a run's history with "time", in units of `scale` seconds, and "iterations" since the run's start.
 
-
-def _iteration(run: MeasuredRun, entry: dict[str, Any]) -> float:
-    """Return the iterations since the start of the run; the history counts within a stage."""
-    before = sum(record.iterations for record in run.archive.manifest.records if record.level > entry["level"])
-    return float(before + entry["iteration"])
-
-
-Position = Callable[[MeasuredRun, dict[str, Any]], float]
+    Entries that were made after a stage have the time of its end. The file counts iterations within a stage.
+    """
+    records, history = run.archive.manifest.records, []
+    for entry in run.archive.history():
+        level = entry["level"]
+        ended = sum(record.train_seconds for record in records if record.level >= level)
+        before = sum(record.iterations for record in records if record.level > level)
+        time = float(entry.get("elapsed", ended)) / scale
+        history.append({**entry, "time": time, "iterations": float(before + entry["iteration"])})
+    return history
 
 
 def _chart_row(
-    runs: Sequence[MeasuredRun],
-    kinds: Sequence[str],
-    marked: MeasuredRun | None,
-    x_label: str,
-    x_of: Position,
-    start: float | None,
+    lines: Sequence[tuple[str, History]], x: str, x_label: str, start: float | None, marks: Sequence[Mark]
 ) -> list[Chart]:
-    marks = [] if marked is None else _stage_marks(marked, x_of)
     charts = []
     for key, title in (("loss", "Loss"), ("psnr", "Held-out PSNR (dB)"), ("num_gaussians", "Gaussians in training")):
         by_stage = key != "psnr"  # which is of the composed image, so that stages continue each other
-        series = [
-            Series(kind, points)
-            for run, kind in reversed(list(zip(runs, kinds, strict=True)))  # draws the first on top
-            for points in _lines(run, key, by_stage, x_of)
-        ]
+        series = []
+        for kind, history in lines:
+            points: dict[int, list[tuple[float, float]]] = {}
+            for entry in history:
+                if key in entry:
+                    points.setdefault(entry["level"] if by_stage else 0, []).append((entry[x], entry[key]))
+            series += [Series(kind, each) for each in points.values()]
         if series:
             inset = None if by_stage else start
             charts.append(draw_lines(title, x_label, series, marks=marks, from_zero=by_stage, inset_until=inset))
     return charts
 
 
-def _lines(run: MeasuredRun, key: str, by_stage: bool, x_of: Position) -> list[list[tuple[float, float]]]:
-    """Return the recorded values of `key`: one line, or one for each stage when stages do not continue each other."""
-    lines: dict[int, list[tuple[float, float]]] = {}
-    for entry in run.archive.history():
-        if key in entry:
-            lines.setdefault(entry["level"] if by_stage else 0, []).append((x_of(run, entry), entry[key]))
-    return list(lines.values())
-
-
-def _stage_marks(run: MeasuredRun, x_of: Position) -> list[Mark]:
+def _stage_marks(history: History, x: str) -> list[Mark]:
     """Mark the start of each stage of a hierarchy; nothing for a single field."""
     begins: dict[int, float] = {}
     end = 0.0
-    for entry in run.archive.history():
+    for entry in history:
         begins.setdefault(entry["level"], end)
-        end = x_of(run, entry)
-    return [Mark(x, f"level {level}") for level, x in begins.items()] if len(begins) > 1 else []
+        end = entry[x]
+    return [Mark(begin, f"level {level}") for level, begin in begins.items()] if len(begins) > 1 else []
 
 
 # Time and number of Gaussians.

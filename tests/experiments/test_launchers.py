@@ -14,8 +14,8 @@ import pytest
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import launchers, worker
+from lapgs_plugin.experiments.execution import execute
 from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
-from lapgs_plugin.experiments.runner import execute
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
 from lapgs_plugin.experiments.worker import Slot, gpu_name

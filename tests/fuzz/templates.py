@@ -28,10 +28,10 @@ from plyfile import PlyData
 
 from lapgs_plugin import __version__
 from lapgs_plugin.experiments.commands import Locations
+from lapgs_plugin.experiments.execution import STORE, prepare
 from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.rows import result_row
-from lapgs_plugin.experiments.runner import STORE, prepare
 from lapgs_plugin.experiments.schema import load_experiment
 from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import ResultStore
