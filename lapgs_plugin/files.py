@@ -147,7 +147,7 @@ class FolderLock:
         with one_line_errors(path, training=True):
             stream = path.open("a+b")
             try:
-                if not _lock_file(stream):
+                if try_lock(stream.fileno()) is False:
                     stream.seek(0)
                     holder = stream.read().decode(errors="replace").strip() or "another process"
                     raise RunFolderError(
@@ -166,30 +166,35 @@ class FolderLock:
         self._stream.close()
 
 
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
-"""Errors of file systems without locks, such as some network mounts, on which training works without one."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF, errno.EINVAL)
+"""Errors of file systems without locks, or without locks of folders, such as some network mounts."""
 
 
 if sys.platform == "win32":
     import msvcrt
 
-    def _lock_file(stream: BinaryIO) -> bool:
-        stream.seek(1 << 30)  # beyond the text: Windows forbids reading locked bytes
+    def try_lock(descriptor: int) -> bool | None:
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: Windows forbids reading locked bytes
         try:
-            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         except OSError:
             return False
         return True
 else:
     import fcntl
 
-    def _lock_file(stream: BinaryIO) -> bool:
-        """Lock an open file without waiting; return False if another process, or another open of it, has the lock."""
+    def try_lock(descriptor: int) -> bool | None:
+        """Lock an open file or folder without waiting, until it is closed.
+
+        Returns:
+            False if another process, or another open of it, has the lock; None where the file system has no locks.
+        """
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
+            return None
         return True
