@@ -7,11 +7,11 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import LapgsError, RunFolderError
 
 MANIFEST = "manifest.json"
 """File that makes a folder a run."""
@@ -50,6 +50,35 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+@contextmanager
+def whole_file(path: Path, what: str) -> Iterator[Path]:
+    """Yield a name beside `path` to write a file under, and rename the file when the block ends without an error.
+
+    For programs that write files by name. Missing folders are made. Unlike `atomic_write` it may lose the file in a
+    power cut.
+
+    Args:
+        path: of the file.
+        what: it is, such as "image", for the message.
+
+    Raises:
+        LapgsError: the block raised an OSError.
+    """
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix.lower()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield unfinished
+        unfinished.replace(path)
+    except OSError as error:
+        reason = " ".join(str(error).split())[-300:]
+        raise LapgsError(
+            f"{path}: the {what} cannot be written ({reason}); check free space and permissions"
+        ) from error
+    finally:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
