@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -149,7 +149,7 @@ def _execute(
                 resume=options.resume,
                 overwrite=options.overwrite,
                 watcher=watcher,
-                **asdict(measuring),
+                measuring=measuring,
             )
             driver.run()
         if driver.folder is not None:

@@ -22,6 +22,7 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 
@@ -38,8 +39,7 @@ class RunContext:
     hooks: HookCaller
     parts: IterationParts
     watcher: Watcher
-    test_every: int | None
-    gpu_busy: bool
+    measuring: MeasuringOptions
 
     def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""

@@ -50,6 +50,7 @@ from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
 
 logger = logging.getLogger(__name__)
@@ -65,10 +66,8 @@ class HierarchyDriver:
         resume: continue the run in the output folder.
         overwrite: replace the run in the output folder.
         hooks: hooks that run after those registered by entry point.
-        breakdown: measure the parts of iterations.
-        gpu_busy: profile some iterations of each stage; needs a CUDA device.
+        measuring: what is measured; None measures held-out views at the end alone.
         watcher: may look at the fields between iterations.
-        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
 
     Attributes:
         folder: run folder, once the run is complete.
@@ -83,25 +82,23 @@ class HierarchyDriver:
         resume: bool = False,
         overwrite: bool = False,
         hooks: Sequence[StageHook] = (),
-        breakdown: bool = False,
-        gpu_busy: bool = False,
+        measuring: MeasuringOptions | None = None,
         watcher: Watcher | None = None,
-        test_every: int | None = None,
     ) -> None:
         self._adapter, self._options = adapter, options
         self._resume, self._overwrite = resume, overwrite
-        place = torch.device(device)
+        place, measuring = torch.device(device), measuring or MeasuringOptions()
+        parts = IterationParts(place, measuring.breakdown)
         self._context = RunContext(
             adapter=adapter,
             options=options,
             device=place,
             images=SceneImages(),
-            wrapper=RasterizerWrapper(),
+            wrapper=RasterizerWrapper(parts.mark_render),
             hooks=HookCaller(hooks),
-            parts=IterationParts(place, breakdown),
+            parts=parts,
             watcher=watcher or Watcher(),
-            test_every=test_every,
-            gpu_busy=gpu_busy,
+            measuring=measuring,
         )
         self._active: ActiveStage | None = None
         self._replacements = StageReplacements(self._context, lambda: self._active, self._train)

@@ -45,7 +45,6 @@ class StageReplacements:
             UserInputError: this is no 3DGS checkout, or another rasterizer than its own is installed.
         """
         adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
-        self._context.wrapper.mark = parts.mark_render
         require_matching_rasterizer(profile, adapter.info.title)
         return [
             *self._in_training(profile),

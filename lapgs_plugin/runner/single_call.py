@@ -76,7 +76,6 @@ class SingleCall:
         self._context, self._run, self._plan, self._activate = context, run, plan, activate
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
-        self._opt = run.call.opt
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
         dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
         dataset.model_path = str(run.archive.path("level_0"))
@@ -130,8 +129,9 @@ class SingleCall:
         return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
 
     def _begin(self, stage: NestedStage) -> None:
-        for name in self._context.adapter.densify_thresholds(self._opt):
-            setattr(self._call.opt, name, getattr(self._opt, name) * stage.window.threshold_factor)
+        given = self._run.call.opt
+        for name in self._context.adapter.densify_thresholds(given):
+            setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
         self._activate(stage)
         stage.load_images()
         stage.begin()
