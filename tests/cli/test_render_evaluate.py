@@ -22,7 +22,7 @@ from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.images import caption_height
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import read_image
+from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
 
