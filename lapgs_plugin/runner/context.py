@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -27,6 +27,13 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 
 
+@dataclass
+class Running:
+    """Hold the stage, or that of the dry run, which answers the replaced symbols; None between stages."""
+
+    stage: Any = None
+
+
 @dataclass(frozen=True)
 class RunContext:
     """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
@@ -40,6 +47,7 @@ class RunContext:
     parts: IterationParts
     watcher: Watcher
     measuring: MeasuringOptions
+    running: Running = field(default_factory=Running)
 
     def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""

@@ -100,8 +100,7 @@ class HierarchyDriver:
             watcher=watcher or Watcher(),
             measuring=measuring,
         )
-        self._active: ActiveStage | None = None
-        self._replacements = StageReplacements(self._context, lambda: self._active, self._train)
+        self._replacements = StageReplacements(self._context, self._train)
         self.folder: Path | None = None
 
     def run(self) -> None:
@@ -114,7 +113,7 @@ class HierarchyDriver:
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
-            counting_steps(model, lambda: self._active),
+            counting_steps(model, lambda: self._context.running.stage),
         ):
             self._adapter.script.run_main()
 
@@ -138,7 +137,7 @@ class HierarchyDriver:
             )
             if not self._has_residuals:
                 plan = between_events(plan, self._schedule, _variables(call))
-            dry_run = DryRun(self._context, call, scene, plan, self._activate)
+            dry_run = DryRun(self._context, call, scene, plan)
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
@@ -150,7 +149,7 @@ class HierarchyDriver:
                     if self._has_residuals:
                         self._run_stages(run, plan, Path(scratch))
                     else:
-                        SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
+                        SingleCall(self._context, run, plan).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
@@ -168,7 +167,8 @@ class HierarchyDriver:
         for stage in plan:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
-            active = self._active = ActiveStage(self._context, run, window, call, tuple(finished), before)
+            active = ActiveStage(self._context, run, window, call, tuple(finished), before)
+            self._context.running.stage = active
             try:
                 active.load_images()
                 if stage.level in run.archive.available_levels:
@@ -179,7 +179,7 @@ class HierarchyDriver:
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
-                self._active = None
+                self._context.running.stage = None
                 active.close()
             finished.append(FinishedStage(stage, call))
 
@@ -205,9 +205,6 @@ class HierarchyDriver:
     def _has_residuals(self) -> bool:
         """Whether some fields are residuals; without any, one call of the script's `training` trains all levels."""
         return self._options.levels > 1 and not self._options.nested
-
-    def _activate(self, stage: Any) -> None:
-        self._active = stage
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.

@@ -25,17 +25,15 @@ class StageReplacements:
 
     Args:
         context: shared objects of the run.
-        running: returns the running stage, None between stages.
         train: called in place of the script's `training`.
     """
 
     def __init__(
         self,
         context: RunContext,
-        running: Callable[[], ActiveStage | None],
         train: Callable[[TrainingCall], None],
     ) -> None:
-        self._context, self._running, self._train = context, running, train
+        self._context, self._train = context, train
         self._controlling = False  # whether a method of density control is running
 
     def all(self) -> list[Replacement]:
@@ -59,6 +57,10 @@ class StageReplacements:
             *self._in_scores(profile),
             *parts.replacements(profile, adapter.info),
         ]
+
+    def _running(self) -> ActiveStage | None:
+        stage: ActiveStage | None = self._context.running.stage
+        return stage
 
     def _in_residual(self) -> bool:
         stage = self._running()

@@ -67,13 +67,10 @@ class SingleCall:
 
     Args:
         context, run, plan: the run.
-        activate: called with the stage that answers the replaced symbols from now on; None after the last one.
     """
 
-    def __init__(
-        self, context: RunContext, run: TrainingRun, plan: StagePlan, activate: Callable[[ActiveStage | None], None]
-    ) -> None:
-        self._context, self._run, self._plan, self._activate = context, run, plan, activate
+    def __init__(self, context: RunContext, run: TrainingRun, plan: StagePlan) -> None:
+        self._context, self._run, self._plan = context, run, plan
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
@@ -107,7 +104,7 @@ class SingleCall:
             self._explain_failure(self._stage)
             raise
         finally:
-            self._activate(None)
+            self._context.running.stage = None
             self._stage.close()
 
     def _explain_failure(self, stage: NestedStage) -> None:
@@ -132,7 +129,7 @@ class SingleCall:
         given = self._run.call.opt
         for name in self._context.adapter.densify_thresholds(given):
             setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
-        self._activate(stage)
+        self._context.running.stage = stage
         stage.load_images()
         stage.begin()
 
