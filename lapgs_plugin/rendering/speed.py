@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,6 +13,7 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.runs.profiling import clock_on
 
 ROUNDS = 5
 BATCH = 8
@@ -146,22 +146,11 @@ def _median_milliseconds(frame: Frame, frames: Sequence[Sequence[Camera]], warm:
     """Return the median time of a frame. The first `warm` frames are not timed: they compile and fill caches."""
     for cameras in frames[:warm]:
         frame(cameras)
-    if device.type != "cuda":
-        ends = [time.perf_counter()]
-        for cameras in frames[warm:]:
-            frame(cameras)
-            ends.append(time.perf_counter())
-        return 1000.0 * median(after - before for before, after in pairwise(ends))
-    torch.cuda.synchronize(device)
-    events = [_recorded(device)]
+    clock = clock_on(device)
+    clock.wait()
+    ends = [clock.stamp()]
     for cameras in frames[warm:]:
         frame(cameras)
-        events.append(_recorded(device))
-    events[-1].synchronize()
-    return median(float(before.elapsed_time(after)) for before, after in pairwise(events))
-
-
-def _recorded(device: torch.device) -> torch.cuda.Event:
-    event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch leaves these without types
-    event.record(torch.cuda.current_stream(device))
-    return event
+        ends.append(clock.stamp())
+    clock.wait()
+    return 1000.0 * median(clock.between(before, after) for before, after in pairwise(ends))

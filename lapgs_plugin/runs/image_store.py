@@ -126,7 +126,11 @@ class ImageStore:
     def __init__(
         self, where: str, precision: str, *, device: torch.device | str = "cpu", folder: Path | None = None
     ) -> None:
-        self.check(where, precision, device)
+        places = PLACES if torch.device(device).type == "cuda" else PLACES[1:]
+        if where not in places:
+            raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
+        if precision not in PRECISIONS:
+            raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
         assert where != "disk" or folder is not None, "a store on disk needs a folder"
         self._where = where
         self._dtype = DTYPES[precision]
@@ -142,15 +146,6 @@ class ImageStore:
         self._loaders = ThreadPoolExecutor(max_workers=LOADERS, thread_name_prefix="image-store")
         self._staging = threading.local()
         self._255 = torch.tensor(255.0, device=self._device)
-
-    @staticmethod
-    def check(where: str, precision: str, device: torch.device | str = "cpu") -> None:
-        """Raise the errors of the constructor without making a store."""
-        places = PLACES if torch.device(device).type == "cuda" else PLACES[1:]
-        if where not in places:
-            raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
-        if precision not in PRECISIONS:
-            raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
 
     def put(self, name: str, image: Tensor) -> None:
         """Store an image, replacing an earlier one of that name.

@@ -205,4 +205,9 @@ class TimedBreakdown(Breakdown):
 
 def breakdown_on(device: torch.device, seconds: Mapping[str, float] | None = None) -> Breakdown:
     """Return a breakdown that measures the work of a device; `seconds` as in `TimedBreakdown`."""
-    return TimedBreakdown(StreamClock(device) if device.type == "cuda" else ProcessorClock(), seconds)
+    return TimedBreakdown(clock_on(device), seconds)
+
+
+def clock_on(device: torch.device) -> ProcessorClock:
+    """Return the clock of a device's work."""
+    return StreamClock(device) if device.type == "cuda" else ProcessorClock()
