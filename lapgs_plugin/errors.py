@@ -39,6 +39,11 @@ def counted(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
+def joined(text: object) -> str:
+    """Return the lines of another program's message as one."""
+    return " ".join(str(text).split()) or "no reason given"
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type if it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from lapgs_plugin.errors import LapgsError, RunFolderError
+from lapgs_plugin.errors import LapgsError, RunFolderError, joined
 
 MANIFEST = "manifest.json"
 """File that makes a folder a run."""
@@ -72,7 +72,7 @@ def whole_file(path: Path, what: str) -> Iterator[Path]:
         yield unfinished
         unfinished.replace(path)
     except OSError as error:
-        reason = " ".join(str(error).split())[-300:]
+        reason = joined(error)[-300:]
         raise LapgsError(
             f"{path}: the {what} cannot be written ({reason}); check free space and permissions"
         ) from error

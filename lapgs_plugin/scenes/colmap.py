@@ -13,7 +13,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.errors import SceneError
+from lapgs_plugin.errors import SceneError, joined
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
@@ -87,9 +87,7 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
-        reason = (
-            disagreement(model) if suffix == "bin" else None
-        ) or f"its files do not agree: {' '.join(str(error).split())}"
+        reason = (disagreement(model) if suffix == "bin" else None) or f"its files do not agree: {joined(error)}"
         raise SceneError(f"{model}: the sparse model cannot be read ({reason}); copy or export it again") from error
 
 

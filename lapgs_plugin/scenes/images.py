@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.errors import SceneError, UserInputError, joined
 from lapgs_plugin.files import is_file, whole_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 
@@ -138,7 +138,7 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
             levels = np.asarray(picture.resize(size))[..., :3]  # (h, w, 3)
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
         raise SceneError(
-            f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({_one_line(str(error))}); "
+            f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({joined(error)}); "
             "expected a whole 8-bit image, copy or convert it again"
         ) from error
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
@@ -255,7 +255,7 @@ def _open(path: Path) -> oiio.ImageInput:
     options.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), options)
     if source is None:
-        reason = _one_line(oiio.geterror())
+        reason = joined(oiio.geterror())
         raise SceneError(f"{path}: not a readable image ({reason}), expected JPEG, PNG, TIFF or EXR; replace the file")
     return source
 
@@ -333,7 +333,7 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
     complaint = source.geterror()
     if pixels is None or complaint:
         raise SceneError(
-            f"{path}: the image is damaged or cut short ({_one_line(complaint)}), expected a whole file; copy it again"
+            f"{path}: the image is damaged or cut short ({joined(complaint)}), expected a whole file; copy it again"
         )
     read: NDArray[np.float32] = pixels.reshape(last - first, spec.width, channels)
     return read
@@ -366,7 +366,3 @@ def _blend(
     if channels.straight:
         colour = colour * alpha
     return colour + (1.0 - alpha) * np.asarray(background, np.float32)
-
-
-def _one_line(text: str) -> str:
-    return "; ".join(line.strip() for line in text.splitlines() if line.strip()) or "no reason given"
