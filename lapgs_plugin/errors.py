@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from importlib.util import find_spec
 from typing import ClassVar
 
 LONGEST_LINE = 1_200
@@ -93,6 +94,23 @@ class TrainingStoppedError(LapgsError):
 
 class MissingExtraError(LapgsError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+def require_extra(module: str, extra: str, what: str, otherwise: str = "") -> None:
+    """Check that the package of an extra is installed, without importing it.
+
+    Args:
+        module: of the package.
+        extra: of lapgs_plugin that brings it.
+        what: file, command or option that needs it, the subject of the message.
+        otherwise: what to do without it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if find_spec(module) is None:
+        package, instead = module.replace("_", "-"), f"; or {otherwise}" if otherwise else ""
+        raise MissingExtraError(f"{what} needs {package}: pip install 'lapgs_plugin[{extra}]'{instead}")
 
 
 class PatchError(UserInputError):

@@ -7,11 +7,11 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import LapgsError, RunFolderError
 
 MANIFEST = "manifest.json"
 """File that makes a folder a run."""
@@ -50,6 +50,35 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+@contextmanager
+def whole_file(path: Path, what: str) -> Iterator[Path]:
+    """Yield a name beside `path` to write a file under, and rename the file when the block ends without an error.
+
+    For programs that write files by name. Missing folders are made. Unlike `atomic_write` it may lose the file in a
+    power cut.
+
+    Args:
+        path: of the file.
+        what: it is, such as "image", for the message.
+
+    Raises:
+        LapgsError: the block raised an OSError.
+    """
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix.lower()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield unfinished
+        unfinished.replace(path)
+    except OSError as error:
+        reason = " ".join(str(error).split())[-300:]
+        raise LapgsError(
+            f"{path}: the {what} cannot be written ({reason}); check free space and permissions"
+        ) from error
+    finally:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -147,7 +176,7 @@ class FolderLock:
         with one_line_errors(path, training=True):
             stream = path.open("a+b")
             try:
-                if not _lock_file(stream):
+                if try_lock(stream.fileno()) is False:
                     stream.seek(0)
                     holder = stream.read().decode(errors="replace").strip() or "another process"
                     raise RunFolderError(
@@ -166,30 +195,35 @@ class FolderLock:
         self._stream.close()
 
 
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
-"""Errors of file systems without locks, such as some network mounts, on which training works without one."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF, errno.EINVAL)
+"""Errors of file systems without locks, or without locks of folders, such as some network mounts."""
 
 
 if sys.platform == "win32":
     import msvcrt
 
-    def _lock_file(stream: BinaryIO) -> bool:
-        stream.seek(1 << 30)  # beyond the text: Windows forbids reading locked bytes
+    def try_lock(descriptor: int) -> bool | None:
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: Windows forbids reading locked bytes
         try:
-            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         except OSError:
             return False
         return True
 else:
     import fcntl
 
-    def _lock_file(stream: BinaryIO) -> bool:
-        """Lock an open file without waiting; return False if another process, or another open of it, has the lock."""
+    def try_lock(descriptor: int) -> bool | None:
+        """Lock an open file or folder without waiting, until it is closed.
+
+        Returns:
+            False if another process, or another open of it, has the lock; None where the file system has no locks.
+        """
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
+            return None
         return True

@@ -30,7 +30,7 @@ from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.limits import LONGEST_STEM
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import SceneReference
-from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution
+from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution, parse_size
 from lapgs_plugin.training.settings import TrainSettings
 
 READS_SCENES = ("OpenImageIO", "pycolmap")
@@ -204,13 +204,10 @@ def _smallest_size(scene: SceneSpec, folder: Path, resolution: str) -> tuple[int
         SceneError: the scene cannot be used.
     """
     if scene.sample is not None and not folder.is_dir():
-        from lapgs_plugin.scenes.sample import parse_size
-
         return parse_resolution(resolution).size_for(*parse_size(scene.sample.size))
     if any(find_spec(name) is None for name in READS_SCENES):
         return None
-    from lapgs_plugin.scenes import load_cameras
+    from lapgs_plugin.scenes.scene import load_cameras, smallest_of
 
     train, test = load_cameras(folder, resolution=resolution, images=scene.images, eval=True)
-    cameras = [*train.values(), *test.values()]
-    return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+    return smallest_of([*train.values(), *test.values()])

@@ -11,19 +11,8 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.patching import (
-    ALL_SETS,
-    FileChange,
-    Target,
-    alone,
-    find_targets,
-    plan_apply,
-    plan_revert,
-    read_only,
-    status,
-    uncommitted,
-    write_all,
-)
+from lapgs_plugin.patching.engine import ALL_SETS, FileChange, Target, find_targets, plan_apply, plan_revert, status
+from lapgs_plugin.patching.files import alone, read_only, uncommitted, write_all
 
 app = typer.Typer(
     help="Patch a checkout's CUDA rasterizer: add signed colour, or make it build with a current CUDA.",

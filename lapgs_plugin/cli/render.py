@@ -141,7 +141,7 @@ def _write_clip(
     archive: RunArchive, renderer: HierarchyRenderer, level: int, scene: Path | None, settings: RenderSettings
 ) -> None:
     """Render along a camera path, as a video or a folder of images."""
-    from lapgs_plugin.rendering.clip import VIDEO, clip_size, is_video, parse_size, render_clip
+    from lapgs_plugin.rendering.clip import VIDEO, clip_size, is_video, render_clip, render_size
     from lapgs_plugin.rendering.run import path_cameras
     from lapgs_plugin.runs.layout import RENDERS
 
@@ -161,7 +161,7 @@ def _write_clip(
         cameras,
         out,
         level=level,
-        size=clip_size(cameras[0], None if settings.size is None else parse_size(settings.size), out),
+        size=clip_size(cameras[0], None if settings.size is None else render_size(settings.size), out),
         fps=DEFAULT_FPS if settings.frame_rate is None else settings.frame_rate,
         panels=settings.panels,
         image_format=settings.image_format,
@@ -189,14 +189,14 @@ def _print_speeds(
     """Print frames per second over the cameras of the views, at another size if one is given."""
     from rich.table import Table
 
-    from lapgs_plugin.rendering.clip import parse_size
+    from lapgs_plugin.rendering.clip import render_size
     from lapgs_plugin.rendering.run import run_scene
     from lapgs_plugin.rendering.speed import measure_speed
 
     splits = _choose(run_scene(archive, scene), settings.views).values()
     cameras = [view.camera for split in splits for view in split]
     if settings.size is not None:
-        cameras = [camera.resized(*parse_size(settings.size)) for camera in cameras]
+        cameras = [camera.resized(*render_size(settings.size)) for camera in cameras]
     table = Table("", "size", "Gaussians", "ms", "FPS", title=f"median over {len(cameras)} cameras")
     for speed in measure_speed(renderer, cameras, level):
         table.add_row(

@@ -23,7 +23,8 @@ def sample(
     The scene is a COLMAP folder with exact camera poses and noisy sparse points. Its patterns repeat at doubling
     frequencies with sharp edges, down to the size of a pixel at 480x320.
     """
-    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size
+    from lapgs_plugin.scenes.resolution import parse_size
+    from lapgs_plugin.scenes.sample import make_sample_scene
 
     width, height = parse_size(size)
     make_sample_scene(

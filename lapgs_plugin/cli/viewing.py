@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.errors import UserInputError, require_extra
 from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runs.watcher import Watcher
 
@@ -40,18 +39,8 @@ class ViewOptions:
 
 
 def require_viser(what: str) -> None:
-    """Check that viser is installed.
-
-    Args:
-        what: command or option that needs it, for the message.
-
-    Raises:
-        MissingExtraError: it is not.
-    """
-    if importlib.util.find_spec("viser") is None:
-        raise MissingExtraError(
-            f"{what} needs viser, which is not installed; pip install 'lapgs_plugin[viewer]' installs it"
-        )
+    """Check that viser is installed, which `what` needs; see `require_extra`."""
+    require_extra("viser", "viewer", what)
 
 
 def open_page(host: str, port: int, label: str, until: str, preview: Image | None = None) -> Page:

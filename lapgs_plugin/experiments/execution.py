@@ -14,6 +14,7 @@ from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
+from lapgs_plugin.scenes.resolution import parse_size
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ def _check_sample(scene: SceneSpec) -> None:
     """
     if scene.sample is None:
         return
-    from lapgs_plugin.scenes.sample import check_sample_scene, parse_size
+    from lapgs_plugin.scenes.sample import check_sample_scene
 
     width, height = parse_size(scene.sample.size)
     check_sample_scene(width, height, scene.sample.views, scene.sample.points)
@@ -97,7 +98,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
     missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample_folder(scene, folder).is_dir()]
     if not missing:
         return
-    from lapgs_plugin.scenes.sample import make_sample_scene, parse_size  # needs packages that read scenes
+    from lapgs_plugin.scenes.sample import make_sample_scene  # needs packages that read scenes
 
     place = folder.absolute() / SCENES
     with one_line_errors(place):

@@ -13,12 +13,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.environment import run_program
-from lapgs_plugin.errors import MissingExtraError, UserInputError, typed_line
+from lapgs_plugin.errors import UserInputError, require_extra, typed_line
 from lapgs_plugin.experiments.settings import WorkerSettings
 from lapgs_plugin.experiments.worker import Slot, work
 
@@ -134,10 +133,7 @@ class SlurmLauncher(Launcher):
 
     @staticmethod
     def check(options: Mapping[str, Any]) -> None:
-        if find_spec("submitit") is None:
-            raise MissingExtraError(
-                "--launcher slurm needs submitit, which is not installed; pip install 'lapgs_plugin[slurm]'"
-            )
+        require_extra("submitit", "slurm", "--launcher slurm")
         if options.get("cluster", "slurm") == "slurm" and shutil.which("sbatch") is None:
             raise UserInputError("--launcher slurm: there is no sbatch on this machine; start it on a login node")
 
@@ -175,8 +171,7 @@ class RayLauncher(Launcher):
 
     @staticmethod
     def check(options: Mapping[str, Any]) -> None:
-        if find_spec("ray") is None:
-            raise MissingExtraError("--launcher ray needs Ray, which is not installed; pip install 'lapgs_plugin[ray]'")
+        require_extra("ray", "ray", "--launcher ray")
         if unknown := sorted(options.keys() - {"address", "num_gpus", "num_cpus"}):
             raise UserInputError(f"--launcher-option {unknown[0]}: Ray takes address, num_gpus and num_cpus")
         for name, least in (("num_gpus", 0.0), ("num_cpus", 0.001)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import shutil
@@ -16,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
+from lapgs_plugin.files import try_lock
 from lapgs_plugin.patching.engine import FileChange, Target, pristine
 
 _SUFFIX = ".lapgs"
@@ -23,8 +23,6 @@ _RANDOM = r"[a-z0-9_]{8}"
 """Text that `tempfile.mkstemp` puts between prefix and suffix."""
 PATIENCE = 30.0
 """Seconds to wait for another process that writes to the same folders."""
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF, errno.EINVAL)
-"""Errors of file systems without locks on folders."""
 
 
 def read_only(changes: Iterable[FileChange]) -> list[Path]:
@@ -116,32 +114,19 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
     if sys.platform == "win32":
         yield False
         return
-    import fcntl
-
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise PatchError(f"{folder}: cannot be read: {error.strerror}; expected a folder this user may read") from error
     end = time.monotonic() + PATIENCE
     try:
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    raise PatchError(
-                        f"{folder}: another `lapgs patch` works on it; wait for it or stop it; nothing was changed"
-                    ) from None
-                time.sleep(0.05)
-            except OSError as error:
-                if error.errno not in _NO_LOCKS:
-                    raise
-                locked = False
-                break
-            else:
-                locked = True
-                break
-        yield locked
+        while (locked := try_lock(descriptor)) is False:
+            if time.monotonic() > end:
+                raise PatchError(
+                    f"{folder}: another `lapgs patch` works on it; wait for it or stop it; nothing was changed"
+                )
+            time.sleep(0.05)
+        yield locked is True
     finally:
         os.close(descriptor)
 

@@ -22,7 +22,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.patching import State, Target, find_targets, status
+from lapgs_plugin.patching.engine import State, Target, find_targets, status
 from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +22,7 @@ from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.trajectory import with_size
 from lapgs_plugin.rendering.video import FrameSink, video_writer
 from lapgs_plugin.scenes.images import write_image
+from lapgs_plugin.scenes.resolution import parse_size
 
 VIDEO = ".mp4"
 MIN_SIDE, MAX_SIDE = 16, 16384
@@ -30,18 +30,15 @@ MAX_PENDING = 16
 """Most images that wait to be written; more would only take memory."""
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """Parse a size such as "1280x720" into (width, height).
+def render_size(text: str) -> tuple[int, int]:
+    """Parse the size of rendered images, such as "1280x720", into (width, height).
 
     Raises:
         UserInputError: the text has another form, or the size is out of range.
     """
-    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    size = parse_size(text)
     if not all(MIN_SIDE <= side <= MAX_SIDE for side in size):
-        raise UserInputError(
-            f"--size {text}: expected WIDTHxHEIGHT in pixels, each from {MIN_SIDE} to {MAX_SIDE}, such as 1280x720"
-        )
+        raise UserInputError(f"--size {text}: expected {MIN_SIDE} to {MAX_SIDE} pixels a side, such as 1280x720")
     VIEW_PIXELS.check(size[0] * size[1], f"--size {text} is {size[0] * size[1]:,} pixels", "choose a smaller one")
     return size
 

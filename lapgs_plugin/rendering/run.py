@@ -20,7 +20,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.masks import ALPHA, NONE
-from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene
+from lapgs_plugin.scenes.scene import Scene, View, load_cameras, load_scene, smallest_of
 
 PATHS = ("orbit", "spline")
 
@@ -85,9 +85,7 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     """
     reference, path = _scene_folder(archive, moved_to)
     train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
-    cameras = [*train.values(), *test.values()]
-    smallest = min(camera.width for camera in cameras), min(camera.height for camera in cameras)
-    require_same_scene(archive, path, smallest)
+    require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
     return refined(archive, train), refined(archive, test)
 
 

@@ -6,15 +6,14 @@ licence, and its crash is an error that we can report. gsplat and nerfstudio use
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from importlib.util import find_spec
+from contextlib import contextmanager
 from pathlib import Path
 
 from torch import Tensor
 
-from lapgs_plugin.errors import LapgsError, MissingExtraError
+from lapgs_plugin.errors import require_extra
+from lapgs_plugin.files import whole_file
 from lapgs_plugin.scenes.images import as_bytes
 
 QUALITY = 8
@@ -23,19 +22,6 @@ QUALITY = 8
 
 FrameSink = Callable[[Tensor], None]
 """Adds a frame to a clip: an image (3, h, w), clamped to [0, 1]."""
-
-
-def require_video() -> None:
-    """Check that imageio-ffmpeg is installed.
-
-    Raises:
-        MissingExtraError: it is not.
-    """
-    if find_spec("imageio_ffmpeg") is None:
-        raise MissingExtraError(
-            "a video needs imageio-ffmpeg, which is not installed; pip install 'lapgs_plugin[video]' brings it, or "
-            "write images with --out FOLDER"
-        )
 
 
 @contextmanager
@@ -49,15 +35,13 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
 
     Raises:
         LapgsError: the file cannot be written.
-        MissingExtraError: as `require_video`.
+        MissingExtraError: imageio-ffmpeg is not installed.
     """
-    require_video()
+    require_extra("imageio_ffmpeg", "video", f"{path}: a video", "write images with --out FOLDER")
     import imageio_ffmpeg
 
     assert size[0] % 2 == size[1] % 2 == 0, "yuv420p has one colour for 2 x 2 pixels"
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path, "video") as unfinished:
         writer = imageio_ffmpeg.write_frames(
             str(unfinished),
             size,
@@ -82,13 +66,6 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Fram
         # On a full disk ffmpeg may end early without an error.
         if _count_frames(unfinished) != frames:
             raise OSError("it is truncated")
-        unfinished.replace(path)
-    except OSError as error:
-        reason = " ".join(str(error).split())[-300:]
-        raise LapgsError(f"{path}: the video cannot be written ({reason}); check free space and permissions") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def _count_frames(path: Path) -> int:

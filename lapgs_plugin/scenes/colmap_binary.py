@@ -8,7 +8,7 @@ reconstruction_io_binary.cc.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pycolmap
@@ -27,58 +27,52 @@ def check_whole(folder: Path) -> None:
     Raises:
         SceneError: a file ends before its last record.
     """
-    for name, record_end in RECORD_ENDS.items():
+    for name in RECORD_ENDS:
         file = folder / f"{name}.bin"
         if not file.is_file():
             continue  # COLMAP before 3.12 writes no rigs and frames
         data = file.read_bytes()
-        if not _holds_all(data, record_end):
+        try:
+            for _ in _starts(name, data):
+                pass
+        # The data ends inside a record, a count or a name, or a camera model does not exist.
+        except (struct.error, ValueError) as error:
             raise SceneError(
                 f"{file}: the file is damaged or cut short at {len(data)} bytes, expected all records that its header "
                 "counts; copy it again"
-            )
-
-
-def _holds_all(data: bytes, record_end: Callable[[bytes, int], int]) -> bool:
-    """Return whether the data holds as many records as it counts."""
-    try:
-        offset = COUNT.size
-        for _ in range(COUNT.unpack_from(data)[0]):
-            offset = record_end(data, offset)
-            if offset > len(data):
-                return False
-    except (struct.error, ValueError):  # the data ends inside a count or a name, or a camera model does not exist
-        return False
-    return True
+            ) from error
 
 
 def disagreement(folder: Path) -> str | None:
     """Return which ids in complete binary files contradict each other, or None."""
-    cameras, images, points = (_records(folder / f"{name}.bin") for name in ("cameras", "images", "points3D"))
-    files = {"cameras": (cameras, "<I"), "images": (images, "<I"), "points3D": (points, "<Q")}
+    data = {name: (folder / f"{name}.bin").read_bytes() for name in ("cameras", "images", "points3D")}
     ids: dict[str, set[int]] = {}
-    for name, ((data, starts), kind) in files.items():
+    for name, kind in (("cameras", "<I"), ("images", "<I"), ("points3D", "<Q")):
         found = ids.setdefault(name, set())
-        for start in starts:
-            (key,) = struct.unpack_from(kind, data, start)
+        for start in _starts(name, data[name]):
+            (key,) = struct.unpack_from(kind, data[name], start)
             if key in found:
                 return f"{name}.bin holds id {key} twice, expected each once"
             found.add(key)
-    data, starts = images
-    for start in starts:
-        image, camera = (int(struct.unpack_from("<I", data, start + at)[0]) for at in (0, 4 + POSE_BYTES))
+    for start in _starts("images", data["images"]):
+        image, camera = (int(struct.unpack_from("<I", data["images"], start + at)[0]) for at in (0, 4 + POSE_BYTES))
         if camera not in ids["cameras"]:
             return f"image {image} of images.bin has camera {camera}, expected one of cameras.bin"
     return None
 
 
-def _records(file: Path) -> tuple[bytes, list[int]]:
-    """Return the bytes of a complete file and the offsets of its records."""
-    data = file.read_bytes()
-    starts = [COUNT.size]
+def _starts(name: str, data: bytes) -> Iterator[int]:
+    """Yield the offset of each record that the file's header counts.
+
+    Raises:
+        ValueError, struct.error: the data ends before.
+    """
+    end = COUNT.size
     for _ in range(COUNT.unpack_from(data)[0]):
-        starts.append(RECORD_ENDS[file.stem](data, starts[-1]))
-    return data, starts[:-1]
+        start, end = end, RECORD_ENDS[name](data, end)
+        if end > len(data):
+            raise ValueError(f"a record ends at {end}")
+        yield start
 
 
 def _camera_end(data: bytes, start: int) -> int:

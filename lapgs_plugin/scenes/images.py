@@ -9,9 +9,8 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,11 +19,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
-from lapgs_plugin.files import is_file
+from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.files import is_file, whole_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 
-JPEG_QUALITY = 95
+JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
+"""How Pillow writes JPEG files."""
 PNG_LEVEL = 4
 """Faster than zlib's default of 6, for slightly larger files."""
 Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own limit is below that of phones
@@ -212,21 +212,11 @@ def write_image(path: Path, image: Tensor) -> None:
         raise UserInputError(
             f"{path}: cannot write {suffix or 'a file without extension'}, expected .png, .jpg or .exr"
         )
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path, "image") as unfinished:
         if suffix == ".exr":
             _write_exr(unfinished, image.detach().to("cpu", torch.float32).permute(1, 2, 0).contiguous().numpy())
         else:
             unfinished.write_bytes(encode_image(image, suffix))
-        unfinished.replace(path)
-    except OSError as error:
-        raise LapgsError(
-            f"{path}: the image cannot be written ({_one_line(str(error))}); check free space and permissions"
-        ) from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def encode_image(image: Tensor, suffix: str) -> bytes:
@@ -240,7 +230,7 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
     if suffix == ".png":
         Image.fromarray(levels).save(encoded, "PNG", compress_level=PNG_LEVEL)
     else:
-        Image.fromarray(levels).save(encoded, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4")
+        Image.fromarray(levels).save(encoded, **JPEG)
     return encoded.getvalue()
 
 

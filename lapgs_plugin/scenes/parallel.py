@@ -1,10 +1,10 @@
-"""Work on many images in threads, with a progress bar."""
+"""Show progress, and work on many images in threads."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
@@ -17,6 +17,19 @@ ProgressCallback = Callable[[int, int], None]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+@contextmanager
+def bar(
+    title: str, unit: str, progress: bool | ProgressCallback, total: int | None = None
+) -> Iterator[ProgressCallback]:
+    """Show a bar on stderr if `progress` is True; yield what to call with finished items and their total."""
+    if progress is not True:
+        yield progress or (lambda done, total: None)
+        return
+    with item_progress(unit) as shown:
+        task = shown.add_task(title, total=total)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
 
 
 def in_threads(
@@ -37,20 +50,15 @@ def in_threads(
         most: number of threads; None for one a processor that this process may use.
         progress: True shows a bar on stderr, False nothing; a function is called after each item.
     """
-    bar = item_progress(unit) if progress is True else None
-    task = bar.add_task(title, total=len(items)) if bar else None
     results = []
     usable = usable_processors()
     # One thread an item: torch's own threads would compete with these.
     pool = ThreadPoolExecutor(min(usable, most or usable), initializer=torch.set_num_threads, initargs=(1,))
-    with bar or nullcontext():
+    with bar(title, unit, progress, len(items)) as seen:
         try:
             for done, future in enumerate([pool.submit(work, item) for item in items], start=1):
                 results.append(future.result())
-                if bar and task is not None:
-                    bar.update(task, completed=done)
-                elif callable(progress):
-                    progress(done, len(items))
+                seen(done, len(items))
         finally:
             pool.shutdown(cancel_futures=True)
     return results

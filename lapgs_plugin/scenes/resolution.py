@@ -100,6 +100,18 @@ def parse_resolution(text: str) -> Resolution:
     raise UserInputError(f"--resolution {text!r}: expected {ACCEPTED}")
 
 
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse a value of --size such as "480x320" into width and height.
+
+    Raises:
+        UserInputError: the text has another form.
+    """
+    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text.strip().lower())
+    if match is None:
+        raise UserInputError(f"--size {text!r}: expected WIDTHxHEIGHT in pixels, such as 480x320")
+    return int(match[1]), int(match[2])
+
+
 def _from_width(text: str, width: int) -> Resolution:
     if width < MIN_WIDTH:
         hint = f"; for a fraction of the full size write 1/{width}" if width > 1 else ""

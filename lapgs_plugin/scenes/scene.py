@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -86,8 +85,7 @@ class Scene:
     @property
     def smallest_size(self) -> tuple[int, int]:
         """Smallest width and smallest height of all views in pixels, which limit the number of levels."""
-        cameras = [view.camera for view in (*self.train, *self.test)]
-        return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+        return smallest_of(view.camera for view in (*self.train, *self.test))
 
 
 def load_scene(
@@ -135,9 +133,22 @@ def load_scene(
             "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
             *(resolution, len(short), len(frames), max(short)),
         )
-    as_3dgs = rule.backbone is not None
-    read = partial(_read, source.kind, background, as_3dgs)
-    views = _load_views(frames, cameras, read, partial(_read_mask, masks, mask_files), progress)
+    behind = background if source.kind == "transforms" else None  # 3DGS ignores alpha of COLMAP scenes
+
+    def load(posed: tuple[Frame, Camera]) -> View:
+        frame, camera = posed
+        size = (camera.width, camera.height)
+        if rule.backbone is not None:
+            image = read_as_3dgs(frame.path, size, behind)
+        else:
+            image = read_image(frame.path, size=size, background=background)
+        mask = alpha_mask(frame.path, size) if masks == ALPHA else None
+        if mask_files:
+            mask = read_mask(mask_files[frame.name], image_size(frame.path), size)
+        return View(frame.name, camera, image, mask)
+
+    items = list(zip(frames, cameras, strict=True))
+    views = in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=progress)
     if masks == ALPHA and all(view.mask is None for view in views):
         raise UserInputError(
             f"--masks alpha: no image of {path} has transparent pixels; leave the option out, which uses "
@@ -181,30 +192,31 @@ def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "
     Raises:
         SceneError, UserInputError: as `load_scene`.
     """
-    rule = parse_resolution(resolution)
-    source = _checked_source(Path(path), images, evaluate=False)
-    cameras = [_sized_camera(frame, rule) for frame in (*source.train, *source.test)]
-    return min(camera.width for camera in cameras), min(camera.height for camera in cameras)
+    train, _ = load_cameras(path, resolution=resolution, images=images)
+    return smallest_of(train.values())
+
+
+def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
+    """Return the smallest width and the smallest height of cameras in pixels."""
+    widths, heights = zip(*((camera.width, camera.height) for camera in cameras), strict=True)
+    return min(widths), min(heights)
 
 
 def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
-    source = _read_source(path, images, evaluate)
-    _check_source(path, source)
-    return source
-
-
-def _read_source(path: Path, images: str, evaluate: bool) -> SceneSource:
+    """Return the frames and points of a scene folder, after checks."""
     if not is_folder(path):
         raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
-    model = find_model(path)
-    if model is not None:
-        return read_colmap(path, model, images, evaluate)
-    if has_transforms(path):
-        return read_transforms(path, images, evaluate)
-    raise SceneError(
-        f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; "
-        "make a scene from photos with `lapgs prepare PHOTOS OUT`"
-    )
+    if (model := find_model(path)) is not None:
+        source = read_colmap(path, model, images, evaluate)
+    elif has_transforms(path):
+        source = read_transforms(path, images, evaluate)
+    else:
+        raise SceneError(
+            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; "
+            "make a scene from photos with `lapgs prepare PHOTOS OUT`"
+        )
+    _check_source(path, source)
+    return source
 
 
 def _check_source(path: Path, source: SceneSource) -> None:
@@ -254,40 +266,6 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
     VIEW_PIXELS.check(size[0] * size[1], subject, "choose a smaller --resolution", SceneError)
     resized = camera.resized(*size).to(dtype=torch.float32)
     return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if rule.backbone is not None else resized
-
-
-def _read(
-    kind: str, background: tuple[float, float, float], as_3dgs: bool, path: Path, size: tuple[int, int]
-) -> Tensor:
-    """Read an image of a scene of this kind, (3, h, w)."""
-    if as_3dgs:
-        return read_as_3dgs(path, size, background if kind == "transforms" else None)
-    return read_image(path, size=size, background=background)
-
-
-def _read_mask(masks: str, files: dict[str, Path], frame: Frame, size: tuple[int, int]) -> Tensor | None:
-    """Read the mask of a view (1, h, w); None without one. `masks` is a result of `resolve_masks`."""
-    if masks == ALPHA:
-        return alpha_mask(frame.path, size)
-    return read_mask(files[frame.name], image_size(frame.path), size) if files else None
-
-
-def _load_views(
-    frames: Sequence[Frame],
-    cameras: Sequence[Camera],
-    read: Callable[[Path, tuple[int, int]], Tensor],
-    read_its_mask: Callable[[Frame, tuple[int, int]], Tensor | None],
-    progress: bool | ProgressCallback,
-) -> list[View]:
-    """Read all images in parallel, in the order of `frames`; raise the first error in that order."""
-
-    def load(posed: tuple[Frame, Camera]) -> View:
-        frame, camera = posed
-        size = (camera.width, camera.height)
-        return View(frame.name, camera, read(frame.path, size), read_its_mask(frame, size))
-
-    items = list(zip(frames, cameras, strict=True))
-    return in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=progress)
 
 
 def _extent(path: Path, train: Sequence[Frame]) -> float:

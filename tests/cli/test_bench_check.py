@@ -13,7 +13,6 @@ from lapgs_plugin.cli import bench_check, bench_experiment
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments import launchers
 from lapgs_plugin.experiments.schema import load_experiment
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import CHECKOUTS
@@ -260,7 +259,7 @@ def test_mistakes_on_the_command_line_are_found_before_anything_is_written(
     ("name", "value"), [("num_cpus", "0"), ("num_cpus", "-1"), ("num_gpus", "many"), ("num_gpus", "nan")]
 )
 def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launchers, "find_spec", lambda name: object())
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: object())
     (line,) = lines_about(GOOD, "--launcher", "ray", "--launcher-option", f"{name}={value}")
     assert line.startswith(f"--launcher-option {name}={value}: expected a number for each worker")
 

@@ -111,7 +111,7 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
         (("--frames", 5), "--frames needs --trajectory"),
         (("--panels",), "--panels needs --trajectory"),
         (("--trajectory", "orbit", "--views", "test"), "--views does not go with --trajectory"),
-        (("--trajectory", "orbit", "--size", "big"), "--size big: expected WIDTHxHEIGHT"),
+        (("--trajectory", "orbit", "--size", "big"), "--size 'big': expected WIDTHxHEIGHT"),
         (("--trajectory", "orbit", "--size", "81x40", "--out", "clip.mp4"), "a video's sides are even; use 82x40"),
         (("--trajectory", "orbit", "--out", "clip.avi"), r"expected an \.mp4 file or a folder"),
         (("--trajectory", "orbit", "--out", "clip.mp4", "--format", "exr"), "a video has 8 bits"),
@@ -135,7 +135,7 @@ def test_mistakes_are_one_line(run: Path, arguments: tuple[object, ...], message
 
 
 def test_without_ffmpeg_it_names_the_extra(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lapgs_plugin.rendering.video.find_spec", lambda name: None)
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[video\]"):
         lapgs_render(run, "--trajectory", "orbit", "--out", tmp_path / "clip.mp4")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import socket
 from pathlib import Path
@@ -48,7 +47,7 @@ def test_mistakes_come_before_the_run_folder(scene: Path, tmp_path: Path, monkey
         lapgs("train", scene, "-o", tmp_path / "run", "--view-port", 8123)
     with pytest.raises(UserInputError, match="--view has no effect with --off"):
         lapgs("run", "--off", "--view", "--device", "cpu", STUBS["graphdeco"].script)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"--view needs viser.*lapgs_plugin\[viewer\]"):
         lapgs("train", scene, "-o", tmp_path / "run", "--view")
     assert not (tmp_path / "run").exists()

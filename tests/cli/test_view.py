@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import socket
@@ -91,7 +90,7 @@ def test_an_address_of_another_machine_is_refused(scene: Path, tmp_path: Path) -
 
 
 def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[viewer\]"):
         lapgs_view(tmp_path)
 

@@ -14,7 +14,7 @@ from PIL import Image
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
 from lapgs_plugin.experiments.worker import RunFailedError
 from lapgs_plugin.limits import FRAMES, PHOTO_PIXELS, PHOTO_SIDE, VIEW_PIXELS, Limit
-from lapgs_plugin.rendering.clip import parse_size
+from lapgs_plugin.rendering.clip import render_size
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image
 from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
@@ -90,10 +90,10 @@ def test_views_are_limited_at_the_size_they_are_trained_at(tmp_path: Path, monke
 
 def test_sizes_that_are_asked_for(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"268,435,456 pixels, expected at most .* LAPGS_MAX_VIEW_PIXELS"):
-        parse_size("16384x16384")
+        render_size("16384x16384")
     for text in ("9" * 5000 + "x720", "\u0661\u0662x720"):
         with pytest.raises(UserInputError, match="expected WIDTHxHEIGHT"):
-            parse_size(text)
+            render_size(text)
     with pytest.raises(UserInputError, match="expected at most 8192x8192"):
         make_sample_scene(tmp_path / "new", width=99999, height=99999)
     with pytest.raises(UserInputError, match="--points"):

@@ -25,23 +25,9 @@ from typer.testing import CliRunner
 
 from lapgs_plugin.cli.patch import app
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.patching import (
-    ALL_SETS,
-    Anchor,
-    Check,
-    Edit,
-    Recipe,
-    State,
-    Target,
-    find_targets,
-    load_recipes,
-    plan_apply,
-    plan_revert,
-    read_only,
-    status,
-    uncommitted,
-    write_all,
-)
+from lapgs_plugin.patching.engine import ALL_SETS, State, Target, find_targets, plan_apply, plan_revert, status
+from lapgs_plugin.patching.files import read_only, uncommitted, write_all
+from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
 from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
@@ -518,7 +504,8 @@ def test_without_git_nothing_is_uncommitted(target: Target, monkeypatch: pytest.
 
 KILLED_AT = """
 import os, pathlib, signal, sys
-from lapgs_plugin.patching import alone, find_targets, plan_apply, plan_revert, write_all
+from lapgs_plugin.patching.engine import find_targets, plan_apply, plan_revert
+from lapgs_plugin.patching.files import alone, write_all
 
 WRITES = {"open", "os.chmod", "os.rename", "os.remove"}
 planners = {"apply": plan_apply, "revert": plan_revert}
@@ -1001,7 +988,7 @@ def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:
 
 
 def test_nothing_is_imported_for_the_help() -> None:
-    program = "import sys, lapgs_plugin.cli.patch, lapgs_plugin.patching; sys.exit('torch' in sys.modules)"
+    program = "import sys, lapgs_plugin.cli.patch, lapgs_plugin.patching.files; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 

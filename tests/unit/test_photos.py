@@ -25,7 +25,6 @@ from PIL import Image
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
-from lapgs_plugin.scenes.prepare import clip as clip_module
 from lapgs_plugin.scenes.prepare import left_out, pipeline
 from lapgs_plugin.scenes.prepare import photos as photos_module
 from lapgs_plugin.scenes.prepare.clip import judge, pick_frames, sharp_and_moving, write_frames
@@ -207,7 +206,7 @@ def test_videos_that_cannot_be_used_are_one_line(clip: Path, tmp_path: Path, mon
         write_image(photos / f"{index}.png", torch.ones(3, 64, 80))
     refused(UserInputError, "--frames 9: it picks frames from a video, and .* is a folder", photos, frames=9)
     refused(SceneError, r"0\.png: one photo, expected a folder", photos / "0.png")
-    monkeypatch.setattr(clip_module, "find_spec", lambda name: None)
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
     refused(MissingExtraError, r"needs imageio-ffmpeg: pip install 'lapgs_plugin\[video\]'", clip)
 
 
@@ -229,8 +228,8 @@ def test_heic_without_its_library_is_named(noise: Path, tmp_path: Path, monkeypa
     (noise / "2.jpg").write_bytes(b"")  # beside HEIC photos a copy is read, which is not the user's file
     with pytest.raises(SceneError, match=rf"^{re.escape(str(noise / '2.jpg'))}: not a readable image"):
         prepare_scene(noise, tmp_path / "scene", progress=False)
-    monkeypatch.setattr(photos_module, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"pillow-heif is needed for 1 HEIC photo \(IMG_1\.HEIC\): pip install"):
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"1 HEIC photo \(IMG_1\.HEIC\) needs pillow-heif: pip install"):
         prepare_scene(noise, tmp_path / "scene", progress=False)
     shutil.copy(noise / "0.jpg", noise / "IMG_1.jpg")
     monkeypatch.undo()

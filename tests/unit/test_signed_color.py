@@ -22,7 +22,9 @@ from lapgs_plugin.evaluation.conformance import Subject, check, check_case, conf
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.patching import Anchor, Edit, Recipe, Target, plan_apply, write_all
+from lapgs_plugin.patching.engine import Target, plan_apply
+from lapgs_plugin.patching.files import write_all
+from lapgs_plugin.patching.recipe import Anchor, Edit, Recipe
 from lapgs_plugin.rasterizers import extensions, signed_color
 from lapgs_plugin.rasterizers.extensions import CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_plugin.errors import MissingExtraError, SceneError
+from lapgs_plugin.errors import SceneError, require_extra
 from lapgs_plugin.limits import PHOTO_PIXELS
-from lapgs_plugin.scenes.images import JPEG_QUALITY
+from lapgs_plugin.scenes.images import JPEG
 
 FRAMES_PER_SECOND = 2.0
 FEWEST, MOST = 40, 240
@@ -95,7 +94,7 @@ def write_frames(clip: Path, numbers: list[int], folder: Path, seen: Callable[[i
     written = 0
     for number, frame in zip(numbers, _frames(clip, "ppm", f"select='{chosen}'"), strict=False):
         name = folder / f"frame_{number:06d}.jpg"
-        Image.fromarray(frame).save(name, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4")
+        Image.fromarray(frame).save(name, **JPEG)
         written += 1
         seen(written, len(numbers))
     if written < len(numbers):
@@ -133,11 +132,7 @@ def _length(clip: Path) -> tuple[int, float]:
         SceneError: it cannot be decoded.
         MissingExtraError: imageio-ffmpeg is not installed.
     """
-    if find_spec("imageio_ffmpeg") is None:
-        raise MissingExtraError(
-            f"{clip}: reading a video needs imageio-ffmpeg: pip install 'lapgs_plugin[video]'; or give a folder of "
-            "frames"
-        )
+    require_extra("imageio_ffmpeg", "video", f"{clip}: reading a video", "give a folder of frames")
     import imageio_ffmpeg
 
     try:

@@ -6,7 +6,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.files import atomic_write
-from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.masks import MASKS
-from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
+from lapgs_plugin.scenes.parallel import ProgressCallback, bar, in_threads
 from lapgs_plugin.scenes.prepare.photos import Photos
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.untrusted import read_json
@@ -74,15 +73,9 @@ class Job:
         """Folder of the scene until it is whole."""
         return self.work / "scene"
 
-    @contextmanager
-    def bar(self, title: str, unit: str) -> Iterator[ProgressCallback]:
+    def bar(self, title: str, unit: str) -> AbstractContextManager[ProgressCallback]:
         """Show a bar if wanted; the function takes the number of finished items and their total."""
-        if not self.progress:
-            yield lambda done, total: None
-            return
-        with item_progress(unit) as bar:
-            task = bar.add_task(title, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
+        return bar(title, unit, self.progress)
 
     @contextmanager
     def timed(self, title: str) -> Iterator[None]:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from PIL import Image
 
-from lapgs_plugin.errors import MissingExtraError, SceneError, counted, first_line, printable
+from lapgs_plugin.errors import SceneError, counted, first_line, printable, require_extra
 from lapgs_plugin.limits import PHOTO_PIXELS
-from lapgs_plugin.scenes.images import JPEG_QUALITY
-from lapgs_plugin.scenes.masks import HEIC
+from lapgs_plugin.scenes.images import JPEG
+from lapgs_plugin.scenes.masks import HEIC, SUFFIXES
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 SHOWN = 10
 """File names in a message, at most."""
 MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 271, 272, 0x8769, 37386, 41989
@@ -71,12 +69,9 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         and not (aside is not None and file.resolve().is_relative_to(aside))
     )
     heic = [file for file in present if file.suffix.lower() in HEIC]
-    if heic and find_spec("pillow_heif") is None:
-        raise MissingExtraError(
-            f"{source}: pillow-heif is needed for {counted(len(heic), 'HEIC photo')} "
-            f"({listed([file.name for file in heic])}): "
-            "pip install 'lapgs_plugin[heic]'; or convert them to JPEG"
-        )
+    if heic:
+        what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed([file.name for file in heic])})"
+        require_extra("pillow_heif", "heic", what, "convert them to JPEG")
     chosen = [file for file in present if file.suffix.lower() in (*SUFFIXES, *HEIC)]
     others = sorted({file.suffix.lower() or file.name for file in present} - {*SUFFIXES, *HEIC})
     if len(chosen) < 2:
@@ -136,7 +131,7 @@ def convert_photo(source: Path, target: Path) -> None:
             if photo.format == "WEBP" and photo.has_transparency_data:
                 raise SceneError(f"{source}: a WebP photo with transparency, expected none in WebP; convert it to PNG")
             exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
-            photo.convert("RGB").save(target, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", exif=exif)
+            photo.convert("RGB").save(target, **JPEG, exif=exif)
     except SceneError:
         raise
     except (OSError, SyntaxError, ValueError, RuntimeError) as error:

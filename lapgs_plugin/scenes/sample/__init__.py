@@ -1,5 +1,5 @@
 """A procedural scene with exact cameras: `lapgs sample`."""
 
-from lapgs_plugin.scenes.sample.scene import check_sample_scene, make_sample_scene, parse_size
+from lapgs_plugin.scenes.sample.scene import check_sample_scene, make_sample_scene
 
-__all__ = ["check_sample_scene", "make_sample_scene", "parse_size"]
+__all__ = ["check_sample_scene", "make_sample_scene"]

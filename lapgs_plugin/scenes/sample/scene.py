@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -62,18 +61,6 @@ def make_sample_scene(
         cameras = [orbit_camera(index, (width, height), seed) for index in range(views)]
         _write_images(folder / "images", world, cameras, progress)
         _write_model(folder / "sparse" / "0", cameras, sample_points(world, cameras, points, seed))
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height from text such as "480x320".
-
-    Raises:
-        UserInputError: the text has another form.
-    """
-    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", text.strip())
-    if match is None:
-        raise UserInputError(f"--size {text!r}: expected WIDTHxHEIGHT in pixels, such as 480x320")
-    return int(match[1]), int(match[2])
 
 
 def check_sample_scene(width: int, height: int, views: int, points: int, seed: int = 0) -> None:
