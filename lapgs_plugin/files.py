@@ -128,18 +128,12 @@ def write_text(path: Path, text: str, *, training: bool = False) -> None:
 
 def is_file(path: Path) -> bool:
     """Return whether a file exists; False also for names that the file system does not allow."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+    return os.path.isfile(path)  # noqa: PTH113  # Path.is_file raises for these names
 
 
 def is_folder(path: Path) -> bool:
     """Return whether a folder exists; False also for names that the file system does not allow."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
+    return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises for these names
 
 
 def require_manifest(folder: Path) -> None:

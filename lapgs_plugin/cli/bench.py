@@ -12,7 +12,6 @@ from lapgs_plugin.cli.bench_blend import blend
 from lapgs_plugin.cli.bench_raster import raster
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.settings import BenchSettings
 
 EXPERIMENT = "run"
@@ -64,18 +63,14 @@ def ops(
 
     Speed-ups and differences are against PyTorch's operations. Other libraries have their own names.
     """
-    if device not in ("auto", "cpu", "cuda"):
-        raise UserInputError(f"--device {device}: expected auto, cpu or cuda")
     import torch
     from rich import box
     from rich.table import Table
 
     from lapgs_plugin.ops.benchmark import benchmark
+    from lapgs_plugin.rasterizers.choice import chosen_device
 
-    has_gpu = torch.cuda.is_available()
-    if device == "cuda" and not has_gpu:
-        raise UserInputError("--device cuda: PyTorch finds no CUDA device; `lapgs doctor` says why")
-    where = torch.device("cuda" if has_gpu and device != "cpu" else "cpu")
+    where = torch.device(chosen_device(device))
     table = Table(title=f"Operations at {width}x{height} with {gaussians} Gaussians on {where}", box=box.SIMPLE)
     for heading in ("operation", "version"):
         table.add_column(heading)

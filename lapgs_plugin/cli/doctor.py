@@ -81,7 +81,9 @@ def examine() -> dict[str, list[Finding]]:
         "PyTorch": findings.torch_findings(torch, driver.result()),
         "Compilers": compilers,
         "CPU rasterizer": findings.numba_findings(raster_probe.result()),
-        "Packages": findings.package_findings(requirements, {name: probe.result() for name, probe in imports.items()}),
+        "Packages": findings.package_findings(
+            requirements[""], {name: probe.result() for name, probe in imports.items()}
+        ),
         "Extras": findings.extra_findings(requirements),
         "Backbones": [
             findings.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),

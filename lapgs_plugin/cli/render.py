@@ -231,7 +231,7 @@ def _write_split(
 
     from lapgs_plugin.progress import item_progress
     from lapgs_plugin.rendering.images import file_stems, view_images
-    from lapgs_plugin.scenes import write_image
+    from lapgs_plugin.scenes.images import write_image
 
     stems, pyramid, suffix = file_stems(views), renderer.pyramid, settings.image_format
     # In threads, because compressing a PNG takes longer than rendering it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -87,6 +87,7 @@ def run(
     import logging
 
     from lapgs_plugin.checkouts.script import require_script
+    from lapgs_plugin.rasterizers.choice import chosen_device
     from lapgs_plugin.runs.gpu_busy import require_cuda
 
     if options.off and (idle := sorted(given_options(context) - OF_OFF)):
@@ -95,7 +96,7 @@ def run(
     plain = options.off and not options.record
     if measuring.gpu_busy and plain:
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
-    device = _chosen_device(options.device)
+    device = chosen_device(options.device, "--device cpu runs the checkout on CPU stand-ins")
     if measuring.gpu_busy:
         require_cuda(device)
     path, words = require_script(script), arguments or []
@@ -148,7 +149,7 @@ def _execute(
                 resume=options.resume,
                 overwrite=options.overwrite,
                 watcher=watcher,
-                **asdict(measuring),
+                measuring=measuring,
             )
             driver.run()
         if driver.folder is not None:
@@ -158,18 +159,6 @@ def _execute(
         if line is None:
             raise
         raise line from error
-
-
-def _chosen_device(device: str) -> str:
-    """Return "cuda" or "cpu" for a value of --device."""
-    import torch
-
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise UserInputError(
-            "--device cuda: PyTorch finds no CUDA device; --device cpu runs the checkout on CPU stand-ins"
-        )
-    return device if device != "auto" else "cuda" if available else "cpu"
 
 
 def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:

@@ -13,22 +13,17 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-import packaging.requirements
+from packaging.requirements import Requirement
 from packaging.version import Version
 
-from lapgs_plugin.environment import (
-    PACKAGE,
-    gsplat_built,
-    installed_version,
-    processor_name,
-    run_program,
-)
+from lapgs_plugin.environment import PACKAGE, gsplat_built, installed_version, processor_name, run_program
 from lapgs_plugin.environment.probes import Probe, run_probe
 from lapgs_plugin.errors import typed_line
 from lapgs_plugin.limits import usable_processors
 
 OLDEST_PYTHON = (3, 10)
-DEVELOPMENT_EXTRA = "dev"
+NOT_REPORTED = ("", "dev")
+"""Extras that are none, or for development."""
 
 VARIABLES = (
     "CUDA_VISIBLE_DEVICES",
@@ -56,23 +51,6 @@ class Finding:
     status: str
     detail: str
     advice: str = ""
-
-
-@dataclass(frozen=True)
-class Requirement:
-    """A requirement in this package's metadata.
-
-    Attributes:
-        name: of the distribution.
-        text: with version bounds, for an installer.
-        minimum: lowest version, "" for any.
-        extra: the extra that needs it, "" if it is always needed.
-    """
-
-    name: str
-    text: str
-    minimum: str
-    extra: str
 
 
 def system_findings() -> list[Finding]:
@@ -169,13 +147,13 @@ def numba_findings(probe: Probe) -> list[Finding]:
 
 
 def package_findings(requirements: Sequence[Requirement], imports: Mapping[str, Probe]) -> list[Finding]:
-    """Report every package that is always needed, with its version.
+    """Report packages with their versions.
 
     Args:
-        requirements: result of `own_requirements`.
+        requirements: of the packages.
         imports: by distribution, result of the probe "import" for compiled packages.
     """
-    found = [_package_finding(each) for each in requirements if not each.extra]
+    found = [_package_finding(each) for each in requirements]
     return [_with_import(finding, imports[finding.name]) if finding.name in imports else finding for finding in found]
 
 
@@ -187,12 +165,11 @@ def _with_import(package: Finding, probe: Probe) -> Finding:
     return Finding(package.name, "problem", f"{package.detail}, but the import fails: {probe.error}", advice)
 
 
-def extra_findings(requirements: Sequence[Requirement]) -> list[Finding]:
-    """Report for every optional extra whether all its packages are installed."""
-    extras = sorted({each.extra for each in requirements} - {"", DEVELOPMENT_EXTRA})
+def extra_findings(requirements: Mapping[str, Sequence[Requirement]]) -> list[Finding]:
+    """Report for every optional extra in the result of `own_requirements` whether all its packages are installed."""
     found = []
-    for extra in extras:
-        members = [_package_finding(each) for each in requirements if each.extra == extra]
+    for extra in sorted(name for name, members in requirements.items() if members and name not in NOT_REPORTED):
+        members = [_package_finding(each) for each in requirements[extra]]
         lacking = [member.name for member in members if member.status != "ok"]
         detail = f"lacks {', '.join(lacking)}" if lacking else ", ".join(f"{m.name} {m.detail}" for m in members)
         advice = f"python -m pip install '{PACKAGE}[{extra}]'" if lacking else ""
@@ -200,23 +177,19 @@ def extra_findings(requirements: Sequence[Requirement]) -> list[Finding]:
     return found
 
 
-def own_requirements() -> list[Requirement]:
-    """Return the requirements in this package's metadata for this Python; empty if it is not installed."""
+def own_requirements() -> dict[str, list[Requirement]]:
+    """Return the requirements in this package's metadata for this Python by extra, "" for those always needed."""
     try:
-        texts = metadata.requires(PACKAGE) or []
+        parsed = [Requirement(text) for text in metadata.requires(PACKAGE) or []]
     except metadata.PackageNotFoundError:
-        return []
-    extras = ("", *(metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()))
-    parsed = [packaging.requirements.Requirement(text) for text in texts]
-    return [
-        _own(requirement, extra)
-        for requirement in parsed
-        for extra in extras
-        if _applies(requirement, extra) and not (extra and _applies(requirement, ""))
-    ]
+        return {"": []}
+    always = [each for each in parsed if _applies(each, "")]
+    extras = metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
+    of_extras = {extra: [each for each in parsed if each not in always and _applies(each, extra)] for extra in extras}
+    return {"": always, **of_extras}
 
 
-def _applies(requirement: packaging.requirements.Requirement, extra: str) -> bool:
+def _applies(requirement: Requirement, extra: str) -> bool:
     """Return whether a requirement applies here with this extra."""
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
@@ -252,18 +225,14 @@ def extension_finding(module: str, purpose: str) -> Finding:
 
 def _package_finding(requirement: Requirement) -> Finding:
     version = installed_version(requirement.name)
-    install = f"python -m pip install '{requirement.text}'"
+    install = f"python -m pip install '{requirement.name}{requirement.specifier}'"
+    minimum = next((bound.version for bound in requirement.specifier if bound.operator == ">="), "")
     if version is None:
         return Finding(requirement.name, "problem", "not installed", install)
-    if requirement.minimum and Version(version).release < Version(requirement.minimum).release:
-        detail = f"{version} is older than {requirement.minimum}, which is needed"
+    if minimum and Version(version).release < Version(minimum).release:
+        detail = f"{version} is older than {minimum}, which is needed"
         return Finding(requirement.name, "problem", detail, install)
     return Finding(requirement.name, "ok", version)
-
-
-def _own(requirement: packaging.requirements.Requirement, extra: str) -> Requirement:
-    minimum = next((bound.version for bound in requirement.specifier if bound.operator == ">="), "")
-    return Requirement(requirement.name, f"{requirement.name}{requirement.specifier}", minimum, extra)
 
 
 def _memory_gib() -> float | None:

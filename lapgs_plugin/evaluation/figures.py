@@ -19,7 +19,7 @@ from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
-from lapgs_plugin.rendering.options import AS_TRAINED, RenderOptions
+from lapgs_plugin.rendering.options import WHERE_TRAINED, RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import RunArchive
@@ -101,7 +101,7 @@ def measure_view(
 
 
 def evaluate_run(
-    archive: RunArchive, options: RenderOptions = AS_TRAINED, lpips: LpipsRequest | None = None
+    archive: RunArchive, options: RenderOptions = WHERE_TRAINED, lpips: LpipsRequest | None = None
 ) -> dict[str, Any]:
     """Measure a complete run on its held-out views, or on its training views when none were held out.
 

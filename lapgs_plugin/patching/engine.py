@@ -6,13 +6,13 @@ is idempotent and replaces edits of an older version.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.patching.blocks import find_blocks, insertion, replacement, stray_marker, without_blocks
 from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes, read_source
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
@@ -75,7 +75,7 @@ def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tup
     Raises:
         PatchError: `checkout` is not a folder or has no known extension.
     """
-    if not os.path.isdir(checkout):  # noqa: PTH112  # Path.is_dir raises where a name is too long for the file system
+    if not is_folder(checkout):
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
     recipes = load_recipes() if recipes is None else recipes
     folders = [checkout, *sorted(_subfolders(checkout))]

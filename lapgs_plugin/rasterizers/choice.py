@@ -40,6 +40,20 @@ class PlacedRasterizer:
     unsupported: Mapping[str, Any]
 
 
+def chosen_device(device: str, advice: str = "`lapgs doctor` says why, or use --device cpu") -> str:
+    """Return "cuda" or "cpu" for a value of --device; "auto" takes CUDA if there is a device.
+
+    Raises:
+        UserInputError: an unknown value, or CUDA without a device; `advice` says what to do then.
+    """
+    if device not in DEVICES:
+        raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise UserInputError(f"--device cuda: PyTorch finds no CUDA device; {advice}")
+    return "cuda" if available and device != "cpu" else "cpu"
+
+
 def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "auto") -> PlacedRasterizer:
     """Choose the rasterizer of a finished run and its device, and log the choice with its reason.
 
@@ -56,12 +70,7 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
         UserInputError: an unknown device or name, or a device that this machine or the rasterizer does not have.
         MissingExtraError: the requested rasterizer is not installed.
     """
-    if device not in DEVICES:
-        raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserInputError(
-            "--device cuda: PyTorch finds no CUDA device; `lapgs doctor` says why, or use --device cpu"
-        )
+    chosen_device(device)
     settings = _raster_settings(manifest)
     if rasterizer == "auto":
         placed, why = _most_similar(manifest.rasterizer, device, settings)

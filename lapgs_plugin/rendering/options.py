@@ -21,5 +21,5 @@ class RenderOptions:
     )
 
 
-AS_TRAINED = RenderOptions()
+WHERE_TRAINED = RenderOptions()
 """The scene where the run was trained, and the most similar rasterizer of this machine."""

@@ -16,8 +16,9 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.limits import FRAMES, VIEW_PIXELS
 from lapgs_plugin.rendering.rig import Rig, camera_positions, looking, posed, unit
-from lapgs_plugin.scenes.source import LARGEST, LONGEST_FOCAL, LONGEST_SIDE
-from lapgs_plugin.untrusted import read_json
+from lapgs_plugin.scenes.blender import read_camera
+from lapgs_plugin.scenes.source import check_camera
+from lapgs_plugin.untrusted import read_json, shortened
 
 MAX_KEYS = 24
 """Most cameras that a spline passes; handheld photos are too shaky to pass all of many."""
@@ -29,7 +30,6 @@ FACING_SHARE = 0.5
 """Radius of an orbit, as a share of the cameras' spread, if all cameras are on one side."""
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-RIGID_TOLERANCE = 1e-3
 
 
 def orbit(rig: Rig, frames: int) -> list[Camera]:
@@ -110,7 +110,7 @@ def read_trajectory(path: Path) -> list[Camera]:
 
     Each matrix is camera to world with OpenGL's axes (x right, y up, z back). "fl_y" defaults to "fl_x", "cx" and "cy"
     to the image centre, and "camera_angle_x" in radians may replace "fl_x". A frame may override any of these, but
-    not the size.
+    not the size. Distortion is ignored.
 
     Raises:
         UserInputError: the file or one of its cameras cannot be used; names the frame.
@@ -123,17 +123,14 @@ def read_trajectory(path: Path) -> list[Camera]:
     FRAMES.check(len(frames), f"--trajectory {path} has {len(frames)} frames")
     cameras = []
     for index, frame in enumerate(frames):
-        try:
-            camera = _read_camera({**values, **frame})
-        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-            reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
-            raise UserInputError(
-                f"--trajectory {path}: the camera of frame {index} is not usable: {reason}; expected a rigid 4x4 "
-                "transform_matrix, w, h and fl_x or camera_angle_x"
-            ) from error
-        subject = f"--trajectory {path}: the camera of frame {index} has {camera.width}x{camera.height} pixels"
+        where = f"--trajectory {path}: frame {index}"
+        if not isinstance(frame, dict):
+            raise UserInputError(f"{where} is {shortened(frame)}, expected a table with transform_matrix")
+        camera = read_camera({**values, **frame}, where)
+        check_camera(where, camera)
+        subject = f"{where} has {camera.width}x{camera.height} pixels"
         VIEW_PIXELS.check(camera.width * camera.height, subject, "write a smaller w and h")
-        cameras.append(camera)
+        cameras.append(camera.to(dtype=torch.float32))
     return cameras
 
 
@@ -185,35 +182,6 @@ def _short_tour(distances: NDArray[np.float64]) -> list[int]:
                 tour[i + 1 : i + 3 + best] = tour[i + 1 : i + 3 + best][::-1]
                 improved = True
     return tour
-
-
-def _read_camera(values: dict[str, Any]) -> Camera:
-    width, height = int(values["w"]), int(values["h"])
-    if "camera_angle_x" in values and "fl_x" not in values:
-        focal = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
-    else:
-        focal = float(values["fl_x"])
-    focal_y = float(values.get("fl_y", focal))
-    cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-    matrix = np.array(values["transform_matrix"], dtype=np.float64)
-    if matrix.shape != (4, 4):
-        raise ValueError(f"transform_matrix has shape {matrix.shape}")
-    if not np.isfinite([*matrix.ravel(), focal, focal_y, cx, cy]).all():
-        raise ValueError("NaN or inf in it")
-    if (largest := float(np.abs(matrix).max())) > LARGEST:
-        raise ValueError(f"{largest:g} in transform_matrix, at most {LARGEST:g} is of use")
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
-    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise ValueError("transform_matrix is not a rotation and a translation")
-    if min(width, height, focal, focal_y) <= 0:
-        raise ValueError(f"{width}x{height} pixels with focal lengths {focal:g} and {focal_y:g}")
-    if max(width, height) > LONGEST_SIDE or max(focal, focal_y, abs(cx), abs(cy)) > LONGEST_FOCAL * max(width, height):
-        raise ValueError(
-            f"{width:.6g}x{height:.6g} pixels with focal lengths {focal:g} and {focal_y:g} around ({cx:g}, {cy:g})"
-        )
-    pose = torch.from_numpy(np.linalg.inv(matrix @ OPENGL_AXES)).float()
-    return Camera(width, height, focal, focal_y, cx, cy, pose)
 
 
 def _passing_times(positions: NDArray[np.float64], rotations: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -110,7 +110,7 @@ class ActiveStage:
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
         self._context.parts.breakdown.mark("other")
-        every = self._context.test_every
+        every = self._context.measuring.test_every
         if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
             elapsed = self.record.elapsed_in_run()
             with self.record.outside("evaluation"):
@@ -169,7 +169,7 @@ class ActiveStage:
         self._require_finite(field)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
         self.record.archive(result, None if self._joint is None else self._joint.fields(self._exported))
-        if self._views.test and (self.stage.level == 0 or self._context.test_every is not None):
+        if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -22,8 +22,16 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
+
+
+@dataclass
+class Running:
+    """Hold the stage, or that of the dry run, which answers the replaced symbols; None between stages."""
+
+    stage: Any = None
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,8 @@ class RunContext:
     hooks: HookCaller
     parts: IterationParts
     watcher: Watcher
-    test_every: int | None
-    gpu_busy: bool
+    measuring: MeasuringOptions
+    running: Running = field(default_factory=Running)
 
     def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""

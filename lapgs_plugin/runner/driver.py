@@ -50,6 +50,7 @@ from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
 
 logger = logging.getLogger(__name__)
@@ -65,10 +66,8 @@ class HierarchyDriver:
         resume: continue the run in the output folder.
         overwrite: replace the run in the output folder.
         hooks: hooks that run after those registered by entry point.
-        breakdown: measure the parts of iterations.
-        gpu_busy: profile some iterations of each stage; needs a CUDA device.
+        measuring: what is measured; None measures held-out views at the end alone.
         watcher: may look at the fields between iterations.
-        test_every: iterations between two measurements of held-out views; None measures them at the end of the run.
 
     Attributes:
         folder: run folder, once the run is complete.
@@ -83,28 +82,25 @@ class HierarchyDriver:
         resume: bool = False,
         overwrite: bool = False,
         hooks: Sequence[StageHook] = (),
-        breakdown: bool = False,
-        gpu_busy: bool = False,
+        measuring: MeasuringOptions | None = None,
         watcher: Watcher | None = None,
-        test_every: int | None = None,
     ) -> None:
         self._adapter, self._options = adapter, options
         self._resume, self._overwrite = resume, overwrite
-        place = torch.device(device)
+        place, measuring = torch.device(device), measuring or MeasuringOptions()
+        parts = IterationParts(place, measuring.breakdown)
         self._context = RunContext(
             adapter=adapter,
             options=options,
             device=place,
             images=SceneImages(),
-            wrapper=RasterizerWrapper(),
+            wrapper=RasterizerWrapper(parts.mark_render),
             hooks=HookCaller(hooks),
-            parts=IterationParts(place, breakdown),
+            parts=parts,
             watcher=watcher or Watcher(),
-            test_every=test_every,
-            gpu_busy=gpu_busy,
+            measuring=measuring,
         )
-        self._active: ActiveStage | None = None
-        self._replacements = StageReplacements(self._context, lambda: self._active, self._train)
+        self._replacements = StageReplacements(self._context, self._train)
         self.folder: Path | None = None
 
     def run(self) -> None:
@@ -117,7 +113,7 @@ class HierarchyDriver:
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
-            counting_steps(model, lambda: self._active),
+            counting_steps(model, lambda: self._context.running.stage),
         ):
             self._adapter.script.run_main()
 
@@ -141,7 +137,7 @@ class HierarchyDriver:
             )
             if not self._has_residuals:
                 plan = between_events(plan, self._schedule, _variables(call))
-            dry_run = DryRun(self._context, call, scene, plan, self._activate)
+            dry_run = DryRun(self._context, call, scene, plan)
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
@@ -153,7 +149,7 @@ class HierarchyDriver:
                     if self._has_residuals:
                         self._run_stages(run, plan, Path(scratch))
                     else:
-                        SingleCall(self._context, run, plan, self._activate).train(Path(scratch))
+                        SingleCall(self._context, run, plan).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
@@ -171,7 +167,8 @@ class HierarchyDriver:
         for stage in plan:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
-            active = self._active = ActiveStage(self._context, run, window, call, tuple(finished), before)
+            active = ActiveStage(self._context, run, window, call, tuple(finished), before)
+            self._context.running.stage = active
             try:
                 active.load_images()
                 if stage.level in run.archive.available_levels:
@@ -182,7 +179,7 @@ class HierarchyDriver:
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
-                self._active = None
+                self._context.running.stage = None
                 active.close()
             finished.append(FinishedStage(stage, call))
 
@@ -208,9 +205,6 @@ class HierarchyDriver:
     def _has_residuals(self) -> bool:
         """Whether some fields are residuals; without any, one call of the script's `training` trains all levels."""
         return self._options.levels > 1 and not self._options.nested
-
-    def _activate(self, stage: Any) -> None:
-        self._active = stage
 
     def _open_archive(self, folder: Path, manifest: Manifest) -> RunArchive:
         """Create the run folder, or open it to continue the run.

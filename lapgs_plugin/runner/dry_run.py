@@ -59,18 +59,10 @@ class DryRun:
         call: the script's call of `training`.
         scene: the checkout's scene.
         plan: the stages.
-        activate: receives what answers the replaced symbols; None at the end.
     """
 
-    def __init__(
-        self,
-        context: RunContext,
-        call: TrainingCall,
-        scene: CheckoutScene,
-        plan: StagePlan,
-        activate: Callable[[Any], None],
-    ) -> None:
-        self._context, self._scene, self._plan, self._activate = context, scene, plan, activate
+    def __init__(self, context: RunContext, call: TrainingCall, scene: CheckoutScene, plan: StagePlan) -> None:
+        self._context, self._scene, self._plan = context, scene, plan
         self._adapter = context.adapter
         self._call = call
         self._inputs: Mapping[str, Any] = {}
@@ -135,7 +127,7 @@ class DryRun:
                 raise _Enough  # the loop would run to its end
 
         self._context.wrapper.rendering = stage.rendering
-        self._activate(stage)
+        self._context.running.stage = stage
         watching = register_optimizer_step_post_hook(stepped)
         try:
             with self._step("the first iteration", "one as without lapgs", works):
@@ -145,7 +137,7 @@ class DryRun:
         finally:
             watching.remove()
             self._context.wrapper.rendering = None
-            self._activate(None)
+            self._context.running.stage = None
         place = self._adapter.profile.source.place(self._adapter.profile.source.training)
         if stage.iteration == 0:
             raise UserInputError(

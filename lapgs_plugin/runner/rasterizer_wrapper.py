@@ -25,18 +25,20 @@ from lapgs_plugin.runner.stage_rendering import StageRendering
 class RasterizerWrapper:
     """Make the replacements of a checkout's renderers, and of its rasterizers' settings, classes and functions.
 
+    Args:
+        mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
+
     Attributes:
         rendering: how the running stage is rendered; None leaves every call unchanged.
         noted: key of the view that is being rendered; None outside of the renderers, and for other cameras.
         given: values of each Gaussian (n, k) that the renderer was called with, such as colours to render instead.
-        mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, mark: Callable[[str], None] = lambda part: None) -> None:
+        self._mark = mark
         self.rendering: StageRendering | None = None
         self.noted: str | None = None
         self.given: tuple[Tensor, ...] = ()
-        self.mark: Callable[[str], None] = lambda part: None
         self._zeros: Tensor | None = None
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -58,7 +60,7 @@ class RasterizerWrapper:
         """Return the replacement of the settings' constructor."""
 
         def make_settings(*args: Any, **kwargs: Any) -> Any:
-            self.mark("forward")
+            self._mark("forward")
             settings = original(*args, **kwargs)
             rendering = self.rendering
             if rendering is None:
@@ -109,7 +111,7 @@ class RasterizerWrapper:
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
             def marked(**inputs: Any) -> Any:
                 outputs = rasterizer(**inputs)
-                self.mark("loss")
+                self._mark("loss")
                 return outputs
 
             colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]

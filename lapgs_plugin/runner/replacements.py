@@ -25,17 +25,15 @@ class StageReplacements:
 
     Args:
         context: shared objects of the run.
-        running: returns the running stage, None between stages.
         train: called in place of the script's `training`.
     """
 
     def __init__(
         self,
         context: RunContext,
-        running: Callable[[], ActiveStage | None],
         train: Callable[[TrainingCall], None],
     ) -> None:
-        self._context, self._running, self._train = context, running, train
+        self._context, self._train = context, train
         self._controlling = False  # whether a method of density control is running
 
     def all(self) -> list[Replacement]:
@@ -45,7 +43,6 @@ class StageReplacements:
             UserInputError: this is no 3DGS checkout, or another rasterizer than its own is installed.
         """
         adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
-        self._context.wrapper.mark = parts.mark_render
         require_matching_rasterizer(profile, adapter.info.title)
         return [
             *self._in_training(profile),
@@ -60,6 +57,10 @@ class StageReplacements:
             *self._in_scores(profile),
             *parts.replacements(profile, adapter.info),
         ]
+
+    def _running(self) -> ActiveStage | None:
+        stage: ActiveStage | None = self._context.running.stage
+        return stage
 
     def _in_residual(self) -> bool:
         stage = self._running()

@@ -67,16 +67,12 @@ class SingleCall:
 
     Args:
         context, run, plan: the run.
-        activate: called with the stage that answers the replaced symbols from now on; None after the last one.
     """
 
-    def __init__(
-        self, context: RunContext, run: TrainingRun, plan: StagePlan, activate: Callable[[ActiveStage | None], None]
-    ) -> None:
-        self._context, self._run, self._plan, self._activate = context, run, plan, activate
+    def __init__(self, context: RunContext, run: TrainingRun, plan: StagePlan) -> None:
+        self._context, self._run, self._plan = context, run, plan
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
-        self._opt = run.call.opt
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
         dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
         dataset.model_path = str(run.archive.path("level_0"))
@@ -108,7 +104,7 @@ class SingleCall:
             self._explain_failure(self._stage)
             raise
         finally:
-            self._activate(None)
+            self._context.running.stage = None
             self._stage.close()
 
     def _explain_failure(self, stage: NestedStage) -> None:
@@ -130,9 +126,10 @@ class SingleCall:
         return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
 
     def _begin(self, stage: NestedStage) -> None:
-        for name in self._context.adapter.densify_thresholds(self._opt):
-            setattr(self._call.opt, name, getattr(self._opt, name) * stage.window.threshold_factor)
-        self._activate(stage)
+        given = self._run.call.opt
+        for name in self._context.adapter.densify_thresholds(given):
+            setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
+        self._context.running.stage = stage
         stage.load_images()
         stage.begin()
 

@@ -22,7 +22,7 @@ class StageRecord(LoopRecord):
     """Measure one stage and write the measurements into the run folder."""
 
     def __init__(self, context: RunContext, archive: RunArchive, window: StageWindow) -> None:
-        super().__init__(context.device, window.stage.iterations if context.gpu_busy else 0)
+        super().__init__(context.device, window.stage.iterations if context.measuring.gpu_busy else 0)
         self._parts, self._archive, self._window = context.parts, archive, window
 
     def start(self) -> None:

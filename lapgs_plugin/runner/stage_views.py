@@ -86,15 +86,13 @@ class StageViews:
 
     def train_views(self) -> list[Any]:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
-        views = [self._view(key) for key in self.train]
-        keys = {id(view): key for key, view in self._views.items()}
 
         def prefetch(view: Any) -> None:
             rendering = self._context.wrapper.rendering  # of the running stage: views may outlive this one
             if rendering is not None:
-                rendering.prefetch(keys[id(view)])
+                rendering.prefetch(self._context.images.key(view))
 
-        return PrefetchingViews(views, prefetch)
+        return PrefetchingViews([self._view(key) for key in self.train], prefetch)
 
     def test_views(self) -> list[Any]:
         """Return the held-out views."""

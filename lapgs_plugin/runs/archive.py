@@ -11,11 +11,7 @@ from pydantic import Field
 
 from lapgs_plugin.errors import FieldError, RunFolderError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
-from lapgs_plugin.files import (
-    MANIFEST,
-    FolderLock,
-    one_line_errors,
-)
+from lapgs_plugin.files import MANIFEST, FolderLock, one_line_errors
 from lapgs_plugin.runs.layout import (
     CHECKPOINT,
     EXPOSURE,
@@ -37,6 +33,7 @@ from lapgs_plugin.runs.manifest import LevelRecord, Manifest, read_manifest
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.run_files import RunFiles
 from lapgs_plugin.runs.tensors import read_tensors, write_tensors
+from lapgs_plugin.runs.training_figures import sums
 from lapgs_plugin.untrusted import read_json
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -205,9 +202,7 @@ class RunArchive(RunFiles):
             if optimizer_state is not None:
                 write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
-        manifest = replace(self._manifest, records=(*self._manifest.records, record))
-        self._write_json(MANIFEST, asdict(manifest), training=True)
-        self._manifest = manifest
+        self._write_manifest(replace(self._manifest, records=(*self._manifest.records, record)))
         self._settle_fields()
         with one_line_errors(self._folder):
             self.path(CHECKPOINT).unlink(missing_ok=True)
@@ -217,12 +212,8 @@ class RunArchive(RunFiles):
         """Add seconds by purpose to the overhead of the level that was finished last."""
         self._require_lock()
         *before, last = self._manifest.records
-        total = {**last.overhead_seconds}
-        for purpose, value in seconds.items():
-            total[purpose] = total.get(purpose, 0.0) + value
-        manifest = replace(self._manifest, records=(*before, replace(last, overhead_seconds=total)))
-        self._write_json(MANIFEST, asdict(manifest), training=True)
-        self._manifest = manifest
+        last = replace(last, overhead_seconds=sums([last.overhead_seconds, seconds]))
+        self._write_manifest(replace(self._manifest, records=(*before, last)))
 
     def finish_extension(
         self,
@@ -260,10 +251,13 @@ class RunArchive(RunFiles):
                 path = self._extended_path(record.level, name, iterations)
                 self._write_json(str(path), dict(learned), training=True)
         self._remove(METRICS, STABILITY, REPORT)
-        self._write_json(MANIFEST, asdict(manifest), training=True)
-        self._manifest = manifest
+        self._write_manifest(manifest)
         self._settle_fields()
         self._remove(CHECKPOINT)
+
+    def _write_manifest(self, manifest: Manifest) -> None:
+        self._write_json(MANIFEST, asdict(manifest), training=True)
+        self._manifest = manifest
 
     def _settle_fields(self) -> None:
         """Rename jointly trained or extended fields to their final names, and remove those that do not count."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import Any
 
 import torch
 
@@ -17,8 +16,6 @@ they need; optimizer steps; everything else."""
 
 UNREAD_EVENTS = 256
 """Number of waiting events from which on those that the GPU has passed are read, to be used again."""
-
-Stamp = TypeVar("Stamp")
 
 
 class Overhead(dict[str, float]):
@@ -101,46 +98,29 @@ class Breakdown:
         return {}
 
 
-class Clock(ABC, Generic[Stamp]):
-    """Make time stamps for a `TimedBreakdown`."""
+class ProcessorClock:
+    """Make time stamps for a `TimedBreakdown`, by `time.perf_counter`."""
 
-    @abstractmethod
-    def stamp(self) -> Stamp:
+    def stamp(self) -> Any:
         """Return this moment in the device's work."""
+        return time.perf_counter()
 
-    @abstractmethod
-    def passed(self, stamp: Stamp) -> bool:
+    def passed(self, stamp: Any) -> bool:
         """Return whether the device has reached a moment; a GPU's work may lag behind."""
+        return True
 
-    @abstractmethod
-    def between(self, begin: Stamp, end: Stamp) -> float:
+    def between(self, begin: Any, end: Any) -> float:
         """Return the seconds between two moments that were reached."""
+        return float(end - begin)
 
-    @abstractmethod
     def wait(self) -> None:
         """Wait until every moment was reached."""
 
-    def release(self, stamp: Stamp) -> None:
+    def release(self, stamp: Any) -> None:
         """Take back a stamp that is not needed any more."""
 
 
-class ProcessorClock(Clock[float]):
-    """Read `time.perf_counter`."""
-
-    def stamp(self) -> float:
-        return time.perf_counter()
-
-    def passed(self, stamp: float) -> bool:
-        return True
-
-    def between(self, begin: float, end: float) -> float:
-        return end - begin
-
-    def wait(self) -> None:
-        return
-
-
-class StreamClock(Clock[torch.cuda.Event]):
+class StreamClock(ProcessorClock):
     """Record events in a CUDA device's current stream without waiting: they time its work and the gaps in it."""
 
     def __init__(self, device: torch.device) -> None:
@@ -165,7 +145,7 @@ class StreamClock(Clock[torch.cuda.Event]):
         self._free.append(stamp)
 
 
-class TimedBreakdown(Breakdown, Generic[Stamp]):
+class TimedBreakdown(Breakdown):
     """Measure the time between marks.
 
     Args:
@@ -175,10 +155,10 @@ class TimedBreakdown(Breakdown, Generic[Stamp]):
 
     measures = True
 
-    def __init__(self, clock: Clock[Stamp], seconds: Mapping[str, float] | None = None) -> None:
+    def __init__(self, clock: ProcessorClock, seconds: Mapping[str, float] | None = None) -> None:
         self._clock = clock
         self._seconds = dict.fromkeys(PARTS, 0.0) | dict(seconds or {})
-        self._marks: deque[tuple[str | None, Stamp]] = deque()
+        self._marks: deque[tuple[str | None, Any]] = deque()
         self._within = False
 
     def mark(self, part: str) -> None:
@@ -225,6 +205,4 @@ class TimedBreakdown(Breakdown, Generic[Stamp]):
 
 def breakdown_on(device: torch.device, seconds: Mapping[str, float] | None = None) -> Breakdown:
     """Return a breakdown that measures the work of a device; `seconds` as in `TimedBreakdown`."""
-    if device.type == "cuda":
-        return TimedBreakdown(StreamClock(device), seconds)
-    return TimedBreakdown(ProcessorClock(), seconds)
+    return TimedBreakdown(StreamClock(device) if device.type == "cuda" else ProcessorClock(), seconds)

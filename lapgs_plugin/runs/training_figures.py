@@ -32,8 +32,8 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     whole = all(record.breakdown_seconds for record in records)
     return {
         "train_seconds": math.fsum(record.train_seconds for record in records),
-        "overhead_seconds": _sums(record.overhead_seconds for record in records),
-        "breakdown_seconds": _sums(record.breakdown_seconds for record in records) if whole else {},
+        "overhead_seconds": sums(record.overhead_seconds for record in records),
+        "breakdown_seconds": sums(record.breakdown_seconds for record in records) if whole else {},
         "gpu_busy_seconds": math.fsum(busy) if len(busy) == len(records) else None,
         "num_gaussians": {str(record.level): record.num_gaussians for record in _rendered(records)},
         "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
@@ -49,7 +49,7 @@ def _rendered(records: Sequence[LevelRecord]) -> Sequence[LevelRecord]:
     return records[max((index for index, record in enumerate(records) if not record.signed), default=0) :]
 
 
-def _sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+def sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Add up the values of each name."""
     total: dict[str, float] = {}
     for each in parts:

@@ -116,12 +116,24 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
         where = f"{where} ({frame['file_path']})"
         if image.name in ("", "..") or image == Path(os.path.normpath(path)):
             raise SceneError(f"{where} names a folder, expected the name of its image; export the scene again")
-        camera = _camera({**values, **frame}, image, where, _world_to_camera(frame.get("transform_matrix"), where))
         inside = os.path.normpath(path)
         name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
-        check_camera(path / file, name, camera)
+        posed = {**values, **frame}
+        _refuse_distortion(posed, where)
+        if not ("w" in posed and "h" in posed):
+            posed["w"], posed["h"] = image_size(image)
+        camera = read_camera(posed, where)
+        check_camera(f"{path / file}: the camera of {name}", camera)
         frames.append(Frame(name, image, camera))
     return frames
+
+
+def _refuse_distortion(values: Values, where: str) -> None:
+    model = values.get("camera_model", "OPENCV")
+    distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
+    if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
+        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
+        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {UNDISTORT_HINT}")
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:
@@ -142,10 +154,10 @@ def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
     except (TypeError, ValueError, ArithmeticError):
         camera_to_world = np.empty(0)
     if camera_to_world.shape not in ((4, 4), (3, 4)) or not np.isfinite(camera_to_world).all():
-        raise SceneError(f"{where} has no transform_matrix of 4x4 finite numbers; export the scene again")
+        raise SceneError(f"{where} has no transform_matrix of 4x4 finite numbers; export it again")
     if (largest := float(np.abs(camera_to_world).max())) > LARGEST:
         raise SceneError(
-            f"{where} has {largest:g} in its transform_matrix, expected at most {LARGEST:g}; export the scene again"
+            f"{where} has {largest:g} in its transform_matrix, expected at most {LARGEST:g}; export it again"
         )
     rotation, position = camera_to_world[:3, :3] * (1.0, -1.0, -1.0), camera_to_world[:3, 3]
     u, _, vt = np.linalg.svd(rotation)
@@ -158,29 +170,33 @@ def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
     return result
 
 
-def _camera(values: Values, image: Path, where: str, world_to_camera: NDArray[np.float64]) -> Camera:
-    """Return the pinhole camera of a frame, from its values and those of the file."""
-    model = values.get("camera_model", "OPENCV")
-    distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
-    if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
-        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
-        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {UNDISTORT_HINT}")
+def read_camera(values: Values, where: str) -> Camera:
+    """Return the pinhole camera of a frame in float64, whatever its distortion; `check_camera` checks its numbers.
+
+    Args:
+        values: of the file and, before these, of the frame.
+        where: file and number of the frame, the subject of messages.
+
+    Raises:
+        SceneError: it has no rigid pose, no size or no focal length, or these are no numbers.
+    """
+    world_to_camera = _world_to_camera(values.get("transform_matrix"), where)
     try:
-        width, height = (int(values["w"]), int(values["h"])) if "w" in values and "h" in values else image_size(image)
+        width, height = int(values["w"]), int(values["h"])
         fx = _focal(values, "x", width)
         fy = _focal(values, "y", height) or fx
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-    except SceneError:
-        raise
+    except KeyError as error:
+        raise SceneError(f"{where} has no {error.args[0]}, expected w and h in pixels; export it again") from error
     except (TypeError, ValueError, ArithmeticError) as error:
-        raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export the scene again") from error
+        raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export it again") from error
     if fx is None or fy is None:
-        raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export the scene again")
+        raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export it again")
     for focal, side in ((fx, width), (fy, height)):
         if 0.0 < focal < SHORTEST_FOCAL * side:
             raise SceneError(
                 f"{where} has a focal length of {focal:g} pixels for {side:.6g} of the image, expected more than a "
-                "thousandth of them; export the scene again"
+                "thousandth of them; export it again"
             )
     return Camera(width, height, fx, fy, cx, cy, torch.from_numpy(world_to_camera))
 

@@ -123,7 +123,7 @@ def _frame(model: Path, folder: Path, camera: Camera, image: pycolmap.Image) -> 
     pose: NDArray[np.float64] = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()  # (3, 4)
     posed = replace(camera, world_to_camera=torch.from_numpy(pose))
-    check_camera(model, name, posed)
+    check_camera(f"{model}: the camera of {name}", posed)
     quaternion = image.cam_from_world().rotation.quat  # (4,) x, y, z, w
     if abs(float(np.linalg.norm(quaternion)) - 1.0) > UNIT_TOLERANCE:
         numbers = ", ".join(f"{number:g}" for number in quaternion)

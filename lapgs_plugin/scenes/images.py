@@ -132,38 +132,16 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     try:
         with Image.open(path) as source:
             source.load()
-            levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
+            picture = source if source.mode in ("RGB", "RGBA") else source.convert("RGBA")
+            if background is not None:
+                picture = _blend_8_bits(picture, background)
+            levels = np.asarray(picture.resize(size))[..., :3]  # (h, w, 3)
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
         raise SceneError(
             f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({_one_line(str(error))}); "
             "expected a whole 8-bit image, copy or convert it again"
         ) from error
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
-
-
-def _resize_8_bits(
-    source: Image.Image, size: tuple[int, int], background: tuple[float, float, float] | None
-) -> Image.Image:
-    """Blend over the background and resize, in bands of rows to save memory.
-
-    The result equals that of Pillow, which also resizes along rows first and rounds to 8 bits between.
-    """
-    width, height = source.size
-    narrowed: Image.Image | None = None
-    rows = max(1, STRIP_VALUES // (4 * width))
-    for top in range(0, height, rows):
-        band = source.crop((0, top, width, min(top + rows, height)))
-        band = band if band.mode in ("RGB", "RGBA") else band.convert("RGBA")
-        if background is not None:
-            band = _blend_8_bits(band, background)
-        if source.size != size and band.mode == "RGBA":
-            band = band.convert("RGBa")  # as Pillow does around resizing
-        if narrowed is None:
-            narrowed = Image.new(band.mode, (size[0], height))
-        narrowed.paste(band.resize((size[0], band.height)), (0, top))
-    assert narrowed is not None, "an image has rows"
-    resized = narrowed.resize(size)
-    return resized.convert("RGBA") if resized.mode == "RGBa" else resized
 
 
 def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) -> Image.Image:

@@ -60,18 +60,16 @@ class SceneSource:
     colors: NDArray[np.float64]  # (n, 3)
 
 
-def check_camera(path: Path, name: str, camera: Camera) -> None:
-    """Refuse a camera that cannot be trained on.
+def check_camera(who: str, camera: Camera) -> None:
+    """Refuse a camera that cannot be trained on or rendered from.
 
     Args:
-        path: file or folder of the camera, for messages.
-        name: name of its image, for messages.
+        who: the file and which of its cameras, the subject of messages.
         camera: the camera, in float64.
 
     Raises:
         SceneError: the camera has NaN, inf, numbers too large for float32, or a size or focal length out of range.
     """
-    who = f"{path}: the camera of {name}"
     numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     pose = camera.world_to_camera.numpy()
     if not (np.isfinite(numbers).all() and np.isfinite(pose).all()):

@@ -40,5 +40,5 @@ def test_table() -> None:
 
 
 def test_an_unknown_device_is_refused() -> None:
-    with pytest.raises(UserInputError, match="--device tpu: expected auto, cpu or cuda"):
+    with pytest.raises(UserInputError, match="--device tpu: expected auto, cuda, cpu"):
         succeeding(bench_app, 120)("ops", "--device", "tpu")

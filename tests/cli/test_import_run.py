@@ -25,7 +25,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import read_image
+from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_scene
 from tests.training_scene import blob_field

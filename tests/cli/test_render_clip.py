@@ -18,7 +18,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.run import run_cameras, run_renderer
 from lapgs_plugin.rendering.trajectory import trajectory_json
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import read_image
+from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import files_in, write_run, write_scene
 

@@ -22,7 +22,7 @@ from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.images import caption_height
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import read_image
+from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
 
@@ -225,16 +225,16 @@ def test_unknown_choices_name_the_known_ones(option: str, value: str, run: Path)
 
 
 def test_an_interruption_leaves_only_whole_images(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lapgs_plugin import scenes
+    from lapgs_plugin.scenes import images
 
-    write, started = scenes.write_image, count()
+    write, started = images.write_image, count()
 
     def interrupted(path: Path, image: object) -> None:
         if next(started) >= 4:  # counted before writing: several threads write at once
             raise KeyboardInterrupt
         write(path, image)
 
-    monkeypatch.setattr(scenes, "write_image", interrupted)
+    monkeypatch.setattr(images, "write_image", interrupted)
     result = CliRunner().invoke(app, ["render", str(run)])
     assert result.exit_code != 0
     written = files_in(run / "renders")

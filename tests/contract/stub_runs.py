@@ -31,6 +31,7 @@ from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runner.driver import HierarchyDriver
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
 
 CHECKOUTS = Path(__file__).parent / "checkouts"
@@ -221,10 +222,8 @@ def drive(
         device="cpu",
         resume=resume,
         hooks=hooks,
-        breakdown=breakdown,
-        gpu_busy=gpu_busy,
+        measuring=MeasuringOptions(test_every=test_every, breakdown=breakdown, gpu_busy=gpu_busy),
         watcher=watcher,
-        test_every=test_every,
     )
     driver.run()
 

@@ -39,7 +39,7 @@ from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.patching.recipe import patches_folder
 from lapgs_plugin.runner.imported import BREAKDOWN, CFG_ARGS, TRAIN_INFO
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import write_image
+from lapgs_plugin.scenes.images import write_image
 from tests.experiments.examples import SMALL
 from tests.fuzz.harness import Reader
 from tests.fuzz.mutations import as_json, as_namespace, as_toml

@@ -15,7 +15,6 @@ from lapgs_plugin.runs.profiling import (
     PARTS,
     UNREAD_EVENTS,
     Breakdown,
-    Clock,
     ProcessorClock,
     TimedBreakdown,
     breakdown_on,
@@ -23,7 +22,7 @@ from lapgs_plugin.runs.profiling import (
 
 
 @dataclass
-class LaggingClock(Clock[int]):
+class LaggingClock(ProcessorClock):
     """Stand in for a GPU's clock: stamps are tickets, reached only after the work before them, in whole seconds.
 
     Attributes:

@@ -20,7 +20,7 @@ import pycolmap
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.scenes import load_scene
@@ -298,7 +298,7 @@ def test_photos_of_several_cameras_get_cameras_of_their_own(
 ) -> None:
     for name, model in (("0.jpg", "One"), ("1.jpg", "One"), ("2.jpg", "Two")):
         exif = Image.Exif()
-        exif[photos_module.MODEL] = model
+        exif[ExifTags.Base.Model] = model
         with Image.open(noise / name) as picture:
             picture.load()
         picture.save(noise / name, exif=exif)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lapgs_plugin.errors import SceneError, UserInputError
-from lapgs_plugin.scenes import parse_resolution
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
+from lapgs_plugin.scenes.resolution import parse_resolution
 from tests.unit.test_scenes_colmap import Model, load, make_scene
 
 WHITE = (1.0, 1.0, 1.0)

@@ -226,9 +226,9 @@ def _run_step(
         try:
             with suppress(BrokenPipeError):  # reported by its exit code
                 worker.stdin.write(order.encode() + b"\n")
-            running = True
-            while running:
-                running = not _ended(worker)
+            while worker.poll() is None:
+                with suppress(subprocess.TimeoutExpired):
+                    worker.wait(POLL_SECONDS)
                 seen(min(done(), total), total)
         finally:
             worker.kill()
@@ -241,14 +241,6 @@ def _run_step(
             f"{job.work.parent}: COLMAP failed at {title.lower()} ({_last_words(log, worker.returncode)}); check free "
             f"space and memory, then repeat the command to continue, or remove {job.work} to start over"
         )
-
-
-def _ended(worker: subprocess.Popen[bytes]) -> bool:
-    try:
-        worker.wait(POLL_SECONDS)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
 
 
 def _last_words(log: Path, code: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -82,37 +83,34 @@ def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
 def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
     """Return width and height of each photo by name. Photos are decoded, to find damaged ones before the long steps."""
 
+    refused: dict[str, SceneError] = {}
+
     def size(name: str) -> tuple[int, int]:
         photo = job.found.files.get(name, job.photos / name)  # errors name the user's file, not our copy
         if photo.suffix.lower() in CONVERTED:
             photo = job.photos / name
-        width, height = check_image(photo)
-        longest = max(width, height)
-        share = min(1.0, (job.settings.max_size or longest) / longest)
-        subject = f"{photo}: the photo has {width}x{height} pixels"
-        VIEW_PIXELS.check(int(width * share) * int(height * share), subject, "choose a smaller --max-size", SceneError)
+        try:
+            width, height = check_image(photo)
+            share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))
+            pixels, subject = (
+                int(width * share) * int(height * share),
+                f"{photo}: the photo has {width}x{height} pixels",
+            )
+            VIEW_PIXELS.check(pixels, subject, "choose a smaller --max-size", SceneError)
+        except SceneError as error:
+            refused[name] = error
+            return 0, 0
         return width, height
 
-    def size_or_error(name: str) -> tuple[int, int] | SceneError:
-        try:
-            return size(name)
-        except SceneError as error:
-            return error
-
-    found = dict(zip(job.names, job.each_photo("Reading photos", size_or_error, job.names), strict=True))
-    _refuse_all({name: result for name, result in found.items() if isinstance(result, SceneError)}, len(found))
-    return {name: result for name, result in found.items() if not isinstance(result, SceneError)}
-
-
-def _refuse_all(refused: dict[str, SceneError], total: int) -> None:
-    """Raise the error of a photo, or one that lists several, so that a user need not find them one by one."""
+    sizes = dict(zip(job.names, job.each_photo("Reading photos", size, job.names), strict=True))
     if not refused:
-        return
-    first = next(iter(refused.values()))
-    if len(refused) == 1:
+        return sizes
+    names = [name for name in job.names if name in refused]
+    first = refused[names[0]]
+    if len(names) == 1:
         raise first
-    raise SceneError(
-        f"{len(refused)} of {total} photos cannot be used: {listed(list(refused))}; the first: {first}"
+    raise SceneError(  # of all, so that a user need not find them one by one
+        f"{len(names)} of {len(sizes)} photos cannot be used: {listed(names)}; the first: {first}"
     ) from first
 
 

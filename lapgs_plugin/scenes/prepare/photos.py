@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lapgs_plugin.errors import SceneError, counted, first_line, printable, require_extra
 from lapgs_plugin.limits import PHOTO_PIXELS
@@ -16,9 +16,6 @@ from lapgs_plugin.scenes.masks import HEIC, SUFFIXES
 
 SHOWN = 10
 """File names in a message, at most."""
-MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 271, 272, 0x8769, 37386, 41989
-"""Tags of EXIF."""
-
 CONVERTED = (*HEIC, ".webp")
 """Photos that COLMAP, as pycolmap brings it, does not read."""
 
@@ -143,7 +140,8 @@ def camera_of(photo: Path) -> tuple[str, ...]:
     """Return maker, model and focal lengths by EXIF, empty where a photo does not tell."""
     with suppress(Exception), Image.open(photo) as opened:  # other software reads the photo; EXIF only helps
         exif = opened.getexif()
-        inner = exif.get_ifd(EXIF_FOLDER)
-        values = (exif.get(MAKE), exif.get(MODEL), inner.get(FOCAL), inner.get(FOCAL_35MM))
+        inner, tags = exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base
+        values = [exif.get(tag) for tag in (tags.Make, tags.Model)]
+        values += [inner.get(tag) for tag in (tags.FocalLength, tags.FocalLengthIn35mmFilm)]
         return tuple("" if value is None else str(value).strip("\0 ") for value in values)
     return ("",) * 4
