@@ -83,7 +83,8 @@ class HierarchySettings:
     )
     split: str | None = option(
         None,
-        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2.",
+        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2, and "
+        "1/3,2/3 for nested levels of a checkout.",
         panel=PANEL,
     )
     supervision: str = option(

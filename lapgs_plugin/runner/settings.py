@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
@@ -56,6 +57,18 @@ class RunSettings(HierarchySettings):
         super().__post_init__()
         if not (self.sh_rate > 0 and math.isfinite(self.sh_rate)):
             raise UserInputError(f"--sh-rate {self.sh_rate}: expected a positive factor")
+
+    @property
+    def shares(self) -> tuple[Fraction, ...] | None:
+        """As `HierarchySettings.shares`, but nested levels leave two thirds of a run to the finest by default.
+
+        A script ends its densification in the middle of its run, and so do halves end the coarser level: none would see
+        the full size.
+        """
+        if self.split is not None or not self.nested or self.levels == 1:
+            return super().shares
+        coarser = self.levels - 1
+        return (Fraction(1, 3 * coarser),) * coarser + (Fraction(2, 3),)
 
     def for_manifest(self) -> dict[str, Any]:
         """Return what the manifest has under "settings"."""

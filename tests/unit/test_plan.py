@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from fractions import Fraction
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -20,6 +21,7 @@ from lapgs_plugin.hierarchy.plan import (
     level_size,
 )
 from lapgs_plugin.hierarchy.settings import HierarchySettings, parse_split
+from lapgs_plugin.runner.settings import RunSettings
 
 
 @given(st.integers(16, 5000), st.integers(16, 5000), st.integers(0, 8))
@@ -78,6 +80,21 @@ def test_any_split_covers_the_iterations(weights: list[int], iterations: int) ->
     assert plan.iterations == iterations
     for stage, share in zip(plan, split, strict=True):
         assert abs(stage.iterations - iterations * share) <= 1
+
+
+@pytest.mark.parametrize(
+    ("given", "split"),
+    [
+        ({"hierarchy": "nested"}, "1/3,2/3"),
+        ({"hierarchy": "nested", "levels": 3}, "1/6,1/6,2/3"),
+        ({"hierarchy": "nested", "levels": 1}, "1"),
+        ({"hierarchy": "nested", "split": "1/2,1/2"}, "1/2,1/2"),
+        ({"hierarchy": "laplacian"}, "1/2,1/2"),
+        ({"protocol": "paper"}, "1/3,2/3"),
+    ],
+)
+def test_nested_levels_of_a_checkout_leave_densification_to_the_finest(given: dict[str, Any], split: str) -> None:
+    assert RunSettings(**given).resolved()["split"] == split
 
 
 @pytest.mark.parametrize("levels", range(1, 7))
