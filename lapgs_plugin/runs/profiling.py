@@ -74,32 +74,8 @@ class PeakMemory:
         return dict(self._bytes)
 
 
-class Breakdown:
-    """Take marks at the boundaries between the parts of an iteration. This base measures nothing; a mark is a no-op.
-
-    Each moment between two marks belongs to one part, so the parts add up to the whole.
-    """
-
-    measures = False
-
-    def mark(self, part: str) -> None:
-        """Assign the time from here on to `part`, one of `PARTS`; has no effect inside `within`."""
-
-    def pause(self) -> None:
-        """Assign the time from here to the next mark to no part."""
-
-    @contextmanager
-    def within(self, part: str) -> Iterator[None]:
-        """Assign all time inside to `part`, ignoring marks there, and time afterwards to the part before."""
-        yield
-
-    def seconds(self) -> dict[str, float]:
-        """Return seconds by part up to the last mark; empty when nothing is measured. Waits for a GPU."""
-        return {}
-
-
 class ProcessorClock:
-    """Make time stamps for a `TimedBreakdown`, by `time.perf_counter`."""
+    """Make time stamps for a `Breakdown`, by `time.perf_counter`."""
 
     def stamp(self) -> Any:
         """Return this moment in the device's work."""
@@ -145,31 +121,35 @@ class StreamClock(ProcessorClock):
         self._free.append(stamp)
 
 
-class TimedBreakdown(Breakdown):
-    """Measure the time between marks.
+class Breakdown:
+    """Measure the time of the parts of an iteration by marks at their boundaries.
+
+    Each moment between two marks belongs to one part, so the parts add up to the whole.
 
     Args:
-        clock: makes the marks.
+        clock: makes the marks; None measures nothing.
         seconds: by part, measured before a run was interrupted.
     """
 
-    measures = True
-
-    def __init__(self, clock: ProcessorClock, seconds: Mapping[str, float] | None = None) -> None:
-        self._clock = clock
+    def __init__(self, clock: ProcessorClock | None = None, seconds: Mapping[str, float] | None = None) -> None:
+        self.measures = clock is not None
+        self._clock = clock or ProcessorClock()
         self._seconds = dict.fromkeys(PARTS, 0.0) | dict(seconds or {})
         self._marks: deque[tuple[str | None, Any]] = deque()
         self._within = False
 
     def mark(self, part: str) -> None:
+        """Assign the time from here on to `part`, one of `PARTS`; has no effect inside `within`."""
         assert part in PARTS, part
         self._put(part)
 
     def pause(self) -> None:
+        """Assign the time from here to the next mark to no part."""
         self._put(None)
 
     @contextmanager
     def within(self, part: str) -> Iterator[None]:
+        """Assign all time inside to `part`, ignoring marks there, and time afterwards to the part before."""
         if self._within or not self._marks:
             yield  # the time belongs to the enclosing part, or comes before the first mark
             return
@@ -183,12 +163,15 @@ class TimedBreakdown(Breakdown):
             self._put(before)
 
     def seconds(self) -> dict[str, float]:
+        """Return seconds by part up to the last mark; empty when nothing is measured. Waits for a GPU."""
+        if not self.measures:
+            return {}
         self._clock.wait()
         self._read()
         return dict(self._seconds)
 
     def _put(self, part: str | None) -> None:
-        if self._within:
+        if self._within or not self.measures:
             return
         self._marks.append((part, self._clock.stamp()))
         if len(self._marks) > UNREAD_EVENTS:
@@ -204,8 +187,8 @@ class TimedBreakdown(Breakdown):
 
 
 def breakdown_on(device: torch.device, seconds: Mapping[str, float] | None = None) -> Breakdown:
-    """Return a breakdown that measures the work of a device; `seconds` as in `TimedBreakdown`."""
-    return TimedBreakdown(clock_on(device), seconds)
+    """Return a breakdown that measures the work of a device; `seconds` as it takes them."""
+    return Breakdown(clock_on(device), seconds)
 
 
 def clock_on(device: torch.device) -> ProcessorClock:

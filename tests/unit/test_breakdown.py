@@ -16,7 +16,6 @@ from lapgs_plugin.runs.profiling import (
     UNREAD_EVENTS,
     Breakdown,
     ProcessorClock,
-    TimedBreakdown,
     breakdown_on,
 )
 
@@ -68,7 +67,7 @@ steps = st.lists(
 @given(steps=steps)
 def test_every_second_belongs_to_the_part_that_was_marked_last(steps: list[tuple[str | None, int, int]]) -> None:
     clock = LaggingClock()
-    breakdown = TimedBreakdown(clock)
+    breakdown = Breakdown(clock)
     breakdown.mark("other")
     expected = dict.fromkeys(PARTS, 0)
     current: str | None = "other"  # what a plain reading of the marks says
@@ -101,7 +100,7 @@ def test_every_second_belongs_to_the_part_that_was_marked_last(steps: list[tuple
 
 def test_marks_are_read_without_waiting_after_the_work() -> None:
     clock = LaggingClock()
-    breakdown = TimedBreakdown(clock)
+    breakdown = Breakdown(clock)
     for _ in range(10 * UNREAD_EVENTS):
         breakdown.mark("forward")
         clock.now += 1
@@ -111,7 +110,7 @@ def test_marks_are_read_without_waiting_after_the_work() -> None:
 
 
 def test_parts_of_known_sleeps() -> None:
-    breakdown = TimedBreakdown(ProcessorClock())
+    breakdown = Breakdown(ProcessorClock())
     start = time.perf_counter()
     for part, seconds in (("forward", 0.03), ("loss", 0.01), ("backward", 0.06), ("forward", 0.02)):
         breakdown.mark(part)
@@ -132,7 +131,7 @@ def test_parts_of_known_sleeps() -> None:
 
 def test_an_earlier_measurement_is_continued() -> None:
     clock = LaggingClock()
-    breakdown = TimedBreakdown(clock, {"forward": 2.5, "other": 1.0})
+    breakdown = Breakdown(clock, {"forward": 2.5, "other": 1.0})
     breakdown.mark("forward")
     clock.now = 4
     breakdown.pause()
