@@ -6,6 +6,7 @@ import errno
 import os
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,8 +23,8 @@ BARE_RECORD = "lapgs_record.json"
 PREVIEW = "preview.jpg"
 """Picture of a run that the viewer shows first; named here because it is read before torch is imported."""
 
-LOCK = ".lock"
-"""File that `FolderLock` locks."""
+LOCK, LOCK_POLL_SECONDS = ".lock", 0.05
+"""File that `FolderLock` locks; seconds between two attempts to lock something."""
 
 TEMPORARY_PATTERN = ".*.tmp"
 """Glob of the temporary files of `atomic_write`, which a killed process may leave."""
@@ -149,6 +150,22 @@ def require_manifest(folder: Path) -> None:
         raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
 
 
+def lock(descriptor: int, patience: float = 0.0) -> bool | None:
+    """Lock an open file or folder until it is closed.
+
+    Args:
+        descriptor: of the file or folder.
+        patience: seconds to wait for another process that has the lock.
+
+    Returns:
+        False if another process, or another open of it, still has the lock; None where the file system has no locks.
+    """
+    end = time.monotonic() + patience
+    while (locked := _try_lock(descriptor)) is False and time.monotonic() < end:
+        time.sleep(LOCK_POLL_SECONDS)
+    return locked
+
+
 class FolderLock:
     """An exclusive lock on a folder, held until `release` or the end of the process.
 
@@ -160,8 +177,8 @@ class FolderLock:
         self._stream = stream
 
     @classmethod
-    def acquire(cls, folder: Path) -> FolderLock:
-        """Lock a folder.
+    def acquire(cls, folder: Path, patience: float = 0.0) -> FolderLock:
+        """Lock a folder, after waiting up to `patience` seconds for another process.
 
         Raises:
             RunFolderError: another process has it.
@@ -170,7 +187,7 @@ class FolderLock:
         with one_line_errors(path, training=True):
             stream = path.open("a+b")
             try:
-                if try_lock(stream.fileno()) is False:
+                if lock(stream.fileno(), patience) is False:
                     stream.seek(0)
                     holder = stream.read().decode(errors="replace").strip() or "another process"
                     raise RunFolderError(
@@ -196,7 +213,7 @@ _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.
 if sys.platform == "win32":
     import msvcrt
 
-    def try_lock(descriptor: int) -> bool | None:
+    def _try_lock(descriptor: int) -> bool | None:
         os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: Windows forbids reading locked bytes
         try:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
@@ -206,12 +223,8 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-    def try_lock(descriptor: int) -> bool | None:
-        """Lock an open file or folder without waiting, until it is closed.
-
-        Returns:
-            False if another process, or another open of it, has the lock; None where the file system has no locks.
-        """
+    def _try_lock(descriptor: int) -> bool | None:
+        """Lock an open file or folder without waiting; return what `lock` returns."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

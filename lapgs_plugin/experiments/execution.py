@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
@@ -103,7 +103,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
     place = folder.absolute() / SCENES
     with one_line_errors(place):
         place.mkdir(parents=True, exist_ok=True)
-    lock = _wait_for_lock(place)
+    lock = FolderLock.acquire(place, LOCK_TIMEOUT)
     try:
         for scene, sample in missing:
             if _sample_folder(scene, folder).is_dir():  # another process made it meanwhile
@@ -119,18 +119,6 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
             )
     finally:
         lock.release()
-
-
-def _wait_for_lock(place: Path) -> FolderLock:
-    """Wait for the lock of a folder."""
-    end = time.monotonic() + LOCK_TIMEOUT
-    while True:
-        try:
-            return FolderLock.acquire(place)
-        except RunFolderError:
-            if time.monotonic() > end:
-                raise
-        time.sleep(POLL_SECONDS)
 
 
 def _sample_folder(scene: SceneSpec, folder: Path) -> Path:

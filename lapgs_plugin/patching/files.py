@@ -9,13 +9,12 @@ import stat
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.files import try_lock
+from lapgs_plugin.files import lock
 from lapgs_plugin.patching.engine import FileChange, Target, pristine
 
 _SUFFIX = ".lapgs"
@@ -118,14 +117,11 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise PatchError(f"{folder}: cannot be read: {error.strerror}; expected a folder this user may read") from error
-    end = time.monotonic() + PATIENCE
     try:
-        while (locked := try_lock(descriptor)) is False:
-            if time.monotonic() > end:
-                raise PatchError(
-                    f"{folder}: another `lapgs patch` works on it; wait for it or stop it; nothing was changed"
-                )
-            time.sleep(0.05)
+        if (locked := lock(descriptor, PATIENCE)) is False:
+            raise PatchError(
+                f"{folder}: another `lapgs patch` works on it; wait for it or stop it; nothing was changed"
+            )
         yield locked is True
     finally:
         os.close(descriptor)
