@@ -81,21 +81,14 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         left = [file.name for file in present if file not in chosen]
         logger.warning("not photos, left out: %s", listed(left))
     files: dict[str, Path] = {}
+    by_target: dict[str, Path] = {}
     for file in chosen:
         place = file.relative_to(source)
         name = (place.with_suffix(".jpg") if file.suffix.lower() in CONVERTED else place).as_posix()
-        if (other := files.setdefault(name, file)) != file:
-            raise _same_name(source, other, file, name)
-    by_target: dict[str, Path] = {}
-    for name, file in sorted(files.items()):
-        if (other := by_target.setdefault(target_name(name), file)) != file:
-            raise _same_name(source, other, file, target_name(name))
+        if (other := by_target.setdefault(target_name(name), place)) != place:
+            raise SceneError(f"{source}: {other} and {place} would both become {target_name(name)}; rename one of them")
+        files[name] = file
     return Photos(source, dict(sorted(files.items())))
-
-
-def _same_name(source: Path, one: Path, other: Path, name: str) -> SceneError:
-    one, other = (each.relative_to(source) for each in (one, other))
-    return SceneError(f"{source}: {one} and {other} would both become {name}; rename one of them")
 
 
 def target_name(name: str) -> str:
