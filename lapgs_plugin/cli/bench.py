@@ -67,8 +67,8 @@ def ops(
     from rich import box
     from rich.table import Table
 
+    from lapgs_plugin.environment.device import chosen_device
     from lapgs_plugin.ops.benchmark import benchmark
-    from lapgs_plugin.rasterizers.choice import chosen_device
 
     where = torch.device(chosen_device(device))
     table = Table(title=f"Operations at {width}x{height} with {gaussians} Gaussians on {where}", box=box.SIMPLE)

@@ -87,7 +87,7 @@ def run(
     import logging
 
     from lapgs_plugin.checkouts.script import require_script
-    from lapgs_plugin.rasterizers.choice import chosen_device
+    from lapgs_plugin.environment.device import chosen_device
     from lapgs_plugin.runs.gpu_busy import require_cuda
 
     if options.off and (idle := sorted(given_options(context) - OF_OFF)):

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.adapters.registry import rasterizer_owners
+from lapgs_plugin.environment.device import chosen_device
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, import_extension, options_of
@@ -20,7 +21,6 @@ from lapgs_plugin.runs.manifest import Manifest
 
 logger = logging.getLogger(__name__)
 
-DEVICES = ("auto", "cuda", "cpu")
 RASTER_SETTINGS = "raster"
 """Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
 
@@ -38,20 +38,6 @@ class PlacedRasterizer:
     rasterizer: Rasterizer
     device: torch.device
     unsupported: Mapping[str, Any]
-
-
-def chosen_device(device: str, advice: str = "`lapgs doctor` says why, or use --device cpu") -> str:
-    """Return "cuda" or "cpu" for a value of --device; "auto" takes CUDA if there is a device.
-
-    Raises:
-        UserInputError: an unknown value, or CUDA without a device; `advice` says what to do then.
-    """
-    if device not in DEVICES:
-        raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise UserInputError(f"--device cuda: PyTorch finds no CUDA device; {advice}")
-    return "cuda" if available and device != "cpu" else "cpu"
 
 
 def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "auto") -> PlacedRasterizer:
