@@ -117,7 +117,10 @@ class HierarchyRenderer:
             try:
                 fields[level] = archive.field(level)
             except RunFolderError as error:
-                raise _with_undamaged_levels(error, list(fields)) from error
+                if not fields:
+                    raise
+                whole = f"what was trained before it is whole: `lapgs render --level {min(fields)}`"
+                raise RunFolderError(f"{error}; {whole}") from error
         return cls.of(manifest, fields, rasterizer, FieldOffload(torch.device(device), keep))
 
     @classmethod
@@ -302,10 +305,3 @@ class HierarchyRenderer:
                     f"{LARGEST_GAIN:g}; 1 is the band as trained"
                 )
         return gains or AS_TRAINED
-
-
-def _with_undamaged_levels(error: RunFolderError, undamaged: Sequence[int]) -> RunFolderError:
-    """Add to the error of a damaged level how to render the levels before it."""
-    if not undamaged:
-        return error
-    return RunFolderError(f"{error}; what was trained before it is whole: `lapgs render --level {min(undamaged)}`")

@@ -53,7 +53,7 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
     out = out.absolute()
     check_output(out, overwrite)
     partial, replaced = out.with_name(f"{out.name}.partial"), out.with_name(f"{out.name}.replaced")
-    with one_line_errors(out):
+    with writing_explained(out):
         try:
             for leftover in (partial, replaced):
                 if leftover.exists():
@@ -70,7 +70,7 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def one_line_errors(out: Path) -> Iterator[None]:
+def writing_explained(out: Path) -> Iterator[None]:
     """Turn an error of the file system or of SQLite during writing into a LapgsError."""
     try:
         yield

@@ -12,7 +12,7 @@ import pycolmap
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import option_values
-from lapgs_plugin.scenes.output import check_output, one_line_errors
+from lapgs_plugin.scenes.output import check_output, writing_explained
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
 from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
 from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
@@ -76,7 +76,7 @@ def prepare_scene(
     settings = settings or PrepareSettings()
     require_colmap_for(settings)
     found = _checked_photos(photos, out, settings, overwrite)
-    with one_line_errors(out):
+    with writing_explained(out):
         job = Job(out / WORK, found, settings, progress)
         with opened_work(job.work, _identity(found, settings), overwrite):
             make_photos(job)
