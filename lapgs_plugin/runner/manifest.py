@@ -70,8 +70,9 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
     before, now = _identity(found), _identity(wanted)
     for name in {**before, **now}:
         if before.get(name) != now.get(name):
-            # The default hierarchy may have been another when the run was started.
-            same = f"--hierarchy {before[name]}" if name == "hierarchy" else "the same options"
+            # These defaults may have been others when the run was started.
+            given = name in ("hierarchy", "split") and before.get(name)
+            same = f"--{name} {before[name]}" if given else "the same options"
             raise RunFolderError(
                 f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
                 f"resume with {same}, or start again with --overwrite"

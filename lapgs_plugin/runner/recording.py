@@ -85,6 +85,7 @@ class BareRunRecorder:
         def training(*args: Any, **kwargs: Any) -> Any:
             self._call = TrainingCall.bind(original, args, kwargs)
             self.record = LoopRecord(self._device, self._call.opt.iterations if self._gpu_busy else 0)
+            self._timeline = []
             result = original(*args, **kwargs)
             if self.iteration:
                 self.record.stop(self._image_bytes())

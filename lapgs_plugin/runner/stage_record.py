@@ -54,8 +54,8 @@ class StageRecord(LoopRecord):
         return sum(record.train_seconds for record in self._archive.manifest.records) + self.elapsed()
 
     def stop(self, image_bytes: int) -> None:
+        super().stop(image_bytes)  # may end a profile, after which parts are measured again
         self._parts.breakdown.pause()
-        super().stop(image_bytes)
 
     def archive(self, result: StageResult, joint_fields: Mapping[int, GaussianField] | None) -> None:
         """Write the stage's field and measurements, and the coarser fields that were trained jointly, by level."""

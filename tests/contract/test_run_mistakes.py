@@ -25,9 +25,11 @@ from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, T
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.runner.installed_packages import explain_import_error
+from lapgs_plugin.runner.manifest import require_same_run
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.viewer.preview import read_preview
 from tests.contract.stub_runs import (
     CHECKOUTS,
@@ -330,6 +332,19 @@ def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path
         with pytest.raises(RunFolderError, match=r"started with another (iterations|inherit|scene) ") as caught:
             run_residuals(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
         one_line(caught.value)
+
+
+def test_a_run_with_the_split_of_an_earlier_default_is_told_which() -> None:
+    scene = SceneReference("scene", "3dgs:-1", True, (0.0, 0.0, 0.0), "colmap")
+
+    def manifest(split: str | None) -> Manifest:
+        settings = RunSettings(hierarchy="nested", split=split).for_manifest()
+        return Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, settings)
+
+    with pytest.raises(RunFolderError, match="resume with --split 1/2,1/2, or") as caught:
+        require_same_run(manifest("1/2,1/2"), manifest(None))
+    one_line(caught.value)
+    require_same_run(manifest("1/2,1/2"), manifest("1/2,1/2"))
 
 
 class FillsTheGpu(StageHook):
