@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -47,11 +46,13 @@ class StageEvaluation:
         test = self.context.scene.test
         some = spread_views(test, SAMPLED_VIEWS) if test and sample else []
         views = test if every else some
-        with self.overhead.timed("evaluation") if views else nullcontext():
+        if not views:  # after most steps: reading exposures would wait for the GPU
+            return {}
+        with self.overhead.timed("evaluation"):
             learned = None if run.exposures is None else run.exposures.archived()
             exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
             found = {view.name: self._psnr(run, view, exposures.get(view.name)) for view in views}
-        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every and views else {}
+        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every else {}
         if some:
             plain, fitted = zip(*(found[view.name] for view in some), strict=True)
             measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}

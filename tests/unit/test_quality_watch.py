@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from torch import Tensor
@@ -16,6 +17,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.evaluation import StageEvaluation
+from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import (
@@ -118,6 +120,21 @@ def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.
     assert line.startswith("level 0, iteration ")
     assert "held-out PSNR fell to 2" in line
     assert "--exposure on" in line
+
+
+def test_exposures_are_read_for_measurements_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Reading them waits for a GPU, and between steps no clock runs.
+    reads = []
+    archived = ViewExposures.archived
+
+    def read(exposures: ViewExposures) -> Any:
+        reads.append(None)
+        return archived(exposures)
+
+    monkeypatch.setattr(ViewExposures, "archived", read)
+    settings = TrainSettings(iterations=200, levels=1, sh_degree=0, exposure="on", keep="last")
+    train(ring_scene(train=5, test=1), settings, tmp_path / "run", Said())
+    assert 1 <= len(reads) <= 10  # eight measurements at most, and the archive
 
 
 def test_keep_best_keeps_the_last_state_unless_another_one_is_visibly_better(
