@@ -36,7 +36,7 @@ def read_ply(path: Path | str) -> PlyData:
         at = "" if error.row is None else f" after {error.row} of {error.element.count} ({error.element.name})"
         raise ValueError(f"it is cut short or damaged{at} ({error.message})") from error
     except Exception as error:  # damage raises ValueError, OverflowError, MemoryError, ... in plyfile and numpy
-        raise ValueError(f"it is not a PLY file ({joined(error)})") from error
+        raise ValueError(f"it is not a PLY file ({_line(error)})") from error
 
 
 def scalar_names(element: PlyElement) -> set[str]:
@@ -67,7 +67,7 @@ def _check_header(path: Path) -> None:
         # With all counts 0 plyfile reads the header alone.
         empty = PlyData.read(io.BytesIO(_ELEMENT.sub(rb"\1\2\g<3>0", header)))
     except Exception as error:  # as in `read_ply`
-        raise ValueError(f"it is not a PLY file ({joined(error)})") from error
+        raise ValueError(f"it is not a PLY file ({_line(error)})") from error
     if len(empty.elements) != len(counts):
         raise ValueError(f"it is not a PLY file ({len(counts)} elements with counts of {len(empty.elements)})")
     is_text = (kind := _FORMAT.search(header)) is not None and kind.group(1) == b"ascii"
@@ -94,3 +94,9 @@ def _row_bytes(element: PlyElement, is_text: bool) -> int:
         np.dtype(prop.list_dtype()[0] if isinstance(prop, PlyListProperty) else prop.dtype()).itemsize
         for prop in element.properties
     )
+
+
+def _line(error: Exception) -> str:
+    """Return an error's message, which may quote a long header, as one short line; its type's name if it has none."""
+    text = joined(str(error) or type(error).__name__)
+    return text if len(text) <= 300 else f"{text[:297]}..."

@@ -69,6 +69,14 @@ def test_damage_is_one_line_for_fields_and_for_points(name: str, tmp_path: Path)
         tracemalloc.stop()
 
 
+def test_a_message_that_quotes_a_header_is_short(tmp_path: Path) -> None:
+    path = tmp_path / "long.ply"
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty " + "x" * 5000 + " a\nend_header\n")
+    with pytest.raises(ValueError, match="it is not a PLY file") as caught:
+        read_ply(path)
+    assert len(str(caught.value)) < 400
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_whole_files_of_several_elements_are_read(text: bool, tmp_path: Path) -> None:
     elements = f"comment one\nelement vertex 2\n{XYZ}\nelement face 1\nproperty list uchar int vertex_indices"
