@@ -125,30 +125,6 @@ def invoke(*words: str | Path) -> BaseException | None:
     return CliRunner().invoke(bench_app, [str(word) for word in words]).exception
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--launcher", "cloud"), "--launcher cloud: expected local, slurm, ray"),
-        (("--launcher", "slurm"), "no sbatch on this machine"),
-        (("--launcher-option", "partition"), "--launcher-option partition: expected NAME=VALUE"),
-        (("--launcher-option", "partition=gpu"), "the local launcher has none"),
-        (("--launcher", "slurm", "--gpus", "0"), "slurm assigns GPUs itself"),
-        (("--path", "mine"), "--path mine: expected NAME=VALUE"),
-        (("--path", "mine=nowhere"), "scene mine: nowhere is not a folder"),
-        (("--scene", "yours"), "--scene yours: not in the experiment; "),
-        (("--seeds", "1;2"), "--seeds 1;2: expected whole numbers"),
-    ],
-)
-def test_mistakes_on_the_command_line(
-    experiment: Path, words: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(experiment.parent)
-    error = invoke(experiment, *words)
-    assert isinstance(error, UserInputError)
-    assert message in str(error)
-    assert "\n" not in str(error)
-
-
 def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path) -> None:
     text = EXPERIMENT.replace('rasterizer = "cpu"', 'checkout = "fastgs"').replace(", sh_degree = 1", "")
     experiment.write_text(text)
