@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -43,9 +44,16 @@ columns = ["train_seconds", "psnr"]
 LAPGS = [sys.executable, "-m", "lapgs_plugin", "bench"]
 
 
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = tmp_path_factory.mktemp("sample") / "scene"
+    make_sample_scene(scene, width=48, height=32, views=8, points=100, progress=False)
+    return scene
+
+
 @pytest.fixture
-def experiment(tmp_path: Path) -> Path:
-    make_sample_scene(tmp_path / "scene", width=48, height=32, views=8, points=100, progress=False)
+def experiment(sample: Path, tmp_path: Path) -> Path:
+    (tmp_path / "scene").symlink_to(sample)
     path = tmp_path / "tiny.toml"
     path.write_text(EXPERIMENT)
     return path
@@ -57,9 +65,8 @@ def bench(experiment: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experiment: Path) -> None:
-    torn = experiment.parent / "torn"
-    make_sample_scene(torn, width=48, height=32, views=8, points=100, progress=False)
+def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experiment: Path, sample: Path) -> None:
+    torn = Path(shutil.copytree(sample, experiment.parent / "torn"))
     whole = (torn / "images" / "0003.png").read_bytes()
     (torn / "images" / "0003.png").write_bytes(whole[: len(whole) // 2])  # with a whole header, so only the run fails
     head, rest = EXPERIMENT.split("[backbones.cpu]")
