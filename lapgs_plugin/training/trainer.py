@@ -241,7 +241,7 @@ class Trainer:
             views_per_step(self.settings, stage, len(train), batches),
             len(train),
         )
-        sizes = {(view.camera.width, view.camera.height) for view in train}
+        sizes = {view.camera.size for view in train}
         if schedule.views > 1 and batches and len(sizes) > 1:
             self.monitor.say(
                 f"level {stage.level}: steps for {schedule.views} views; the training views have {len(sizes)} sizes, "

@@ -86,7 +86,7 @@ class Batching(CpuRasterizer):
         describes: bool = True,
     ) -> RenderResult:
         assert len(cameras) > 1
-        assert len({(camera.width, camera.height) for camera in cameras}) == 1
+        assert len({camera.size for camera in cameras}) == 1
         warms_up = cameras[0].width == 16
         if not warms_up:
             self.asked.append((len(cameras), (cameras[0].width, cameras[0].height), sh_degree))
