@@ -97,7 +97,7 @@ class Profile:
 
     def holders(self, value: Any) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name, that hold an object."""
-        return [(module, name) for module in self.modules for name, held in vars(module).items() if held is value]
+        return [(module, name) for module in self.modules for name, held in held_by(module) if held is value]
 
     def named(self, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name of these that it holds."""
@@ -105,7 +105,7 @@ class Profile:
 
     def script_names(self, value: Any) -> set[str]:
         """Return the names by which the script knows an object."""
-        return {name for name, held in vars(self.script.module).items() if held is value}
+        return {name for name, held in held_by(self.script.module) if held is value}
 
     def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
@@ -237,7 +237,7 @@ class Profile:
     def _classes(self) -> list[type]:
         """Return the classes of the checkout."""
         names = {module.__name__ for module in self.modules}
-        held = [value for module in self.modules for value in vars(module).values() if isinstance(value, type)]
+        held = [value for module in self.modules for _, value in held_by(module) if isinstance(value, type)]
         return list(dict.fromkeys(value for value in held if value.__module__ in names))
 
     def _first_call(self, names: Container[str]) -> ast.Call | None:
@@ -292,6 +292,11 @@ class Profile:
     def _evaluated(self, expression: ast.expr, values: Mapping[str, Any]) -> Any:
         code = compile(ast.Expression(expression), str(self.script.path), "eval", dont_inherit=True)
         return eval(code, vars(self.script.module), dict(values))
+
+
+def held_by(module: ModuleType) -> list[tuple[str, Any]]:
+    """Return the names of a module with their values, as a copy: to look at a value may add names to a lazy module."""
+    return list(vars(module).items())
 
 
 def _changing(model: type) -> set[str]:

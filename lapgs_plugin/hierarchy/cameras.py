@@ -10,7 +10,7 @@ from lapgs_plugin.hierarchy.plan import level_size
 
 def level_camera(camera: Camera, level: int) -> Camera:
     """Return the camera of a pyramid level, from the camera of the full-resolution view."""
-    return camera.resized(*level_size((camera.width, camera.height), level))
+    return camera.resized(*level_size(camera.size, level))
 
 
 def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> Tensor:

@@ -98,7 +98,7 @@ class StageImages:
         return cache
 
     def _stores(self, views: Sequence[View], where: str = AUTO, eight_bit: bool = False) -> ImageStores:
-        sizes = [(view.camera.width, view.camera.height) for view in views]
+        sizes = [view.camera.size for view in views]
         return ImageStores(sizes, self._context.device, eight_bit, where, self._folder)
 
     def _level_images(self, stage: Stage) -> LevelImages:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 import typer
 
 from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.checkouts.profile import held_by
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.cli.app import app
@@ -108,6 +109,20 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     with pytest.raises(UserInputError, match=r"training\(cfg, options, .* got no argument with source_path") as caught:
         TrainingCall.bind(training, (1, options, []), {})
     assert "\n" not in str(caught.value)
+
+
+def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:
+    module = ModuleType("lazy")
+
+    class Lazy:
+        @property  # type: ignore[misc]
+        def __class__(self) -> type:
+            setattr(module, f"loaded_{len(vars(module))}", None)
+            return int
+
+    vars(module).update(first=Lazy(), second=Lazy())
+    assert {name for name, value in held_by(module) if isinstance(value, int)} >= {"first", "second"}
+    assert sum(name.startswith("loaded_") for name in vars(module)) >= 2
 
 
 def test_arguments_that_a_script_gathers_are_passed_on_by_name() -> None:

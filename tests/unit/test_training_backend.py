@@ -312,7 +312,7 @@ def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("level", [0, 1])
 def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
     eight_bit = tuple(replace(view, image=(view.image * 255).round() / 255) for view in scene.train)
-    stores = ImageStores([(view.camera.width, view.camera.height) for view in eight_bit], torch.device("cpu"), True)
+    stores = ImageStores([view.camera.size for view in eight_bit], torch.device("cpu"), True)
     held = LevelImages(stores, level, Pyramid(), with_coarse=level == 0, exact=True)
     stored = LevelImages(stores, level, Pyramid(), with_coarse=level == 0)
     for view in eight_bit:

@@ -86,7 +86,7 @@ class Batching(CpuRasterizer):
         describes: bool = True,
     ) -> RenderResult:
         assert len(cameras) > 1
-        assert len({(camera.width, camera.height) for camera in cameras}) == 1
+        assert len({camera.size for camera in cameras}) == 1
         warms_up = cameras[0].width == 16
         if not warms_up:
             self.asked.append((len(cameras), (cameras[0].width, cameras[0].height), sh_degree))
@@ -419,7 +419,7 @@ def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_pat
     found = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
     assert [count for count, _, _ in tight.asked] == [4, 2]
     strategy, *halved = lines.lines
-    assert strategy == "--strategy 3dgs"
+    assert strategy == "density control: --strategy 3dgs"
     assert len(halved) == 2
     assert halved[0].startswith("level 0: no memory for 4 views at once; from here on 2 are rendered together")
     assert plys(found) == plys(train(tmp_path / "one", scene, settings, CpuRasterizer()))

@@ -99,7 +99,7 @@ class GsplatStack:
             means, quaternions, scales, opacities, sh = self._parts[i]
             if len(means) == 0:
                 continue  # gsplat divides by their number
-            pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], (camera.width, camera.height)
+            pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
             projected = direct.project(means, quaternions, scales, opacities, pose, matrix, size)
             stacked = radii, means2d, depths, conics, colors
             write_to_stack(means, position, sh, self._signed[i], projected, stacked, self._starts[i])
