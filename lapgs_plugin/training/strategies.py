@@ -101,8 +101,11 @@ class Strategy:
         Args:
             schedule: of the stage.
             extent: of the scene, in world units.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(f"strategy {type(self).__qualname__} has no method density_control; it has to make one")
 
 
 @dataclass(frozen=True)
