@@ -53,9 +53,7 @@ class CoarserLevels:
         if self.joint is not None:
             self.breakdown.mark("forward")
             return self.joint.predict(names)
-        if self.cached is None:
-            return None
-        return self.cached.get_batch(names) if len(names) > 1 else self.cached.get(names[0])
+        return None if self.cached is None else self.cached.get(*names)
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return what adds `prediction` to renders of the views."""

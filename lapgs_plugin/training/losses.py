@@ -43,7 +43,7 @@ class ViewLosses:
 
     def plain(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
         """Return what computes the mean loss of some views, in a list, from their renders."""
-        target = self.images.targets.get_stored(names)
+        target = self.images.targets.get_stored(*names)
         compose = self.coarser.adder(names)
 
         def losses(rendered: Tensor) -> list[Tensor]:
@@ -72,8 +72,7 @@ class ViewLosses:
 
     def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
-        several = len(names) > 1
-        target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
+        target, coarse_target = self.images.get(*names)
         context = StageContext(
             stage=self.stage,
             iteration=iterations[-1],
@@ -81,9 +80,9 @@ class ViewLosses:
             target=target,
             accumulated=self.coarser.prediction(names),
             coarse_target=coarse_target,
-            weight=self.images.get_weights(names),
+            weight=self.images.get_weights(*names),
         )
-        if not several or self.hooks.takes_batches:
+        if len(names) == 1 or self.hooks.takes_batches:
             return [context]
 
         def of(images: Tensor | None, index: int) -> Tensor | None:
