@@ -129,7 +129,11 @@ class SupervisionLoss(StageHook):
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
         prediction, target = image, context.target
         if context.accumulated is not None:  # the base is always compared with its target
-            prediction, target = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
+            pair = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                name = type(self._supervision).__qualname__
+                raise UserInputError(f"supervision {name}: pair returned {_describe(pair)}, expected two images")
+            prediction, target = pair
         return photometric_loss(fill_outside(prediction, target, context.weight), target, self._ssim_weight)
 
 

@@ -167,6 +167,8 @@ def degree_to_evaluate(field: GaussianField, sh_degree: int | None) -> int:
 
 def require_color(background: Tensor) -> None:
     """Raise a UserInputError unless a background is one colour: CUDA code reads three numbers, whatever its shape."""
+    if not isinstance(background, Tensor):
+        raise UserInputError(f"background is a {type(background).__name__}, expected a (3,) Tensor: one RGB colour")
     if background.shape != (3,):
         raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
 

@@ -89,8 +89,8 @@ class HierarchySettings:
     )
     split: str | None = option(
         None,
-        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2, and "
-        "1/3,2/3 for nested levels of a checkout.",
+        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2; "
+        "nested levels of `lapgs run`: 1/3,2/3.",
         panel=PANEL,
     )
     supervision: str = option(
@@ -144,7 +144,7 @@ class HierarchySettings:
     )
     images_on: str = option(
         AUTO,
-        "Where training images and cached predictions of coarser levels are kept: gpu, memory, disk, or auto by their "
+        "Where training images and cached predictions of coarser levels are kept: gpu, memory or disk. auto: by their "
         "size.",
         panel=STORAGE,
         names=("--images-on", "--cache"),

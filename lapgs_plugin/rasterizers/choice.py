@@ -116,7 +116,12 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
     if device == "cpu" or not torch.cuda.is_available():
         from lapgs_plugin.reference_raster.standins import stand_ins
 
-        place, module = "cpu", stand_ins(stand_in)[name]
+        modules = stand_ins(stand_in) if stand_in else {}
+        if name not in modules:
+            raise UserInputError(
+                f"--rasterizer {name}: it has no stand-in for a CPU; leave the option out, or render on a CUDA device"
+            )
+        place, module = "cpu", modules[name]
     else:
         place, module = "cuda", import_extension(name)
     known, unsupported = _split(settings, options_of(module))
@@ -139,6 +144,7 @@ def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     if placed.unsupported:
         values = ", ".join(f"{key} = {value}" for key, value in placed.unsupported.items())
         line += f"; {name} cannot honour {values} of the training"
-        if manifest.rasterizer in rasterizer_owners():
+        owner = rasterizer_owners().get(manifest.rasterizer)
+        if owner is not None and owner.info.stand_in:
             line += f" (--rasterizer {manifest.rasterizer} can, slowly on a CPU)"
     logger.info("%s", line)

@@ -120,7 +120,7 @@ class ImageStore:
         folder: for "disk", the folder of the files; made here and removed by `close`.
 
     Raises:
-        UserInputError: an unknown place or precision, or "gpu" without one.
+        UserInputError: an unknown place or precision, "gpu" without one, or "disk" without a folder.
     """
 
     def __init__(
@@ -131,7 +131,8 @@ class ImageStore:
             raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
         if precision not in PRECISIONS:
             raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
-        assert where != "disk" or folder is not None, "a store on disk needs a folder"
+        if where == "disk" and folder is None:
+            raise UserInputError("images on disk: expected the folder to write them to; pass folder=")
         self._where = where
         self._dtype = DTYPES[precision]
         self._device = torch.device(device)
@@ -157,8 +158,12 @@ class ImageStore:
         Raises:
             TrainingDivergedError: it holds NaN or inf, or values beyond float16 if that is the precision.
             RunFolderError: the disk is full or the folder not writable.
-            UserInputError: there is not enough memory to page-lock.
+            UserInputError: it is not of floats, or there is not enough memory to page-lock.
         """
+        if not image.is_floating_point():
+            raise UserInputError(
+                f"the image of view {name} is of {image.dtype}: expected floats; divide levels from 0 to 255 by 255.0"
+            )
         encoded, low, divisor = self._encode(name, image.detach())
         if (coming := self._coming.pop(name, None)) is not None:
             wait([coming])

@@ -9,6 +9,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
@@ -70,8 +71,13 @@ class DensityControl:
 
         Returns:
             Whether Gaussians were added, removed or reset.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(
+            f"density control {type(self).__qualname__} has no method after_step; it has to edit a field"
+        )
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """Return a term of the loss that makes unneeded Gaussians transparent and small; None if its weights are 0."""

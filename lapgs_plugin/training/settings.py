@@ -97,22 +97,23 @@ class Densification:
 
     start: int | None = option(
         None,
-        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        "Iteration of each stage after which densification begins. Default: "
+        f"{REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}, in proportion in shorter runs.",
         panel=PANEL,
         names=("--densify-from",),
         least=0,
     )
     until: int | None = option(
         None,
-        "Last densification, of the whole run; stages scale it. Default: 25000 of 30000 with --strategy mcmc, else "
-        "15000.",
+        "Iteration of the run at which densification ends; each stage stops at the same share of its own iterations. "
+        "Default: 25000 of 30000 with --strategy mcmc, else 15000.",
         panel=PANEL,
         names=("--densify-until",),
         least=0,
     )
     base_share: float | None = option(
         None,
-        "Share of the coarsest level's iterations in which it densifies, from 0 to 1. Default: as all stages, half.",
+        "Share of the coarsest level's iterations in which it densifies, from 0 to 1. Default: by --densify-until.",
         panel=PANEL,
         names=("--base-densify-share",),
     )
@@ -120,15 +121,15 @@ class Densification:
     reset_every: int | None = option(
         None,
         "Iterations between two resets of all opacities, in every stage; 0 never resets. Default: 3000 of 30000, in "
-        "the coarsest level alone; never with --strategy mcmc.",
+        "the coarsest level alone. No option of --strategy mcmc.",
         panel=PANEL,
         names=("--opacity-reset-every",),
     )
     strategy: str = option(
         AUTO,
-        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (its heuristics), multiview (those, "
-        "only where several views have large errors), or one that another package brings. auto: mcmc from "
-        f"{LONG_RUN} iterations on, else 3dgs.",
+        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
+        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
+        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
         panel=PANEL,
     )
     options: Strategy = options_of(STRATEGIES, "strategy")
@@ -187,34 +188,35 @@ class TrainSettings(HierarchySettings):
     )
     sh_rate_factor: float | None = option(
         None,
-        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
-        "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
-        f"to {SH_RATE_VIEWS} to {MOST_SH_RATE:g}.",
+        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in all levels but "
+        "residuals. It falls exponentially to 1 within each stage. Default: the number of training views divided by "
+        f"{SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
     dropout: float | None = option(
         None,
-        "Share of the Gaussians that is left out at random, anew for each step, growing from 0 to this over a stage; "
-        f"against floaters that few photos allow. Default: {Mcmc.few_dropout:g} for fewer than {FEW_PHOTOS} training "
-        "photos with --strategy mcmc, else 0.",
+        "Share of the Gaussians to leave out at random in each step, growing from 0 to this over a stage: fewer "
+        f"floaters where photos are few. Default: {Mcmc.few_dropout:g} for fewer than {FEW_PHOTOS} training photos "
+        "with --strategy mcmc, else 0.",
         panel=SCHEDULE,
     )
     exposure: str = option(
         AUTO,
-        "Learn an affine colour transform for each training photo, for photos whose exposure or white balance change: "
-        "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
+        "Learn an affine colour transform for each training photo, against changes of exposure and white balance: "
+        "on, off, or auto, which measures whether there are any. Renders show the mean exposure.",
         panel=SCHEDULE,
         choices=(AUTO, ON, OFF),
     )
     refine_poses: bool = option(
         False,
-        "Refine the pose of each training photo with the field, for poses that are not accurate. Views are then "
-        "rendered one by one, which takes longer on a GPU.",
+        "Refine the pose of each training photo while the field trains, for inaccurate poses. Views are then rendered "
+        "one by one, which takes longer on a GPU.",
         panel=SCHEDULE,
     )
     keep: str = option(
         LAST,
-        "State that each level archives: last, or best by a few training views, which are then not trained on.",
+        "State of each level to archive: last, or best as measured on a few training views, which are then not trained "
+        "on.",
         panel=SCHEDULE,
         choices=(LAST, BEST),
     )
@@ -224,7 +226,7 @@ class TrainSettings(HierarchySettings):
     learning_rates: LearningRates = field(default_factory=LearningRates)
     densification: Densification = field(default_factory=Densification)
     antialiased: bool = option(False, "Dim Gaussians that are smaller than a pixel.", panel=GSPLAT)
-    packed: bool = option(False, "Less memory where a view sees little; slower.", panel=GSPLAT)
+    packed: bool = option(False, "Use less memory where a view sees little of the scene; slower.", panel=GSPLAT)
     sparse_adam: bool = option(False, "Step only the Gaussians that the view shows.", panel=GSPLAT)
 
     def __post_init__(self) -> None:
@@ -417,17 +419,17 @@ class TrainingControl(MeasuringOptions):
         panel=RUN,
     )
     threads: int | None = option(
-        None, "Processor threads. Default: all this process may use.", panel=RUN, least=1, most=1024
+        None, "Processor threads. Default: all that this process may use.", panel=RUN, least=1, most=1024
     )
     checkpoint_every: int | None = option(
         None,
-        "Iterations between checkpoints; by default one is written every minute. Ctrl-C writes one too.",
+        "Iterations between checkpoints. Default: one a minute. Ctrl-C writes one, too.",
         panel=RUN,
         least=1,
     )
     log: str | None = option(
         None,
-        "tensorboard: also write the figures of history.jsonl for TensorBoard, into the run folder.",
+        "tensorboard: write the figures of history.jsonl for TensorBoard as well, into the run folder.",
         panel=RUN,
     )
 

@@ -101,8 +101,11 @@ class Strategy:
         Args:
             schedule: of the stage.
             extent: of the scene, in world units.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(f"strategy {type(self).__qualname__} has no method density_control; it has to make one")
 
 
 @dataclass(frozen=True)
@@ -113,8 +116,8 @@ class Regularized(Strategy):
 
     opacity_regularization: float | None = option(
         None,
-        "Weight of the mean opacity in the loss; it makes Gaussians that are not needed transparent, and fewer. "
-        "Default: 0.01 with --strategy mcmc, else 0.",
+        "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
+        "with --strategy mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )
@@ -143,12 +146,12 @@ class Gradients(Regularized):
 
     grow_grad2d: float | None = option(
         None,
-        "Screen-space gradient above which a Gaussian is cloned or split, in normalised device coordinates. Default: "
-        f"{GROW_THRESHOLD:g}, and {ABSGRAD_THRESHOLD:g} with --absgrad.",
+        "Screen-space gradient, in normalised device coordinates, above which --strategy 3dgs clones or splits a "
+        f"Gaussian, and multiview clones it. Default: {GROW_THRESHOLD:g}, and {ABSGRAD_THRESHOLD:g} with --absgrad.",
         panel=PANEL,
         names=("--densify-threshold",),
     )
-    absgrad: bool = option(False, "Densify by absolute gradients (AbsGS).", panel=PANEL)
+    absgrad: bool = option(False, "With --strategy 3dgs: densify by absolute gradients (AbsGS).", panel=PANEL)
 
     @property
     def needs_absgrad(self) -> bool:
@@ -180,11 +183,11 @@ class Multiview(Gradients):
         names=("--split-threshold",),
     )
     error_threshold: float = option(
-        0.1, "Share of the range of a view's errors above which a pixel counts, for --strategy multiview.", panel=PANEL
+        0.1, "Share of the range of a view's errors above which --strategy multiview counts a pixel.", panel=PANEL
     )
     error_pixels: float = option(
         0.1,
-        "Counted pixels of a view that a Gaussian must make up to be cloned or split, for --strategy multiview.",
+        "Counted pixels, mean over views, that a Gaussian must make up for --strategy multiview to clone or split it.",
         panel=PANEL,
     )
 
@@ -228,13 +231,16 @@ class Mcmc(Regularized):
     cap_max: int | None = option(
         None,
         f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
-        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A "
-        "level that starts with more keeps them.",
+        f"level's training images, at most {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A level that "
+        "starts with more keeps them.",
         panel=PANEL,
         least=1,
     )
     base_cap_max: int | None = option(
-        None, "Most Gaussians of the coarsest level, for --strategy mcmc. Default: as all levels.", panel=PANEL, least=1
+        None,
+        "Most Gaussians of the coarsest level, for --strategy mcmc. Default: that of --cap-max.",
+        panel=PANEL,
+        least=1,
     )
 
     def of_stage(self, part: StagePart) -> Self:

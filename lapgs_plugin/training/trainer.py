@@ -161,7 +161,7 @@ class Trainer:
         found = [self._strategy_of(stage).most for stage in self._context.plan]
         limits = [f"{most:,}" for most in found if most is not None]
         words = f", at most {' and '.join(limits)} Gaussians" if limits else ""
-        return f"--strategy {self.settings.densification.strategy}{words}"
+        return f"density control: --strategy {self.settings.densification.strategy}{words}"
 
     def _strategy_of(self, stage: Stage) -> Strategy:
         views = level_views(self._context.scene.train, stage.level)

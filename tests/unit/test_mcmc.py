@@ -261,7 +261,7 @@ def test_runs_say_their_limits_stay_under_them_and_learn(hierarchy: str, tmp_pat
         tmp_path / "run", Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
     ) as run:
         Trainer(ring_scene(), chosen, run, CpuRasterizer(), monitor=Listening()).run()
-    assert "--strategy mcmc, at most 110 and 120 Gaussians" in Listening.said
+    assert "density control: --strategy mcmc, at most 110 and 120 Gaussians" in Listening.said
     assert [record.num_gaussians for record in run.manifest.records] == [110, 120]
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))

@@ -419,7 +419,7 @@ def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_pat
     found = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
     assert [count for count, _, _ in tight.asked] == [4, 2]
     strategy, *halved = lines.lines
-    assert strategy == "--strategy 3dgs"
+    assert strategy == "density control: --strategy 3dgs"
     assert len(halved) == 2
     assert halved[0].startswith("level 0: no memory for 4 views at once; from here on 2 are rendered together")
     assert plys(found) == plys(train(tmp_path / "one", scene, settings, CpuRasterizer()))
