@@ -10,7 +10,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.options import check_values, option, option_name, options_of
+from lapgs_plugin.options import check_values, option, option_name, options_of, require_positive
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
@@ -24,7 +24,6 @@ from lapgs_plugin.training.strategies import (
     Mcmc,
     StagePart,
     Strategy,
-    require_positive,
 )
 from lapgs_plugin.untrusted import STRICT
 
@@ -232,7 +231,6 @@ class TrainSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_values(self)
         self._choose_strategy()
         self.learning_rates.check()
         self.densification.check()
