@@ -156,7 +156,7 @@ class StageRendering:
             image = self.on_image(key, image, below)
         if self.images is not None and key in self.masked and not self.capture:
             # Whatever the loop's loss is, it compares the target with itself outside of the mask.
-            image = fill_outside(image, self.target(key), self.images.get_weights([key]))
+            image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
     def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:

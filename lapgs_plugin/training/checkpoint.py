@@ -145,7 +145,7 @@ def check_transforms(state: TransformsState | None, shape: torch.Size | None, na
     Args:
         state: from a checkpoint; None without transforms.
         shape: of the transforms; None if the run has none.
-        name: "exposure" or "poses", for the message.
+        name: of the state in the checkpoint, for the message.
         path: of the checkpoint, for the message.
 
     Raises:

@@ -41,8 +41,8 @@ def unpruned_levels(plan: StagePlan, settings: TrainSettings) -> list[int]:
     """Return the levels, coarsest first, that --prune leaves as they are, because their densification does not end."""
     if not settings.prune:
         return []
-    schedules = {s.level: StageSchedule.create(settings, s, iterations_continued(plan, s)) for s in plan}
-    return [level for level, schedule in schedules.items() if schedule.prunes_after is None]
+    schedules = [(stage, StageSchedule.create(settings, stage, iterations_continued(plan, stage))) for stage in plan]
+    return [stage.level for stage, schedule in schedules if schedule.prunes_after is None]
 
 
 def require_pruning(plan: StagePlan, settings: TrainSettings) -> None:

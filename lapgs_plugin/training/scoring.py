@@ -61,7 +61,7 @@ class FieldScoring:
                 below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
                 self.breakdown.mark("densification")
                 composed = self.losses.exposed([view.name], image if below is None else image + below)
-                whole = fill_outside(composed, target, images.get_weights([view.name]))
+                whole = fill_outside(composed, target, images.get_weights(view.name))
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view, 0), whole, target, loss)
 

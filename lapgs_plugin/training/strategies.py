@@ -6,13 +6,13 @@ Each strategy here says what differs between strategies in the rest of training;
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option, option_name
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.options import check_values, option, option_name, require_positive
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -297,13 +297,7 @@ class Auto(Mcmc, Gradients):
         return kind(**{each.name: getattr(self, each.name) for each in fields(kind)})
 
 
-def require_positive(name: str, value: float, kind: str) -> None:
-    """Raise a UserInputError about a number that is not positive and finite."""
-    if not (value > 0.0 and math.isfinite(value)):
-        raise UserInputError(f"{name} {value}: expected a positive {kind}")
-
-
-AUTO, MCMC, GRADIENTS = "auto", "mcmc", "3dgs"
+MCMC, GRADIENTS = "mcmc", "3dgs"
 STRATEGIES: Registry[Strategy] = Registry(
     "--strategy",
     "lapgs_plugin.strategies",

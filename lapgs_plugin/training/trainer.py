@@ -251,7 +251,7 @@ class Trainer:
 
     @property
     def _batches(self) -> bool:
-        """Whether the rasterizer renders several views together; poses are refined with each view alone."""
+        """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
         return not self.settings.refine_poses and self.rasterizer.can_batch
 
     def _stage_run(
@@ -285,11 +285,10 @@ class Trainer:
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
             densifier=self._strategy_of(stage).density_control(schedule, context.scene.extent),
-            coarser=CoarserLevels(
-                images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
-            ),
+            coarser=CoarserLevels(images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown),
             exposures=first_exposures(context, stage, checkpoint, overhead),
             poses=poses,
+            batches=self._batches,
             breakdown=breakdown,
             progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
@@ -316,6 +315,8 @@ class Trainer:
         for name, learned in run.transforms.items():
             shape = None if learned is None else learned.transforms.shape
             check_transforms(checkpoint.get(name), shape, name, path)
+            if (best := checkpoint.get("best")) is not None:
+                check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
     def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:

@@ -230,7 +230,8 @@ def test_the_papers_protocol_is_the_papers_settings_and_nothing_else() -> None:
         **{"gather": 4, "views_per_step": "8", "sh_rate_factor": 8.0},
     }
     for name, value in others.items():
-        with pytest.raises(UserInputError, match=f"--{name.replace('_', '-')} {value} with --protocol paper"):
+        shown = "accumulate-views" if name == "gather" else name.replace("_", "-")
+        with pytest.raises(UserInputError, match=f"--{shown} {value} with --protocol paper"):
             TrainSettings(protocol="paper", **{name: value})
     with pytest.raises(UserInputError, match="--protocol papers: expected default or paper"):
         TrainSettings(protocol="papers")
