@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ import torch
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook
 from lapgs_plugin.interrupt import StopRequest, stop_request
@@ -164,8 +165,8 @@ class Trainer:
         return f"density control: --strategy {self.settings.densification.strategy}{words}"
 
     def _strategy_of(self, stage: Stage) -> Strategy:
-        views = level_views(self._context.scene.train, stage.level)
-        return self.settings.strategy_of(stage, sum(view.camera.width * view.camera.height for view in views))
+        sizes = (level_size(view.camera.size, stage.level) for view in self._context.scene.train)
+        return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""
