@@ -95,6 +95,13 @@ class Densification:
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
+    strategy: str = option(
+        AUTO,
+        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
+        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
+        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
+        panel=PANEL,
+    )
     start: int | None = option(
         None,
         "Iteration of each stage after which densification begins. Default: "
@@ -124,13 +131,6 @@ class Densification:
         "the coarsest level alone. No option of --strategy mcmc.",
         panel=PANEL,
         names=("--opacity-reset-every",),
-    )
-    strategy: str = option(
-        AUTO,
-        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
-        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
-        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
-        panel=PANEL,
     )
     options: Strategy = options_of(STRATEGIES, "strategy")
 
