@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -61,9 +60,10 @@ class Semantics:
     note: str = ""
 
 
-class FieldStack(Protocol):
+class FieldStack(ABC):
     """Hold finished fields on a device, to render them together; see `Rasterizer.stack`."""
 
+    @abstractmethod
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         """Render the first fields, each from its own camera.
 
@@ -75,7 +75,6 @@ class FieldStack(Protocol):
         Returns:
             (3, height, width) of each camera, in PyTorch's current stream.
         """
-        ...
 
 
 class Rasterizer(ABC):

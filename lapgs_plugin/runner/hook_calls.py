@@ -111,7 +111,7 @@ class HookCaller:
         target, coarse = images.get(key)
         if below is None and accumulated is not None:
             below = accumulated.get(key)
-        weight = images.get_weights([key])
+        weight = images.get_weights(key)
         return StageContext(self._stage, self._iteration, view_name(key), target, below, coarse, weight)
 
     def densified(self) -> None:

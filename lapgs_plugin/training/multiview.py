@@ -19,7 +19,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.densification import Densifier, ViewScores
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Multiview
@@ -30,19 +30,6 @@ HIGHEST_OPACITY = 0.8
 """Opacities are lowered to this at each refinement: nothing behind an opaque Gaussian gets a gradient."""
 LATE_OPACITY, LATE_BLAME = 0.1, 0.9
 """After densification, Gaussians with a lower opacity or a larger blame are removed."""
-
-
-@dataclass(frozen=True)
-class ViewScores:
-    """Hold each Gaussian's part in the errors of some views.
-
-    Attributes:
-        pixels: (n,) pixels with large errors that it makes up: its weights alpha T there summed, mean over views.
-        blame: (n,) the same with each view weighted by its loss, scaled to the range from 0 to 1.
-    """
-
-    pixels: Tensor
-    blame: Tensor
 
 
 @dataclass(frozen=True)

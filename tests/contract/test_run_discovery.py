@@ -16,6 +16,7 @@ from lapgs_plugin.checkouts.profile import held_by
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.doctor_checkout import describe
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.installed_packages import explain_import_error
@@ -85,6 +86,28 @@ def test_a_package_that_is_not_installed_is_to_be_installed(fork: Path) -> None:
     assert line == (
         "scripts/train.py:3 needs open3d, which cannot be imported (No module named 'open3d'): pip install open3d"
     )
+
+
+@pytest.mark.parametrize("code", ["CUDAExtension", "Extension"])
+def test_a_package_that_the_checkout_brings_is_installed_from_there(fork: Path, code: str) -> None:
+    """As GaussianPro's propagation: nobody else has a package of that name, or a stranger has."""
+    folder = fork / "submodules" / "Propagation"
+    folder.mkdir(parents=True)
+    (folder / "setup.py").write_text(f"setup(ext_modules=[{code}('open3d._C', ['a.cu'])])")
+    error, script = ModuleNotFoundError("No module named 'open3d'", name="open3d"), fork / "scripts" / "train.py"
+    on_gpu, on_cpu = (str(explain_import_error(error, script, on_cpu=on_cpu)) for on_cpu in (False, True))
+    (packages,) = (each for each in describe(script)["Packages"] if each.name == "open3d")
+    stand_in = describe(script)["lapgs run"][-1].detail
+    if code == "CUDAExtension":
+        assert on_gpu.endswith(f": {packages.advice}")
+        assert packages.advice == f"pip install --no-build-isolation {folder}"
+        assert on_cpu.endswith("no CPU stand-in has what the checkout takes from it; it needs CUDA")
+        assert stand_in.startswith("no CPU stand-in for open3d, which scripts/train.py:3 imports from ")
+    else:
+        assert on_gpu == on_cpu
+        assert on_cpu.endswith(f": {packages.advice}")
+        assert packages.advice == f"pip install {folder}"
+        assert "open3d" not in stand_in
 
 
 WINDOW = StageWindow(Stage(0, (8, 6), 20, signed=True), 10, 30, 2, 4.0, 2.0)
