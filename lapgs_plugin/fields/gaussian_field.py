@@ -54,7 +54,7 @@ class GaussianField:
     signed: bool = False
 
     def __post_init__(self) -> None:
-        n = self.means.shape[0]
+        n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "quaternions": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,)}
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:

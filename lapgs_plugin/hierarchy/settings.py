@@ -109,12 +109,14 @@ class HierarchySettings:
     joint: float | None = option(
         None,
         "Share of each residual level's iterations, at the end, in which the coarser fields are optimized as well; 0 "
-        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
+        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}; 0.5 in `lapgs train` with "
+        "--strategy mcmc.",
         panel=PANEL,
     )
     residual_color_rate: float | None = option(
         None,
-        f"Factor on the SH learning rates of residual levels. Default: {RESIDUAL_COLOR_RATE:g}; the paper's is 1.",
+        f"Factor on the SH learning rates of residual levels. Default: {RESIDUAL_COLOR_RATE:g}; in `lapgs train` with "
+        "--strategy mcmc 1, as in the paper.",
         panel=PANEL,
     )
     coarse_threshold: float | None = option(

@@ -6,7 +6,7 @@ import torch
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
-from lapgs_plugin.training.quality import require_views_to_set_aside
+from lapgs_plugin.training.quality import LEAST_VIEWS
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import BEST, TrainSettings
 
@@ -27,8 +27,11 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         raise UserInputError(
             f"--views-per-step {asked}: the scene has {views} training views; give at most as many, or auto"
         )
-    if views is not None and settings.keep == BEST:
-        require_views_to_set_aside(views)
+    if views is not None and settings.keep == BEST and views < LEAST_VIEWS:
+        raise UserInputError(
+            f"--keep best: sets training views aside, and the scene has {views} of them, expected at least "
+            f"{LEAST_VIEWS}; leave it out"
+        )
     return StagePlan.create(size, settings.scheduled, settings.levels, settings.shares, settings.kind)
 
 

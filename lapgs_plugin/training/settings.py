@@ -370,6 +370,18 @@ class TrainSettings(HierarchySettings):
             return self.sh_rate_factor
         return min(MOST_SH_RATE, max(1.0, training_views / SH_RATE_VIEWS))
 
+    @property
+    def joint_share(self) -> float:
+        """See `HierarchySettings.joint_share`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_joint
+        return super().joint_share if own is None or self.nested or self.joint is not None else own
+
+    @property
+    def color_factor(self) -> float:
+        """See `HierarchySettings.color_factor`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_color_rate
+        return super().color_factor if own is None or self.residual_color_rate is not None else own
+
     def dropout_for(self, training_photos: int) -> float:
         """Return the share of Gaussians that the last steps of a stage leave out."""
         if self.dropout is not None:
@@ -414,8 +426,8 @@ class TrainingControl(MeasuringOptions):
 
     rasterizer: str = option(
         AUTO,
-        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
-        "else cpu.",
+        "gsplat (CUDA), cpu, oracle (slow, plain PyTorch, for checking), or one of an installed package. auto: gsplat "
+        "where there is a CUDA device, else cpu.",
         panel=RUN,
     )
     threads: int | None = option(

@@ -66,12 +66,16 @@ class Strategy:
         densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
         few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
+        residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
+        residual_color_rate: default of `TrainSettings.residual_color_rate`; None for the hierarchy's.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
     densify_until: ClassVar[int] = 15_000
     unused: ClassVar[tuple[str, ...]] = ()
     few_dropout: ClassVar[float] = 0.0
+    residual_joint: ClassVar[float | None] = None
+    residual_color_rate: ClassVar[float | None] = None
 
     @property
     def needs_absgrad(self) -> bool:
@@ -224,6 +228,8 @@ class Mcmc(Regularized):
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
     few_dropout: ClassVar[float] = 0.2
+    residual_joint: ClassVar[float | None] = 0.5
+    residual_color_rate: ClassVar[float | None] = 1.0
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )

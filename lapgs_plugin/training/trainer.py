@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -12,9 +13,9 @@ import torch
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
-from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -147,6 +148,8 @@ class Trainer:
         """Tell the user what the settings mean for this scene and device."""
         scene, say = self._context.scene, self.monitor.say
         say(self._strategy_line())
+        if (hooks := hooks_line()) is not None:
+            say(hooks)
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
         if self.settings.dropout is None and (share := self.settings.dropout_for(len(scene.train))) > 0.0:
@@ -164,8 +167,8 @@ class Trainer:
         return f"density control: --strategy {self.settings.densification.strategy}{words}"
 
     def _strategy_of(self, stage: Stage) -> Strategy:
-        views = level_views(self._context.scene.train, stage.level)
-        return self.settings.strategy_of(stage, sum(view.camera.width * view.camera.height for view in views))
+        sizes = (level_size(view.camera.size, stage.level) for view in self._context.scene.train)
+        return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""

@@ -100,7 +100,7 @@ def cut(saved: Saved, *keys: Any) -> Saved:
 
 
 STATE = ("state",)
-COLOURS = {"transforms": torch.zeros(2, 3, 4), "gradient": None, "moments": {}}
+COLOURS: Saved = {"transforms": torch.zeros(2, 3, 4), "gradient": None, "moments": {}}
 BEST: Saved = {"psnr": 20.0, "iteration": 1, "joint": None, "exposure": COLOURS}
 DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     "a list": (lambda saved: [], "holds a list, expected a dictionary"),

@@ -12,7 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    MissingExtraError,
+    RunFolderError,
+    TrainingDivergedError,
+    UserInputError,
+)
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
@@ -114,6 +120,12 @@ def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
     found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
     assert (found.hierarchy, found.views_per_step, found.sh_rate_factor) == ("laplacian", "1", 1.0)
+    for damaged, message in (
+        ({"inherit_ratio": "half"}, "inherit_ratio is 'half', expected a valid number"),
+        ({"densification": {"strategy": []}}, r"densification.strategy is \[\], expected a valid string"),
+    ):
+        with pytest.raises(RunFolderError, match=message):
+            settings_from_manifest(replace(manifest, settings={**older, **damaged}))
 
 
 # --------------------------------------------------------------------------------------- gsplat's functions on a CPU
