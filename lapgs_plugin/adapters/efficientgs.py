@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.rasterizer import Semantics

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 
 
 class Adapter(BackboneAdapter):

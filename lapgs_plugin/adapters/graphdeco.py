@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.adapters.base import OF_A_CALL, BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import OF_A_CALL, BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.source import readable_source
 
 if TYPE_CHECKING:

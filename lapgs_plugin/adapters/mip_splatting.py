@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo, logits_of
+from lapgs_plugin.adapters.base import BackboneAdapter, logits_of
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.training_call import TrainingCall
 
 if TYPE_CHECKING:

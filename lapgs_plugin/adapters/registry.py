@@ -21,7 +21,7 @@ GROUP = "lapgs_plugin.backbones"
 OWN = tuple(
     module.name
     for module in pkgutil.iter_modules(adapters.__path__)
-    if module.name not in ("base", "generic", "registry")
+    if module.name not in ("base", "generic", "info", "registry")
 )
 """Names of the backbones in this package: `adapters/<name>.py` defines `Adapter`."""
 

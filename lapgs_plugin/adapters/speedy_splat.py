@@ -6,7 +6,8 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 
 

@@ -32,6 +32,7 @@ OPACITY_RESET = "reset_opacity"
 """Method of the family's models that is density control and can be skipped by itself."""
 
 BACKGROUND_WORDS = {"bg", "background"}
+TRAINING_WORDS = {"train", "training"}
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Profile:
 
     def holders(self, value: Any) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name, that hold an object."""
-        return [(module, name) for module in self.modules for name, held in vars(module).items() if held is value]
+        return [(module, name) for module in self.modules for name, held in held_by(module) if held is value]
 
     def named(self, names: Iterable[str]) -> list[tuple[ModuleType, str]]:
         """Return modules of the checkout, each with a name of these that it holds."""
@@ -105,7 +106,7 @@ class Profile:
 
     def script_names(self, value: Any) -> set[str]:
         """Return the names by which the script knows an object."""
-        return {name for name, held in vars(self.script.module).items() if held is value}
+        return {name for name, held in held_by(self.script.module) if held is value}
 
     def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
@@ -142,7 +143,8 @@ class Profile:
     def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **given: Any) -> Any:
         """Render a view as the training loop does, and return what its function returns.
 
-        Arguments that depend on the loop's state, such as the size of a photo, have their defaults.
+        Arguments that depend on the loop's state, such as the size of a photo, have their defaults. Flags of training,
+        with which a fork leaves Gaussians out at random, are off.
 
         Args:
             values: arguments of the training function by parameter name.
@@ -163,6 +165,7 @@ class Profile:
             )
         first, second, *others = _parameters(renderer)
         named = {name: background for name in others if BACKGROUND_WORDS & set(name.split("_"))}
+        named |= {name: False for name in others if self._is_training_flag(name, values)}
         named |= {first: view, second: model} | {name: value for name, value in given.items() if name in others}
         # Looked up at each call: it may be replaced meanwhile.
         function = vars(sys.modules[renderer.__module__])[renderer.__name__]
@@ -180,6 +183,13 @@ class Profile:
             return next((self._evaluated(word.value, values) for word in words if word.arg == name), None)
         except Exception:  # it depends on the state of the loop
             return None
+
+    def _is_training_flag(self, name: str, values: Mapping[str, Any]) -> bool:
+        """Return whether a parameter of the loop's renderer says that the image is trained on."""
+        assert self.loop_renderer is not None, "asked of its parameters"
+        default = _parameters(self.loop_renderer)[name].default
+        on = default if isinstance(default, bool) else self.loop_argument(name, values)
+        return isinstance(on, bool) and bool(TRAINING_WORDS & set(name.split("_")))
 
     @property
     def _training_place(self) -> str:
@@ -237,7 +247,7 @@ class Profile:
     def _classes(self) -> list[type]:
         """Return the classes of the checkout."""
         names = {module.__name__ for module in self.modules}
-        held = [value for module in self.modules for value in vars(module).values() if isinstance(value, type)]
+        held = [value for module in self.modules for _, value in held_by(module) if isinstance(value, type)]
         return list(dict.fromkeys(value for value in held if value.__module__ in names))
 
     def _first_call(self, names: Container[str]) -> ast.Call | None:
@@ -292,6 +302,11 @@ class Profile:
     def _evaluated(self, expression: ast.expr, values: Mapping[str, Any]) -> Any:
         code = compile(ast.Expression(expression), str(self.script.path), "eval", dont_inherit=True)
         return eval(code, vars(self.script.module), dict(values))
+
+
+def held_by(module: ModuleType) -> list[tuple[str, Any]]:
+    """Return the names of a module with their values, as a copy: to look at a value may add names to a lazy module."""
+    return list(vars(module).items())
 
 
 def _changing(model: type) -> set[str]:

@@ -30,7 +30,7 @@ MARKS = {"ok": "[green]ok[/green]", "absent": "[dim]--[/dim]", "problem": "[bold
 def doctor(
     checkout: Annotated[
         Path | None,
-        typer.Argument(help="Describe a 3DGS checkout instead: what is found in it, and what works with it."),
+        typer.Argument(metavar="CHECKOUT", help="3DGS checkout, or a training script in it, to describe instead."),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print all findings as JSON, for scripts and bug reports.")
@@ -39,8 +39,8 @@ def doctor(
     """Check Python, PyTorch, GPU, compilers and packages, and say what `lapgs train` will use.
 
     With a checkout, say what `lapgs run` finds in it: its root, its training function, its rasterizers and what works.
-    The command changes and downloads nothing, and its exit code is 0 unless CHECKOUT is none. Lines marked !! are
-    problems and say what to do. Lines marked -- are optional parts that are not installed.
+    Nothing is changed or downloaded. Lines marked !! are problems and say what to do; lines marked -- are optional
+    parts that are not installed. The exit code is 0 unless CHECKOUT is not a checkout.
     """
     from dataclasses import asdict
 

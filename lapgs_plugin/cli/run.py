@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.adapters.registry import OWN, adapter_class
+from lapgs_plugin.adapters.registry import GENERIC, OWN, adapter_class
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
@@ -43,15 +43,17 @@ class ScriptOptions:
         False, "With --off: record time, Gaussians, memory and held-out PSNR of the unchanged run in its -m folder."
     )
     backbone: str | None = option(
-        None, f"{', '.join(OWN)}, or a backbone of an installed package. Default: recognised from the checkout."
+        None,
+        f"Adapter of the checkout: {', '.join(OWN)}, {GENERIC} (any fork), or one of an installed package. Default: "
+        "the one that recognises it.",
     )
     device: str = option(
         "auto",
-        "cuda, cpu (the checkout on CPU stand-ins for its CUDA extensions), or auto: CUDA if there is a CUDA device, "
+        "cuda, cpu (with CPU stand-ins for the checkout's CUDA extensions), or auto: CUDA if there is a CUDA device, "
         "else the CPU.",
         choices=("auto", "cuda", "cpu"),
     )
-    resume: bool = option(False, "Continue the run in -m after its last finished level.")
+    resume: bool = option(False, "Continue the run in -m after its last finished level. Repeat its other options.")
     overwrite: bool = option(False, "Replace the run in -m.")
     viewing: ViewOptions = field(default_factory=ViewOptions)
     verbose: bool = option(False, "Log which symbols are replaced, and where they are used.", names=("--verbose", "-v"))
@@ -80,9 +82,9 @@ def run(
 
         lapgs run train.py -s data/garden -i images --eval
 
-    --backbone lists the recognised codebases. Everything after the script is passed to it. The run is written to the
-    script's output folder (-m) with one folder per level; `lapgs render`, `lapgs eval` and `lapgs report` read it.
-    After Ctrl-C, repeat the command with --resume to continue after the last finished level.
+    Everything after the script is passed to it. Its output folder (-m) becomes a run folder with one folder per level,
+    which `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` read. After Ctrl-C, repeat the command with
+    --resume to continue. `lapgs doctor CHECKOUT` says what works with a checkout.
     """
     import logging
 

@@ -53,8 +53,7 @@ class StartOptions:
 
     resume: bool = option(
         False,
-        "Continue the run in --out with its settings. A finished run is extended to --iterations, a larger number than "
-        "it has.",
+        "Continue the run in --out with its settings. A finished run is extended if --iterations is more than it has.",
     )
     overwrite: bool = option(False, "Replace the run in --out.")
     viewing: ViewOptions = field(default_factory=ViewOptions)
@@ -67,7 +66,7 @@ class StartOptions:
 @takes_settings
 def train(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Blender-style scene.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder: COLMAP, Blender or nerfstudio.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     *,
     start: StartOptions,

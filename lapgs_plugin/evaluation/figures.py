@@ -91,7 +91,7 @@ def measure_view(
         targets = [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]
     level_psnr = {level: psnr(image, *targets[level]) for level, image in composition.composed.items()}
     upsampled = {
-        level: psnr(to_full_size(image, view.camera, level, renderer.pyramid), photo, mask)
+        level: psnr(to_full_size(image, view.camera.size, level, renderer.pyramid), photo, mask)
         for level, image in composition.composed.items()
     }
     whole = composition.composed[0]
@@ -125,7 +125,7 @@ def evaluate_run(
     with one_pool():
         scene = run_scene(archive, options.scene)
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
-        smallest = min(min(view.camera.width, view.camera.height) for view in views)
+        smallest = min(min(view.camera.size) for view in views)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
         learned = archive.exposure(archive.available_levels[-1])
         exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])

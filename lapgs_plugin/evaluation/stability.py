@@ -147,12 +147,14 @@ def path_frames(
         composition = renderer.render(camera)
         coarsest = renderer.levels - 1
         images = {
-            COMPOSITION: to_full_size(composition.composed[renderer.finest], camera, renderer.finest, renderer.pyramid)
+            COMPOSITION: to_full_size(
+                composition.composed[renderer.finest], camera.size, renderer.finest, renderer.pyramid
+            )
         }
         if renderer.levels > 1:
             bands = {coarsest: composition.base, **composition.residuals}
             for level, band in bands.items():
-                images[f"band {level}"] = to_full_size(band, camera, level, renderer.pyramid)
+                images[f"band {level}"] = to_full_size(band, camera.size, level, renderer.pyramid)
         images[COMPOSITION] = images[COMPOSITION].clamp(0.0, 1.0)
         if single is not None:
             images[SINGLE] = single.render(camera).composed[0].to(images[COMPOSITION]).clamp(0.0, 1.0)

@@ -31,6 +31,11 @@ class Camera:
     world_to_camera: Tensor  # (4, 4)
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.width, self.height
+
+    @property
     def tan_half_fov(self) -> tuple[float, float]:
         """Half the width and half the height of the image plane at depth 1."""
         return self.width / (2.0 * self.fx), self.height / (2.0 * self.fy)

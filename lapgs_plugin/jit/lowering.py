@@ -1,4 +1,8 @@
-"""Register the functions of `lanes` with Numba: their types and the LLVM instructions that they become."""
+"""Register the functions of `lanes` with Numba: their types and the LLVM instructions that they become.
+
+`numba.extending.intrinsic` does the same for single functions, but not for operators, and type checkers cannot read
+the functions that it makes.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +68,8 @@ def _register(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tupl
     """Register a function with Numba.
 
     Args:
-        shapes: classes of the argument types that `lowering` takes; one tuple for each combination.
+        shapes: classes of the argument types that `lowering` takes, one tuple for each combination; none for a function
+            of `lanes`, which has no other implementation.
     """
 
     def generic(self: Any, args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
@@ -73,7 +78,7 @@ def _register(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tupl
 
     template = type(f"Typing_{function.__name__}", (templates.AbstractTemplate,), {"generic": generic})
     templates.infer_global(function)(template)
-    for shape in shapes:
+    for shape in shapes or ((types.VarArg(types.Any),),):
         extending.lower_builtin(function, *shape)(lowering)
 
 
@@ -275,16 +280,9 @@ def _lower_any_lane(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 _register(operator.and_, _both_masks, lambda context, builder, sig, args: builder.and_(*args), (MaskType, MaskType))
 _register(operator.or_, _both_masks, lambda context, builder, sig, args: builder.or_(*args), (MaskType, MaskType))
-_register(
-    lanes.select,
-    _type_select,
-    _lower_select,
-    (MaskType, LanesType, LanesType),
-    (MaskType, LanesType, types.Number),
-    (MaskType, types.Number, LanesType),
-)
-_register(lanes.bits, _one_mask(types.int64), _lower_bits, (MaskType,))
-_register(lanes.any_lane, _one_mask(types.boolean), _lower_any_lane, (MaskType,))
+_register(lanes.select, _type_select, _lower_select)
+_register(lanes.bits, _one_mask(types.int64), _lower_bits)
+_register(lanes.any_lane, _one_mask(types.boolean), _lower_any_lane)
 
 # ------------------------------------------------------------------------------------------------ memory
 
@@ -298,9 +296,10 @@ def _of_floats(array: Any) -> bool:
     return _is_memory(array) and isinstance(array.dtype, types.Float)
 
 
-def _fit(array: Any, values: Sequence[Any]) -> bool:
-    """Return whether `values` are 1 to 16 vectors of the array's float type."""
-    return _of_floats(array) and 0 < len(values) <= WIDTH and set(values) == {LanesType(array.dtype)}
+def _type_store(array: Any, start: Any, *values: Any) -> Any:
+    """Type a function that stores 1 to 16 vectors of the array's float type."""
+    fits = _of_floats(array) and 0 < len(values) <= WIDTH and set(values) == {LanesType(array.dtype)}
+    return types.void if fits else None
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
@@ -337,6 +336,10 @@ def _lower_borrowed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def _lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     _store_part(context, builder, sig, args, args[2])
     return _no_value(context)
+
+
+def _type_change(array: Any, *numbers: Any) -> Any:
+    return types.void if _is_memory(array) else None
 
 
 def _type_at(array: Any, index: Any) -> Any:
@@ -378,30 +381,15 @@ def _type_vector(array: Any, number: Any) -> Any:
     return LanesType(array.dtype) if _of_floats(array) else None
 
 
-_register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed, (types.Array,))
-_register(lanes.keep_alive, lambda a: types.void, lambda context, *_: _no_value(context), (types.Array,))
-_register(lanes.load, _type_vector, _load_part, (types.Any, types.Integer))
-_register(lanes.broadcast, _type_vector, _lower_broadcast, (types.Any, types.Integer))
-_register(lanes.splat, _type_vector, _lower_splat, (types.Any, types.Number))
-_register(
-    lanes.store,
-    lambda array, start, value: types.void if _fit(array, [value]) else None,
-    _lower_store,
-    (types.Any, types.Integer, LanesType),
-)
-_register(lanes.at, _type_at, _lower_at, (types.Any, types.Integer))
-_register(
-    lanes.put,
-    lambda array, index, value: types.void if _is_memory(array) else None,
-    _lower_put,
-    (types.Any, types.Integer, types.Number),
-)
-_register(
-    lanes.prefetch,
-    lambda array, index: types.void if _is_memory(array) else None,
-    _lower_prefetch,
-    (types.Any, types.Integer),
-)
+_register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed)
+_register(lanes.keep_alive, lambda array: types.void, lambda context, *_: _no_value(context))
+_register(lanes.load, _type_vector, _load_part)
+_register(lanes.broadcast, _type_vector, _lower_broadcast)
+_register(lanes.splat, _type_vector, _lower_splat)
+_register(lanes.store, _type_store, _lower_store)
+_register(lanes.at, _type_at, _lower_at)
+_register(lanes.put, _type_change, _lower_put)
+_register(lanes.prefetch, _type_change, _lower_prefetch)
 
 # ------------------------------------------------------------------------------------ vectors and rows of memory
 
@@ -520,28 +508,12 @@ def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return _no_value(context)
 
 
-_VECTORS = types.VarArg(LanesType)
-_register(lanes.load_columns, _type_load_columns, _lower_load_columns, (types.Any, types.Integer, types.IntegerLiteral))
-_register(
-    lanes.store_columns,
-    lambda array, start, *values: types.void if _fit(array, values) else None,
-    _lower_store_columns,
-    (types.Any, types.Integer, _VECTORS),
-)
-_register(lanes.store_whole, _type_store_whole, _lower_store_whole, (types.Any, types.Integer, _VECTORS))
-_register(lanes.load_rows, _type_load_rows, _lower_load_rows, (types.Any, types.Integer, types.Integer))
-_register(
-    lanes.store_rows,
-    lambda array, start, stride, *values: types.void if _fit(array, values) else None,
-    _lower_store_rows,
-    (types.Any, types.Integer, types.Integer, _VECTORS),
-)
-_register(
-    lanes.store_sums,
-    lambda array, start, *values: types.void if _fit(array, values) else None,
-    _lower_store_sums,
-    (types.Any, types.Integer, _VECTORS),
-)
+_register(lanes.load_columns, _type_load_columns, _lower_load_columns)
+_register(lanes.store_columns, _type_store, _lower_store_columns)
+_register(lanes.store_whole, _type_store_whole, _lower_store_whole)
+_register(lanes.load_rows, _type_load_rows, _lower_load_rows)
+_register(lanes.store_rows, lambda array, start, stride, *values: _type_store(array, start, *values), _lower_store_rows)
+_register(lanes.store_sums, _type_store, _lower_store_sums)
 
 # ------------------------------------------------------------------------------------------------ integers
 
@@ -557,10 +529,7 @@ def _lower_fetch_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.atomic_rmw("add", pointer, amount, "monotonic")
 
 
-_register(lanes.lowest_bit, lambda value: types.int64, _lower_lowest_bit, (types.Integer,))
+_register(lanes.lowest_bit, lambda value: types.int64, _lower_lowest_bit)
 _register(
-    lanes.fetch_add,
-    lambda counter, amount: types.int64 if counter.dtype == types.int64 else None,
-    _lower_fetch_add,
-    (types.Array, types.Integer),
+    lanes.fetch_add, lambda counter, amount: types.int64 if counter.dtype == types.int64 else None, _lower_fetch_add
 )

@@ -8,7 +8,6 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.upsample import upsample, upsample_add
@@ -92,15 +91,17 @@ def scaled(image: Tensor, gain: float) -> Tensor:
     return image if gain == 1.0 else gain * image
 
 
-def to_full_size(image: Tensor, camera: Camera, level: int, pyramid: Pyramid, finest: int = 0) -> Tensor:
+def to_full_size(image: Tensor, size: tuple[int, int], level: int, pyramid: Pyramid, finest: int = 0) -> Tensor:
     """Upsample a composed image of `level` to the size of the full-resolution view, as if finer residuals were zero.
 
     Args:
         image: (3, h, w) at the size of `level`.
-        camera: of the full-resolution view.
+        size: (width, height) of the full-resolution view.
+        level: level of the image.
+        pyramid: Up between two levels.
         finest: level at whose size to end instead.
     """
     for finer in range(level - 1, finest - 1, -1):
-        width, height = level_size((camera.width, camera.height), finer)
+        width, height = level_size(size, finer)
         image = upsample(pyramid, image, (height, width))
     return image

@@ -115,6 +115,7 @@ class Gradients:
         means, quats, scales, opacities, sh, colors: by the arrays of `Gaussians`, in their shapes.
         centres: (n, 2) by the centres on the image, in loss per pixel.
         absolute_centres: (n, 2) the sum of the absolute values of each pixel's part of `centres`.
+        slots: (pairs * SLOT,) the sums that these are made of, of each splat in each tile; see `layout.SLOT`.
     """
 
     means: Floats
@@ -125,6 +126,7 @@ class Gradients:
     colors: Floats | None
     centres: Floats
     absolute_centres: Floats
+    slots: Floats
 
 
 TileLists = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]
@@ -220,6 +222,7 @@ def gradients(
         None if gaussians.colors is None else colors[: n * 3].reshape(n, 3),
         centres[: n * 2].reshape(n, 2),
         absolute_centres[: n * 2].reshape(n, 2),
+        slots,
     )
 
 

@@ -59,7 +59,7 @@ def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tupl
     Raises:
         UserInputError: a video of an odd size was requested.
     """
-    width, height = wanted or (camera.width, camera.height)
+    width, height = wanted or camera.size
     if not is_video(out) or width % 2 == height % 2 == 0:
         return width, height
     if wanted is not None:
@@ -108,16 +108,16 @@ def render_clip(
 
 def _composed(renderer: HierarchyRenderer, camera: Camera, level: int) -> Tensor:
     """Render the composition down to `level` at the size of the view, (3, h, w)."""
-    return to_full_size(renderer.images([camera], level)[0], camera, level, renderer.pyramid)
+    return to_full_size(renderer.images([camera], level)[0], camera.size, level, renderer.pyramid)
 
 
 def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) -> Tensor:
     """Render base, residuals and composition side by side at the size of the view, (3, h, panels * w)."""
     composition = renderer.render(camera, level)
-    whole = to_full_size(composition.composed[level], camera, level, renderer.pyramid)
-    base = to_full_size(composition.base, camera, renderer.levels - 1, renderer.pyramid)
+    whole = to_full_size(composition.composed[level], camera.size, level, renderer.pyramid)
+    base = to_full_size(composition.base, camera.size, renderer.levels - 1, renderer.pyramid)
     residuals = [
-        to_full_size(residual, camera, each, renderer.pyramid) for each, residual in composition.residuals.items()
+        to_full_size(residual, camera.size, each, renderer.pyramid) for each, residual in composition.residuals.items()
     ]
     shown = residuals if raw else [around_grey(residual) for residual in residuals]
     return torch.cat([base, *shown, whole], dim=2)

@@ -200,7 +200,7 @@ class HierarchyRenderer:
             size: (width, height) in pixels at which the image is shown.
         """
         for level in range(self.levels - 1, self.finest, -1):
-            width, height = level_size((camera.width, camera.height), level)
+            width, height = level_size(camera.size, level)
             if width >= size[0] and height >= size[1]:
                 return level
         return self.finest
@@ -286,7 +286,7 @@ class HierarchyRenderer:
         self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float], clamped: int | None = None
     ) -> Composition:
         """Render and compose these levels, coarsest first. With nested levels the first may be any."""
-        if len(sizes := {(camera.width, camera.height) for camera in cameras}) != 1:
+        if len(sizes := {camera.size for camera in cameras}) != 1:
             found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
             raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
         nested = self.nested  # a nested field's image includes the coarser bands, so none can be omitted

@@ -57,7 +57,7 @@ def measure_speed(
         level: the finest to add.
         rounds: over all cameras.
     """
-    one_size = len({(camera.width, camera.height) for camera in cameras}) == 1
+    one_size = len({camera.size for camera in cameras}) == 1
     batches = renderer.device.type == "cuda" and one_size and len(cameras) >= BATCH
     return [_measured(renderer, kind, cameras, rounds) for kind in _kinds(renderer, level, batches)]
 

@@ -120,7 +120,7 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
     layers = [_Layer("Photo", "ground truth", view.image)]
 
     def whole(image: Tensor, level: int) -> Tensor:
-        return to_full_size(image, view.camera, level, renderer.pyramid).cpu()
+        return to_full_size(image, view.camera.size, level, renderer.pyramid).cpu()
 
     coarsest = renderer.levels - 1
     if composition.residuals:

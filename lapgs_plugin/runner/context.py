@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -67,15 +68,20 @@ class RunContext:
             gaussians: the checkout's model.
             black: whether the background is black instead of the call's.
         """
-        background = torch.full((3,), 0.0 if black else float(call.white_background), device=self.device)
         outer, self.wrapper.rendering = self.wrapper.rendering, rendering
         try:
-            self.adapter.render(call, view, gaussians, background)
+            self.adapter.render(call, view, gaussians, self._backgrounds[call.white_background and not black])
         finally:
             self.wrapper.rendering = outer
         image, rendering.captured = rendering.captured, None
         assert image is not None, "a rendering that captures"
         return image
+
+    @cached_property
+    @torch.inference_mode(False)  # kept for later calls, which may need gradients
+    def _backgrounds(self) -> dict[bool, Tensor]:
+        """Black and white, (3,) each, by whether it is white. Making one would be a launch in every joint render."""
+        return {white: torch.full((3,), float(white), device=self.device) for white in (False, True)}
 
 
 @dataclass(frozen=True)

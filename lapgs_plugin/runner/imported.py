@@ -24,7 +24,8 @@ from typing import Any, Literal
 
 from typing_extensions import NotRequired
 
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
-from lapgs_plugin.adapters.base import BackboneInfo
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on

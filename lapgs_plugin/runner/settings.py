@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
-from lapgs_plugin.options import option
+from lapgs_plugin.options import option, require_positive
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
 """Settings that the manifest has fields of its own for."""
@@ -24,26 +22,26 @@ class RunSettings(HierarchySettings):
 
     sh_rate: float = option(
         1.0,
-        "Factor on the backbone's learning rate of SH above degree 0, in every level; for backbones whose script has "
-        "no option for it.",
+        "Factor on the checkout's learning rate of SH above degree 0, in every level, where its script has no option "
+        "for it.",
         panel=PANEL,
     )
     prune_by_size: bool = option(
         True,
-        "Let the backbone's densification remove Gaussians that are large on screen or in the scene.",
+        "Let the checkout's densification remove Gaussians that are large on screen or in the scene.",
         panel=PANEL,
         names=("--prune-by-size/--no-prune-by-size",),
     )
     fused_adam: bool = option(
         True,
-        "Step the backbone's plain Adam optimizers in one kernel a tensor.",
+        "Step the checkout's plain Adam optimizers in one kernel for each tensor.",
         panel=STORAGE,
         names=("--fused-adam/--no-fused-adam",),
     )
 
     dry_run: bool = option(
         True,
-        "Try one iteration of the checkout, and all that the run does with its model, before the first stage.",
+        "Before the first stage, try one iteration of the checkout and everything that the run does with its model.",
         names=("--dry-run/--no-dry-run",),
     )
 
@@ -55,8 +53,7 @@ class RunSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.sh_rate > 0 and math.isfinite(self.sh_rate)):
-            raise UserInputError(f"--sh-rate {self.sh_rate}: expected a positive factor")
+        require_positive("--sh-rate", self.sh_rate, "factor")
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:

@@ -15,8 +15,8 @@ class MeasuringOptions:
 
     test_every: int | None = option(
         None,
-        "Measure held-out PSNR every so many iterations, for the curves of `lapgs report`. Default: at the end; "
-        "`lapgs train` then also measures some held-out views during its stages.",
+        "Measure held-out PSNR every so many iterations, for the curves of `lapgs report`. Default: `lapgs train` at "
+        "the end of each level, and some of the views in between; `lapgs run` at its end.",
         panel=PANEL,
         least=1,
     )

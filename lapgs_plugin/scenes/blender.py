@@ -41,6 +41,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 SHORTEST_FOCAL = 1e-3
 """Shortest focal length in sides of the image. Files with angles in other units than radians have shorter ones."""
+LAST_ROW_ERROR = 1e-4
+"""Largest error of the last row of a 4x4 pose."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
@@ -164,6 +166,12 @@ def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
     rigid = u @ vt  # the nearest rotation: JSON files round to few digits
     if np.abs(rigid - rotation).max() > 1e-2 or np.linalg.det(rigid) < 0:
         raise SceneError(f"{where} has a transform_matrix that is no rotation and translation; export without scaling")
+    if np.abs(camera_to_world[3:] - (0.0, 0.0, 0.0, 1.0)).max(initial=0.0) > LAST_ROW_ERROR:
+        last = " ".join(f"{value:g}" for value in camera_to_world[3])
+        raise SceneError(
+            f"{where} has {last} in the last row of its transform_matrix, expected 0 0 0 1; export the matrix by rows, "
+            "with the camera's position in the last column"
+        )
     result: NDArray[np.float64] = np.eye(4)
     result[:3, :3] = rigid.T
     result[:3, 3] = -rigid.T @ position

@@ -78,7 +78,7 @@ def measure_exposure(scene: Scene) -> MeasuredExposure:
 
 def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return the colours (n, 3) of a photo at sparse points, 0 where it does not see them, and (n,) which are right."""
-    step = max(1, round(max(view.camera.width, view.camera.height) / SIDE))
+    step = max(1, round(max(view.camera.size) / SIDE))
     small = torch.nn.functional.avg_pool2d(view.image[None], step) if step > 1 else view.image[None]
     x, y, seen = _visible(view.camera, points)
     if view.mask is not None:

@@ -132,10 +132,7 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     try:
         with Image.open(path) as source:
             source.load()
-            picture = source if source.mode in ("RGB", "RGBA") else source.convert("RGBA")
-            if background is not None:
-                picture = _blend_8_bits(picture, background)
-            levels = np.asarray(picture.resize(size))[..., :3]  # (h, w, 3)
+            levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
         raise SceneError(
             f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({joined(error)}); "
@@ -144,12 +141,43 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
 
 
-def _blend_8_bits(picture: Image.Image, background: tuple[float, float, float]) -> Image.Image:
-    pixels = np.asarray(picture.convert("RGBA"))  # (h, w, 4)
+def _resize_8_bits(
+    source: Image.Image, size: tuple[int, int], background: tuple[float, float, float] | None
+) -> Image.Image:
+    """Return what Pillow's `resize` makes of an image, blended before if there is a background, as RGB or RGBA.
+
+    A large image is converted one strip of rows at a time. Pillow, too, resizes along rows first, then along columns,
+    and rounds to 8 bits after each.
+    """
+    width, step = size[0], max(1, STRIP_VALUES // (4 * source.width))
+    tables = None if background is None else _blend_tables(background)
+    narrowed: Image.Image | None = None
+    for top in range(0, source.height, step):
+        strip = source.crop((0, top, source.width, min(top + step, source.height)))
+        if strip.mode != "RGB":
+            strip = strip.convert("RGBA")
+            if tables is not None:
+                strip = _blend_8_bits(strip, tables)
+            elif source.size != size:
+                strip = strip.convert("RGBa")  # Pillow multiplies by alpha while it resizes
+        strip = strip.resize((width, strip.height))
+        narrowed = narrowed or Image.new(strip.mode, (width, source.height))
+        narrowed.paste(strip, (0, top))
+    assert narrowed is not None, "an image has at least one row"
+    image = narrowed.resize(size)
+    return image.convert("RGBA") if image.mode == "RGBa" else image
+
+
+def _blend_tables(background: tuple[float, float, float]) -> list[NDArray[np.uint8]]:
+    """Return by channel its blended values, (256, 256), by alpha and value."""
     steps = np.arange(256) / 255.0
     alpha = steps[:, None]
-    # By table, because float64 arithmetic on a large photo is slow.
-    tables = [((steps * alpha + value * (1 - alpha)) * 255.0).astype(np.uint8) for value in background]
+    return [((steps * alpha + value * (1 - alpha)) * 255.0).astype(np.uint8) for value in background]
+
+
+def _blend_8_bits(picture: Image.Image, tables: list[NDArray[np.uint8]]) -> Image.Image:
+    """Blend RGBA by tables, because float64 arithmetic on a large photo is slow."""
+    pixels = np.asarray(picture)  # (h, w, 4)
     return Image.fromarray(np.stack([table[pixels[..., 3], pixels[..., i]] for i, table in enumerate(tables)], axis=-1))
 
 

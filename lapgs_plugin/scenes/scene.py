@@ -137,7 +137,7 @@ def load_scene(
 
     def load(posed: tuple[Frame, Camera]) -> View:
         frame, camera = posed
-        size = (camera.width, camera.height)
+        size = camera.size
         if rule.backbone is not None:
             image = read_as_3dgs(frame.path, size, behind)
         else:
@@ -198,7 +198,7 @@ def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "
 
 def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
     """Return the smallest width and the smallest height of cameras in pixels."""
-    widths, heights = zip(*((camera.width, camera.height) for camera in cameras), strict=True)
+    widths, heights = zip(*(camera.size for camera in cameras), strict=True)
     return min(widths), min(heights)
 
 
@@ -256,7 +256,7 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
     """Return the camera at its training size, after comparing the shapes of model and file."""
     camera = frame.camera
     width, height = image_size(frame.path)
-    if not same_shape((width, height), (camera.width, camera.height)):
+    if not same_shape((width, height), camera.size):
         raise SceneError(
             f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
             "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"

@@ -79,7 +79,7 @@ def check_camera(who: str, camera: Camera) -> None:
             f"{who} has {np.abs(pose).max():g} in its pose, expected at most {LARGEST:g}; reconstruct or export it "
             "again"
         )
-    size = (camera.width, camera.height)
+    size = camera.size
     if min(camera.fx, camera.fy, *size) <= 0:
         raise SceneError(
             f"{who} is {camera.width}x{camera.height} pixels with focal lengths {camera.fx:g} and {camera.fy:g}, "

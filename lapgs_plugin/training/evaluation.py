@@ -73,7 +73,7 @@ class StageEvaluation:
             image = add_prediction(image, joint.predict([view.name]))
         elif cache is not None:
             image = add_prediction(image, cache.get(view.name))
-        whole = to_full_size(image, view.camera, level, self.context.pyramid)
+        whole = to_full_size(image, view.camera.size, level, self.context.pyramid)
         if exposure is not None:
             whole = transform_colors(whole, exposure.to(device))
         mask = None if view.mask is None else view.mask.to(device)

@@ -10,7 +10,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.options import check_values, option, option_name, options_of
+from lapgs_plugin.options import check_values, option, option_name, options_of, require_positive
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
@@ -24,7 +24,6 @@ from lapgs_plugin.training.strategies import (
     Mcmc,
     StagePart,
     Strategy,
-    require_positive,
 )
 from lapgs_plugin.untrusted import STRICT
 
@@ -96,24 +95,32 @@ class Densification:
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
+    strategy: str = option(
+        AUTO,
+        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
+        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
+        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
+        panel=PANEL,
+    )
     start: int | None = option(
         None,
-        f"First densification. Default: {REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}.",
+        "Iteration of each stage after which densification begins. Default: "
+        f"{REFERENCE_DENSIFY_FROM} of {REFERENCE_ITERATIONS}, in proportion in shorter runs.",
         panel=PANEL,
         names=("--densify-from",),
         least=0,
     )
     until: int | None = option(
         None,
-        "Last densification, of the whole run; stages scale it. Default: 25000 of 30000 with --strategy mcmc, else "
-        "15000.",
+        "Iteration of the run at which densification ends; each stage stops at the same share of its own iterations. "
+        "Default: 25000 of 30000 with --strategy mcmc, else 15000.",
         panel=PANEL,
         names=("--densify-until",),
         least=0,
     )
     base_share: float | None = option(
         None,
-        "Share of the coarsest level's iterations in which it densifies, from 0 to 1. Default: as all stages, half.",
+        "Share of the coarsest level's iterations in which it densifies, from 0 to 1. Default: by --densify-until.",
         panel=PANEL,
         names=("--base-densify-share",),
     )
@@ -121,16 +128,9 @@ class Densification:
     reset_every: int | None = option(
         None,
         "Iterations between two resets of all opacities, in every stage; 0 never resets. Default: 3000 of 30000, in "
-        "the coarsest level alone; never with --strategy mcmc.",
+        "the coarsest level alone. No option of --strategy mcmc.",
         panel=PANEL,
         names=("--opacity-reset-every",),
-    )
-    strategy: str = option(
-        AUTO,
-        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (its heuristics), multiview (those, "
-        "only where several views have large errors), or one that another package brings. auto: mcmc from "
-        f"{LONG_RUN} iterations on, else 3dgs.",
-        panel=PANEL,
     )
     options: Strategy = options_of(STRATEGIES, "strategy")
 
@@ -188,34 +188,35 @@ class TrainSettings(HierarchySettings):
     )
     sh_rate_factor: float | None = option(
         None,
-        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in the base or a single "
-        "field. It falls exponentially to 1 within each stage. Default: by the number of training views, from 1 for up "
-        f"to {SH_RATE_VIEWS} to {MOST_SH_RATE:g}.",
+        "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in all levels but "
+        "residuals. It falls exponentially to 1 within each stage. Default: the number of training views divided by "
+        f"{SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
     dropout: float | None = option(
         None,
-        "Share of the Gaussians that is left out at random, anew for each step, growing from 0 to this over a stage; "
-        f"against floaters that few photos allow. Default: {Mcmc.few_dropout:g} for fewer than {FEW_PHOTOS} training "
-        "photos with --strategy mcmc, else 0.",
+        "Share of the Gaussians to leave out at random in each step, growing from 0 to this over a stage: fewer "
+        f"floaters where photos are few. Default: {Mcmc.few_dropout:g} for fewer than {FEW_PHOTOS} training photos "
+        "with --strategy mcmc, else 0.",
         panel=SCHEDULE,
     )
     exposure: str = option(
         AUTO,
-        "Learn an affine colour transform for each training photo, for photos whose exposure or white balance change: "
-        "on, off, or auto, which measures whether they do. Renders and the viewer show the mean exposure.",
+        "Learn an affine colour transform for each training photo, against changes of exposure and white balance: "
+        "on, off, or auto, which measures whether there are any. Renders show the mean exposure.",
         panel=SCHEDULE,
         choices=(AUTO, ON, OFF),
     )
     refine_poses: bool = option(
         False,
-        "Refine the pose of each training photo with the field, for poses that are not accurate. Views are then "
-        "rendered one by one, which takes longer on a GPU.",
+        "Refine the pose of each training photo while the field trains, for inaccurate poses. Views are then rendered "
+        "one by one, which takes longer on a GPU.",
         panel=SCHEDULE,
     )
     keep: str = option(
         LAST,
-        "State that each level archives: last, or best by a few training views, which are then not trained on.",
+        "State of each level to archive: last, or best as measured on a few training views, which are then not trained "
+        "on.",
         panel=SCHEDULE,
         choices=(LAST, BEST),
     )
@@ -225,12 +226,11 @@ class TrainSettings(HierarchySettings):
     learning_rates: LearningRates = field(default_factory=LearningRates)
     densification: Densification = field(default_factory=Densification)
     antialiased: bool = option(False, "Dim Gaussians that are smaller than a pixel.", panel=GSPLAT)
-    packed: bool = option(False, "Less memory where a view sees little; slower.", panel=GSPLAT)
+    packed: bool = option(False, "Use less memory where a view sees little of the scene; slower.", panel=GSPLAT)
     sparse_adam: bool = option(False, "Step only the Gaussians that the view shows.", panel=GSPLAT)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_values(self)
         self._choose_strategy()
         self.learning_rates.check()
         self.densification.check()
@@ -370,6 +370,18 @@ class TrainSettings(HierarchySettings):
             return self.sh_rate_factor
         return min(MOST_SH_RATE, max(1.0, training_views / SH_RATE_VIEWS))
 
+    @property
+    def joint_share(self) -> float:
+        """See `HierarchySettings.joint_share`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_joint
+        return super().joint_share if own is None or self.nested or self.joint is not None else own
+
+    @property
+    def color_factor(self) -> float:
+        """See `HierarchySettings.color_factor`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_color_rate
+        return super().color_factor if own is None or self.residual_color_rate is not None else own
+
     def dropout_for(self, training_photos: int) -> float:
         """Return the share of Gaussians that the last steps of a stage leave out."""
         if self.dropout is not None:
@@ -414,22 +426,22 @@ class TrainingControl(MeasuringOptions):
 
     rasterizer: str = option(
         AUTO,
-        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
-        "else cpu.",
+        "gsplat (CUDA), cpu, oracle (slow, plain PyTorch, for checking), or one of an installed package. auto: gsplat "
+        "where there is a CUDA device, else cpu.",
         panel=RUN,
     )
     threads: int | None = option(
-        None, "Processor threads. Default: all this process may use.", panel=RUN, least=1, most=1024
+        None, "Processor threads. Default: all that this process may use.", panel=RUN, least=1, most=1024
     )
     checkpoint_every: int | None = option(
         None,
-        "Iterations between checkpoints; by default one is written every minute. Ctrl-C writes one too.",
+        "Iterations between checkpoints. Default: one a minute. Ctrl-C writes one, too.",
         panel=RUN,
         least=1,
     )
     log: str | None = option(
         None,
-        "tensorboard: also write the figures of history.jsonl for TensorBoard, into the run folder.",
+        "tensorboard: write the figures of history.jsonl for TensorBoard as well, into the run folder.",
         panel=RUN,
     )
 

@@ -6,13 +6,13 @@ Each strategy here says what differs between strategies in the rest of training;
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option, option_name
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.options import check_values, option, option_name, require_positive
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -66,12 +66,16 @@ class Strategy:
         densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
         few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
+        residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
+        residual_color_rate: default of `TrainSettings.residual_color_rate`; None for the hierarchy's.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
     densify_until: ClassVar[int] = 15_000
     unused: ClassVar[tuple[str, ...]] = ()
     few_dropout: ClassVar[float] = 0.0
+    residual_joint: ClassVar[float | None] = None
+    residual_color_rate: ClassVar[float | None] = None
 
     @property
     def needs_absgrad(self) -> bool:
@@ -101,8 +105,11 @@ class Strategy:
         Args:
             schedule: of the stage.
             extent: of the scene, in world units.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(f"strategy {type(self).__qualname__} has no method density_control; it has to make one")
 
 
 @dataclass(frozen=True)
@@ -113,8 +120,8 @@ class Regularized(Strategy):
 
     opacity_regularization: float | None = option(
         None,
-        "Weight of the mean opacity in the loss; it makes Gaussians that are not needed transparent, and fewer. "
-        "Default: 0.01 with --strategy mcmc, else 0.",
+        "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
+        "with --strategy mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )
@@ -143,12 +150,12 @@ class Gradients(Regularized):
 
     grow_grad2d: float | None = option(
         None,
-        "Screen-space gradient above which a Gaussian is cloned or split, in normalised device coordinates. Default: "
-        f"{GROW_THRESHOLD:g}, and {ABSGRAD_THRESHOLD:g} with --absgrad.",
+        "Screen-space gradient, in normalised device coordinates, above which --strategy 3dgs clones or splits a "
+        f"Gaussian, and multiview clones it. Default: {GROW_THRESHOLD:g}, and {ABSGRAD_THRESHOLD:g} with --absgrad.",
         panel=PANEL,
         names=("--densify-threshold",),
     )
-    absgrad: bool = option(False, "Densify by absolute gradients (AbsGS).", panel=PANEL)
+    absgrad: bool = option(False, "With --strategy 3dgs: densify by absolute gradients (AbsGS).", panel=PANEL)
 
     @property
     def needs_absgrad(self) -> bool:
@@ -180,11 +187,11 @@ class Multiview(Gradients):
         names=("--split-threshold",),
     )
     error_threshold: float = option(
-        0.1, "Share of the range of a view's errors above which a pixel counts, for --strategy multiview.", panel=PANEL
+        0.1, "Share of the range of a view's errors above which --strategy multiview counts a pixel.", panel=PANEL
     )
     error_pixels: float = option(
         0.1,
-        "Counted pixels of a view that a Gaussian must make up to be cloned or split, for --strategy multiview.",
+        "Counted pixels, mean over views, that a Gaussian must make up for --strategy multiview to clone or split it.",
         panel=PANEL,
     )
 
@@ -221,6 +228,8 @@ class Mcmc(Regularized):
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
     few_dropout: ClassVar[float] = 0.2
+    residual_joint: ClassVar[float | None] = 0.5
+    residual_color_rate: ClassVar[float | None] = 1.0
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )
@@ -228,13 +237,16 @@ class Mcmc(Regularized):
     cap_max: int | None = option(
         None,
         f"Most Gaussians of a level, for --strategy mcmc. Default: one for each {PIXELS_A_GAUSSIAN} pixels of the "
-        f"level's training images, and not more than {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A "
-        "level that starts with more keeps them.",
+        f"level's training images, at most {MOST_GAUSSIANS}, in coarser levels {MOST_GAUSSIANS // 2}. A level that "
+        "starts with more keeps them.",
         panel=PANEL,
         least=1,
     )
     base_cap_max: int | None = option(
-        None, "Most Gaussians of the coarsest level, for --strategy mcmc. Default: as all levels.", panel=PANEL, least=1
+        None,
+        "Most Gaussians of the coarsest level, for --strategy mcmc. Default: that of --cap-max.",
+        panel=PANEL,
+        least=1,
     )
 
     def of_stage(self, part: StagePart) -> Self:
@@ -291,13 +303,7 @@ class Auto(Mcmc, Gradients):
         return kind(**{each.name: getattr(self, each.name) for each in fields(kind)})
 
 
-def require_positive(name: str, value: float, kind: str) -> None:
-    """Raise a UserInputError about a number that is not positive and finite."""
-    if not (value > 0.0 and math.isfinite(value)):
-        raise UserInputError(f"{name} {value}: expected a positive {kind}")
-
-
-AUTO, MCMC, GRADIENTS = "auto", "mcmc", "3dgs"
+MCMC, GRADIENTS = "mcmc", "3dgs"
 STRATEGIES: Registry[Strategy] = Registry(
     "--strategy",
     "lapgs_plugin.strategies",

@@ -195,4 +195,4 @@ def _shown(run: ShownRun, camera: Camera, settings: PictureSettings, level: int)
         image = renderer.band(full, level, settings.gains.get(level, 1.0))
         if level < renderer.levels - 1:
             image = around_grey(image)
-    return to_full_size(image, full, level, renderer.pyramid, top).clamp(0.0, 1.0), level
+    return to_full_size(image, full.size, level, renderer.pyramid, top).clamp(0.0, 1.0), level

@@ -97,7 +97,7 @@ def test_a_hierarchy_of_the_release_is_rendered_as_its_script_does(foreign: Fore
     lapgs("render", run, "--format", "exr")
 
     view = run_scene(RunArchive.open(run)).test[0]
-    assert (view.camera.width, view.camera.height) == (57, 41)
+    assert view.camera.size == (57, 41)
     cpu, black = CpuRasterizer(), torch.zeros(3)
     coarse = cpu(base, view.camera.resized(29, 21), background=black).image
     fine = cpu(residual, view.camera, background=black).image

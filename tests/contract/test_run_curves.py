@@ -22,7 +22,7 @@ def rendered(archive: RunArchive, level: int) -> float:
     values = []
     for view in run_scene(archive).test:
         image = renderer.render(view.camera, level).composed[level]
-        values.append(psnr(to_full_size(image, view.camera, level, renderer.pyramid), view.image))
+        values.append(psnr(to_full_size(image, view.camera.size, level, renderer.pyramid), view.image))
     return sum(values) / len(values)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runner import joint
+from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
@@ -49,6 +51,25 @@ class FieldsAt(StageHook):
         if stage.level == 0:
             archive = RunArchive.open(self.folder)
             self.fields = {level: archive.field(level).parameters for level in archive.available_levels}
+
+
+def test_renders_of_one_colour_share_their_background() -> None:
+    given: list[Tensor] = []
+    rendering = SimpleNamespace(captured=torch.zeros(3, 2, 2))
+
+    def render(call: Any, view: Any, gaussians: Any, background: Tensor) -> None:
+        given.append(background)
+        rendering.captured = torch.zeros(3, 2, 2)
+
+    adapter, wrapper, device = SimpleNamespace(render=render), SimpleNamespace(rendering=None), torch.device("cpu")
+    context: Any = RunContext(adapter, None, device, None, wrapper, None, None, None, None)  # type: ignore[arg-type]
+    for white, black in ((True, False), (False, False), (True, True), (True, False)):
+        with torch.inference_mode(not given):
+            context.render(rendering, SimpleNamespace(white_background=white), None, None, black=black)
+    assert [background.tolist() for background in given] == [[1.0] * 3, [0.0] * 3, [0.0] * 3, [1.0] * 3]
+    assert given[0] is given[3]
+    assert given[1] is given[2]
+    assert not given[0].is_inference(), "later renders may need gradients"
 
 
 @pytest.mark.parametrize("name", NAMES)

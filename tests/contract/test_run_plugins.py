@@ -23,7 +23,8 @@ counting = tiny_backbone:Counting
 photo = tiny_backbone:PHOTO
 """
 SOURCE = """\
-from lapgs_plugin.adapters.base import BackboneAdapter, BackboneInfo
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.hierarchy.supervision import Reconstructed
 from lapgs_plugin.hooks import StageHook
 

@@ -57,7 +57,7 @@ def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path:
     renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
     for view in scene.train:
         levels = renderer.render(view.camera).composed
-        base.append(psnr(to_full_size(levels[1], view.camera, 1, renderer.pyramid), view.image))
+        base.append(psnr(to_full_size(levels[1], view.camera.size, 1, renderer.pyramid), view.image))
         composed.append(psnr(levels[0], view.image))
     assert sum(composed) / len(composed) > sum(base) / len(base) + 1.0  # the gain was 2.1 dB
     assert [record.level for record in archive.manifest.records] == [1, 0]
@@ -267,7 +267,7 @@ def test_nested_levels_learn(scene: Scene, tmp_path: Path) -> None:
     renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
     fits = {
         level: math.fsum(
-            psnr(to_full_size(renderer.images([view.camera], level)[0], view.camera, level, Pyramid()), view.image)
+            psnr(to_full_size(renderer.images([view.camera], level)[0], view.camera.size, level, Pyramid()), view.image)
             for view in scene.train
         )
         / len(scene.train)

@@ -17,6 +17,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import ssim
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_numba import _photometric_kernel, photometric_loss_cpu
+from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 
 INTERIOR = (slice(None), slice(5, -5), slice(5, -5))
 """Pixels whose window lies inside the image."""
@@ -221,3 +222,10 @@ def test_the_same_is_refused_on_every_device(device: str) -> None:
         photometric_loss(p, p.clone().requires_grad_())
     with pytest.raises(UserInputError, match="ssim_weight nan: expected a number from 0 to 1"):
         photometric_loss(p, p, math.nan)
+
+
+def test_images_of_one_channel_are_not_for_the_kernels_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lapgs_plugin.ops.photometric_loss.triton_works", lambda *tensors: True)
+    p, t = torch.rand(2, 1, 12, 14, generator=torch.Generator().manual_seed(0))
+    expected = photometric_loss_torch(p, t)
+    torch.testing.assert_close(photometric_loss(p, t), expected, rtol=0, atol=1e-6)  # worst seen: 3e-8

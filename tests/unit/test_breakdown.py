@@ -21,7 +21,7 @@ from lapgs_plugin.runs.profiling import (
 
 
 @dataclass
-class LaggingClock(ProcessorClock):
+class LaggingClock:
     """Stand in for a GPU's clock: stamps are tickets, reached only after the work before them, in whole seconds.
 
     Attributes:

@@ -51,7 +51,7 @@ class Constant(Rasterizer):
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
-        self.calls.append((field.signed, (camera.width, camera.height), background.tolist()))
+        self.calls.append((field.signed, camera.size, background.tolist()))
         image = field.sh[0, 0].view(3, 1, 1).expand(3, camera.height, camera.width)
         nothing = torch.zeros(len(field))
         return RenderResult(image, image[0], nothing.int(), torch.zeros(len(field), 2))
@@ -143,13 +143,13 @@ def test_a_coarser_level_stops_early() -> None:
     composition = HierarchyRenderer(fields, 2, Pyramid(), rasterizer).render(CAMERA, level=1)
     assert set(composition.composed) == {1}
     assert len(rasterizer.calls) == 1
-    full = to_full_size(composition.composed[1], CAMERA, 1, Pyramid())
+    full = to_full_size(composition.composed[1], CAMERA.size, 1, Pyramid())
     assert full.shape == (3, 30, 45)
 
 
 def test_level_cameras_keep_the_field_of_view() -> None:
     camera = level_camera(CAMERA, 2)
-    assert (camera.width, camera.height) == (12, 8)
+    assert camera.size == (12, 8)
     assert camera.tan_half_fov == pytest.approx(CAMERA.tan_half_fov)
     # A point seen at a quarter of the width stays at a quarter of the width.
     assert camera.cx / camera.width == pytest.approx(CAMERA.cx / CAMERA.width)

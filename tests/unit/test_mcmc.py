@@ -246,7 +246,7 @@ def test_runs_say_their_limits_stay_under_them_and_learn(hierarchy: str, tmp_pat
     )
     said = Said()
     run = train(tmp_path / "run", ring_scene(), chosen, monitor=said)
-    assert "--strategy mcmc, at most 110 and 120 Gaussians" in said.lines
+    assert "density control: --strategy mcmc, at most 110 and 120 Gaussians" in said.lines
     assert [record.num_gaussians for record in run.manifest.records] == [110, 120]
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))

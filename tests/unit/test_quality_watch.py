@@ -82,7 +82,7 @@ def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.
     scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
     monitor = Said()
     train(tmp_path / "run", scene, settings, monitor=monitor)
-    (line,) = (said for said in monitor.lines if said != "--strategy 3dgs")
+    (line,) = (said for said in monitor.lines if said != "density control: --strategy 3dgs")
     assert line.startswith("level 0, iteration ")
     assert "held-out PSNR fell to 2" in line
     assert "--exposure on" in line

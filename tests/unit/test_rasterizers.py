@@ -15,11 +15,13 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
+from lapgs_plugin.adapters.fastgs import Adapter as FastgsAdapter
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_transmittance
+from lapgs_plugin.rasterizers import choice
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, rasterizer_for
 from lapgs_plugin.rasterizers.extensions import CudaExtension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
@@ -130,6 +132,18 @@ def test_what_cannot_be_had_is_refused_in_one_line(device: str, rasterizer: str,
     with pytest.raises((UserInputError, MissingExtraError), match=message) as caught:
         rasterizer_for(manifest("cpu"), device, rasterizer)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_a_backbone_without_a_stand_in_is_not_offered_on_a_cpu(monkeypatch: pytest.MonkeyPatch, line: Any) -> None:
+    class Theirs(FastgsAdapter):
+        info = replace(FastgsAdapter.info, rasterizer="their_raster", stand_in="")
+
+    monkeypatch.setattr(choice, "rasterizer_owners", lambda: {"their_raster": Theirs})
+    with pytest.raises(UserInputError, match="--rasterizer their_raster: it has no stand-in for a CPU; leave"):
+        rasterizer_for(manifest("their_raster"), rasterizer="their_raster")
+    rasterizer_for(manifest("their_raster", mult=0.5))
+    assert line().endswith("cpu cannot honour mult = 0.5 of the training")
 
 
 # --------------------------------------------------------------------------------------------- with a CUDA device

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.adapters import registry as backbones
-from lapgs_plugin.adapters.base import FAMILY_FILES, BackboneAdapter
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.info import FAMILY_FILES
 from lapgs_plugin.adapters.registry import BACKBONES, OWN, adapter_class, all_adapters, recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import HierarchySettings
@@ -59,7 +60,7 @@ def test_a_packages_supervision_is_chosen_by_name() -> None:
     ("name", "message"),
     [
         ("broken", "tiny_loss:ABSENT cannot be loaded: AttributeError"),
-        ("wrong", "tiny_loss:Halved is a ABCMeta, expected a Supervision"),
+        ("wrong", "tiny_loss:Halved is the class Halved, expected an instance of Supervision"),
         ("missing", "--supervision missing: expected reconstructed, online_residual, gt_laplacian, broken, halved"),
     ],
 )
@@ -89,7 +90,7 @@ def test_own_entries_may_be_instances_or_be_loaded_when_they_are_looked_up() -> 
 
 def test_every_file_beside_the_registry_is_a_backbone() -> None:
     folder = Path(backbones.__file__).parent
-    assert set(OWN) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base", "generic", "registry"}
+    assert set(OWN) == {path.stem for path in folder.glob("*.py")} - {"__init__", "base", "generic", "info", "registry"}
     assert [adapter.info.name for adapter in all_adapters()] == list(BACKBONES)
 
 

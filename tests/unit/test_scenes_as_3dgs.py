@@ -77,6 +77,22 @@ def test_alpha_of_a_colmap_scene_is_left_out_and_of_a_transforms_scene_blended(t
     assert torch.equal(read_as_3dgs(path, (12, 10), WHITE), expected)
 
 
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "L", "P", "CMYK"])
+@pytest.mark.parametrize("size", [(24, 20), (24, 11), (13, 20), (7, 9), (31, 40)])
+def test_strips_are_the_image_that_pillow_resizes_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, size: tuple[int, int]
+) -> None:
+    path = tmp_path / "a.tiff"
+    colours = np.random.default_rng(2).integers(0, 256, (20, 24, 4), dtype=np.uint8)
+    Image.fromarray(colours).convert("RGB" if mode in ("P", "CMYK") else "RGBA").convert(mode).save(path)
+    with Image.open(path) as source:
+        assert source.mode == mode
+        whole = source.convert("RGBA" if mode != "RGB" else "RGB").resize(size)
+    expected = torch.from_numpy(np.array(whole)[..., :3]).permute(2, 0, 1) / 255.0
+    monkeypatch.setattr("lapgs_plugin.scenes.images.STRIP_VALUES", 4 * 24 * 3)  # three rows
+    assert torch.equal(read_as_3dgs(path, size, None), expected)
+
+
 def test_grey_becomes_rgb(tmp_path: Path) -> None:
     grey = Image.fromarray(np.arange(96, dtype=np.uint8).reshape(8, 12) * 2)
     grey.save(tmp_path / "grey.png")
@@ -97,7 +113,7 @@ def test_damaged_and_missing_images_are_named(tmp_path: Path, photo: Image.Image
 def test_cameras_look_through_the_middle_of_the_image(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(cameras={1: "PINHOLE 96 64 80 82 47.3 33.1"}))
     camera = load(path, resolution="3dgs:2").train[0].camera
-    assert (camera.width, camera.height) == (48, 32)
+    assert camera.size == (48, 32)
     assert (camera.cx, camera.cy) == (24.0, 16.0)
     assert (camera.fx, camera.fy) == pytest.approx((40.0, 41.0))
     assert load(path, resolution="1/2").train[0].camera.cx == pytest.approx(47.3 / 2)

@@ -118,7 +118,7 @@ def test_projection_is_pycolmaps(tmp_path: Path, camera: str, binary: bool) -> N
     for view in scene.train:
         image = by_name[view.name]
         expected = np.array([image.project_point(point) for point in POINTS])
-        assert (view.camera.width, view.camera.height) == (96, 64)
+        assert view.camera.size == (96, 64)
         assert view.camera.world_to_camera.dtype == torch.float32
         # In pixels; float32 poses, seen 1.5e-6.
         np.testing.assert_allclose(project(view.camera, POINTS), expected, rtol=0, atol=1e-5)
@@ -162,7 +162,7 @@ def test_pre_resized_photos_rescale_the_camera(tmp_path: Path, size: tuple[int, 
     scene = load(make_scene(tmp_path, size=size))
     camera = scene.train[0].camera
     sx, sy = size[0] / 96, size[1] / 64
-    assert (camera.width, camera.height) == size
+    assert camera.size == size
     assert (camera.fx, camera.fy) == pytest.approx((80 * sx, 82 * sy), rel=1e-12)
     assert (camera.cx, camera.cy) == pytest.approx((47.3 * sx, 33.1 * sy), rel=1e-12)
 

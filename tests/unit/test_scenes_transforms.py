@@ -130,10 +130,10 @@ def test_intrinsics_for_the_file_or_each_frame(tmp_path: Path) -> None:
     edit(path, {"fl_x": 55.0, "cx": 20.0, "w": 40, "h": 30}, in_frame=3)
     first, fourth = (load(path).train[i].camera for i in (0, 3))
     assert (first.fx, first.fy, first.cx, first.cy) == (70.0, 72.0, 41.0, 29.5)
-    assert (first.width, first.height) == (80, 60)
+    assert first.size == (80, 60)
     # The file of the fourth has twice the size that its frame says.
     assert (fourth.fx, fourth.fy, fourth.cx, fourth.cy) == (110.0, 144.0, 40.0, 59.0)
-    assert (fourth.width, fourth.height) == (80, 60)
+    assert fourth.size == (80, 60)
 
 
 def test_missing_intrinsics_have_the_usual_meaning(tmp_path: Path) -> None:

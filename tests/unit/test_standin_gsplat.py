@@ -56,13 +56,14 @@ def test_sh_and_signed_colours_are_those_of_the_rasterizer_beneath() -> None:
     field = replace(case.field, signed=True)
     raw = on_cpu.spherical_harmonics(2, field.means - case.camera.position, field.sh)
     camera = case.camera
-    image, *_ = on_cpu.rasterization(
-        field.means, field.quaternions, field.log_scales.exp(), field.opacity_logits.sigmoid(), raw,
-        camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
-    )  # fmt: skip
     expected = CpuRasterizer()(field, camera, background=torch.zeros(3), sh_degree=2).image
     assert expected.min() < -0.1
-    torch.testing.assert_close(image[0].permute(2, 0, 1), expected, rtol=0, atol=1e-5)
+    for colors in (raw, raw[None]):  # of all cameras, of each camera
+        image, *_ = on_cpu.rasterization(
+            field.means, field.quaternions, field.log_scales.exp(), field.opacity_logits.sigmoid(), colors,
+            camera.world_to_camera[None], camera.intrinsics[None], camera.width, camera.height,
+        )  # fmt: skip
+        torch.testing.assert_close(image[0].permute(2, 0, 1), expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(

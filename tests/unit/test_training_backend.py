@@ -12,7 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    MissingExtraError,
+    RunFolderError,
+    TrainingDivergedError,
+    UserInputError,
+)
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
@@ -103,6 +109,12 @@ def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
     found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
     assert (found.hierarchy, found.views_per_step, found.sh_rate_factor) == ("laplacian", "1", 1.0)
+    for damaged, message in (
+        ({"inherit_ratio": "half"}, "inherit_ratio is 'half', expected a valid number"),
+        ({"densification": {"strategy": []}}, r"densification.strategy is \[\], expected a valid string"),
+    ):
+        with pytest.raises(RunFolderError, match=message):
+            settings_from_manifest(replace(manifest, settings={**older, **damaged}))
 
 
 # --------------------------------------------------------------------------------------- gsplat's functions on a CPU
@@ -280,15 +292,11 @@ def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
             )
 
 
-def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpus_state_is_continued() -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
-
-    def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
-        return TrainableField._in_two(field, rates, extent, sparse)
-
-    monkeypatch.setattr(TrainableField, "create", create)
-    whole = stepped(create(field, LearningRates(), 4.0, sparse=False))
-    copy = TrainableField.from_state(whole.state(), LearningRates(), 4.0)
+    whole = stepped(TrainableField._in_two(field, LearningRates(), 4.0, sparse=False))
+    copy = TrainableField._in_two(whole.field, LearningRates(), 4.0, sparse=False)
+    copy.restore(whole.state())
     for model in (whole, copy):
         stepped(model, 3)
     for name, value in whole.field.parameters.items():
@@ -301,7 +309,7 @@ def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("level", [0, 1])
 def test_stored_images_are_the_targets(scene: Scene, level: int) -> None:
     eight_bit = tuple(replace(view, image=(view.image * 255).round() / 255) for view in scene.train)
-    stores = ImageStores([(view.camera.width, view.camera.height) for view in eight_bit], torch.device("cpu"), True)
+    stores = ImageStores([view.camera.size for view in eight_bit], torch.device("cpu"), True)
     held = LevelImages(stores, level, Pyramid(), with_coarse=level == 0, exact=True)
     stored = LevelImages(stores, level, Pyramid(), with_coarse=level == 0)
     for view in eight_bit:

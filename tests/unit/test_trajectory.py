@@ -151,6 +151,14 @@ EYE = np.eye(4).tolist()
         ({**GOOD, "frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}, "no transform_matrix of 4x4 finite numbers"),
         ({**GOOD, "frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "is no rotation and translation"),
         ({**GOOD, "frames": [{"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "is no rotation and"),
+        (
+            {**GOOD, "frames": [{"transform_matrix": [*EYE[:3], [0, 0, 0, 2]]}]},
+            "frame 0 has 0 0 0 2 in the last row of its transform_matrix, expected 0 0 0 1; export the matrix by rows",
+        ),
+        (
+            {**GOOD, "frames": [{"transform_matrix": [*EYE[:3], [1.5, -2, 3, 1]]}]},  # by columns
+            "frame 0 has 1.5 -2 3 1 in the last row",
+        ),
         ({**GOOD, "frames": [{"transform_matrix": [[math.nan] * 4] * 4}]}, "of 4x4 finite numbers"),
         ({"w": 64, "h": 48, "camera_angle_x": 0, "frames": [{"transform_matrix": EYE}]}, "frame 0 has intrinsics that"),
         ({**GOOD, "w": math.inf, "frames": [{"transform_matrix": EYE}]}, "frame 0 has intrinsics that are"),

@@ -201,7 +201,7 @@ def test_kept_views_are_saved_as_a_path(page: Any, tmp_path: Path) -> None:
         page.get_by_role("button", name="save", exact=True).click()
     download.value.save_as(tmp_path / "path.json")
     kept = read_trajectory(tmp_path / "path.json")
-    assert [(camera.width, camera.height) for camera in kept] == [(WIDTH, HEIGHT)] * 2
+    assert [camera.size for camera in kept] == [(WIDTH, HEIGHT)] * 2
     for camera, index in zip(kept, (0, 8), strict=True):  # the held-out views come first, and the first is the start
         known = ring_camera(2 * math.pi * index / 10).position
         np.testing.assert_allclose(camera.position.numpy(), known.numpy(), atol=1e-3)

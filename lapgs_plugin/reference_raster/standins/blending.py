@@ -24,7 +24,7 @@ from lapgs_plugin.reference_raster.layout import (
     SPLAT,
     TILE,
 )
-from lapgs_plugin.reference_raster.pipeline import Kept, View
+from lapgs_plugin.reference_raster.pipeline import Kept, Rendering, View
 
 _LANES = BLOCK * BLOCK
 
@@ -57,12 +57,20 @@ class Tile:
 
 @dataclass(frozen=True)
 class Blending:
-    """Hold a rendering's tiles; n is the number of Gaussians."""
+    """Hold a rendering of n Gaussians that was made with `keep`, and its tiles."""
 
-    n: int
     view: View
-    kept: Kept
-    background: NDArray[np.float32]
+    rendering: Rendering
+
+    @property
+    def n(self) -> int:
+        return len(self.rendering.radii)
+
+    @property
+    def kept(self) -> Kept:
+        """What the rendering kept."""
+        assert self.rendering.kept is not None, "rendered without keep=True"
+        return self.rendering.kept
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:
@@ -109,13 +117,6 @@ class Blending:
             found[: len(order), tile.pixels] = np.where(any_share, tile.members[order], -1)
         return found
 
-    def remaining(self) -> NDArray[np.float64]:
-        """Return the transmittance behind all Gaussians, (height * width,)."""
-        found = np.ones(self.view.width * self.view.height)
-        for tile in self.tiles:
-            found[tile.pixels] = tile.transmittance[-1] * (1 - tile.alpha[-1])
-        return found
-
     def weighted_shares(self, weights: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the sum over pixels of weight times alpha times the transmittance behind the Gaussian, (n,).
 
@@ -135,12 +136,13 @@ class Blending:
         Args:
             grad_image: (3, height * width) derivative of the loss by the image.
         """
-        total = np.zeros(self.n)
+        total, background = np.zeros(self.n), self.kept.background.astype(np.float64)
+        transmittance = self.rendering.transmittance.ravel()
         for tile in self.tiles:
             above = grad_image[:, tile.pixels].astype(np.float64)  # (3, p)
             color = tile.colors @ above  # (k, p) derivative of the loss by a share
             parts = tile.weights * color
-            last = tile.transmittance[-1] * (1 - tile.alpha[-1]) * (self.background.astype(np.float64) @ above)
+            last = transmittance[tile.pixels] * (background @ above)
             behind = np.cumsum(parts[::-1], 0)[::-1] - parts + last
             by_alpha = np.where(tile.alpha > 0, tile.transmittance * color - behind / (1 - tile.alpha), 0.0)
             np.add.at(total, tile.members, ((tile.opacities[:, None] * by_alpha) ** 2).sum(1))

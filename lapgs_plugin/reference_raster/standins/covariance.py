@@ -14,8 +14,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.jit.lanes import Floats
-from lapgs_plugin.jit.threads import parallel
-from lapgs_plugin.reference_raster import pipeline, tile_kernels
 from lapgs_plugin.reference_raster.layout import (
     FACTOR_SCALE,
     FACTOR_XX,
@@ -118,17 +116,8 @@ def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tens
     return factors[:, None].to(means.dtype)
 
 
-def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, grad_image: Floats) -> Tensor:
-    """Return the derivative of the loss by given covariances, (n, 6).
-
-    It runs the tiles' backward pass once more, which is slower but leaves the kernels unchanged.
-    """
-    slots = np.empty(len(kept.members) * SLOT, np.float32)
-    parallel(
-        tile_kernels.blend_backward, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
-        kept.background, pipeline.offsets(np.dtype(np.float32)), kept.hits, kept.reached, kept.final,
-        grad_image.reshape(-1), np.empty(0, np.float32), slots,
-    )  # fmt: skip
+def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, slots: Floats) -> Tensor:
+    """Return the derivative of the loss by given covariances, (n, 6), from `Gradients.slots`."""
     n = len(means)
     uu, uv, vv = (torch.from_numpy(np.bincount(kept.members, slots[i::SLOT], n)) for i in (SUM_UU, SUM_UV, SUM_VV))
     seen = torch.from_numpy(np.diff(kept.first_pair) > 0)

@@ -6,8 +6,9 @@ units of half the image's sides, and the gradient by the scales lacks the factor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -57,8 +58,7 @@ class Settings(Protocol):
     def campos(self) -> Tensor: ...
 
 
-@dataclass(frozen=True)
-class Inputs:
+class Inputs(NamedTuple):
     """Hold the tensors of a call; n Gaussians, float32, None for arguments that are not given.
 
     Attributes:
@@ -79,11 +79,6 @@ class Inputs:
     scales: Tensor | None
     quats: Tensor | None
     covariances: Tensor | None
-
-    def tensors(self) -> tuple[Tensor | None, ...]:
-        return (
-            self.means, self.means2d, self.opacities, self.sh, self.colors, self.scales, self.quats, self.covariances
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -143,12 +138,11 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
             assert inputs.quats is not None
             covariances = covariances_of(inputs.scales * settings.scale_modifier, inputs.quats)
         factors = antialiasing_factors(inputs.means, covariances, view)
-        inputs = replace(inputs, opacities=inputs.opacities * factors)
-    tensors = inputs.tensors()
+        inputs = inputs._replace(opacities=inputs.opacities * factors)
     call = _Call(
-        settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+        settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     )
-    image, inverse_depths, radii = _Rasterize.apply(call, *tensors)  # type: ignore[no-untyped-call]  # torch's
+    image, inverse_depths, radii = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
     assert call.centres is not None
     assert call.depths is not None
     return Output(
@@ -196,23 +190,20 @@ class _Call:
         self.contributions: Contributions | None = None
         self.blending: Blending | None = None
 
-    def gaussians(self, tensors: tuple[Tensor | None, ...]) -> Gaussians:
-        """Return the tensors as the kernels take them."""
-        means, _, opacities, sh, colors, scales, quats, covariances = (
-            None if t is None else t.detach().contiguous() for t in tensors
-        )
-        if covariances is not None:
-            scales, quats = principal_axes(covariances)
-        else:
-            assert scales is not None
-            scales = scales * self.settings.scale_modifier if self.settings.scale_modifier != 1 else scales
-        assert means is not None
-        assert opacities is not None
+    def gaussians(self, tensors: Sequence[Tensor | None]) -> Gaussians:
+        """Return the tensors of `Inputs` as the kernels take them."""
+        given = Inputs._make(None if t is None else t.detach().contiguous() for t in tensors)
+        scales, quats = given.scales, given.quats
+        if given.covariances is not None:
+            scales, quats = principal_axes(given.covariances)
+        elif scales is not None and self.settings.scale_modifier != 1:
+            scales = scales * self.settings.scale_modifier
+        assert scales is not None
         assert quats is not None
         degree = int(self.settings.sh_degree)
         return Gaussians(
-            means.numpy(), quats.numpy(), scales.numpy(), opacities.reshape(-1).numpy(),
-            None if sh is None else sh.numpy(), None if colors is None else colors.numpy(),
+            given.means.numpy(), quats.numpy(), scales.numpy(), given.opacities.reshape(-1).numpy(),
+            None if given.sh is None else given.sh.numpy(), None if given.colors is None else given.colors.numpy(),
             raw=False, signed=degree < 0, sh_degree=degree & ~SIGNED_COLOR_BIT,
         )  # fmt: skip
 
@@ -254,8 +245,7 @@ class _Rasterize(torch.autograd.Function):
             flat = weights.detach().to("cpu", torch.float32).contiguous().reshape(-1).numpy()
             call.contributions = contributions(n, call.view, rendering.kept, flat)
         if call.options.blending:
-            assert rendering.kept is not None
-            call.blending = Blending(n, call.view, rendering.kept, call.background)
+            call.blending = Blending(call.view, rendering)
         inverse_depths = torch.empty(0)
         if call.options.inverse_depth:
             behind = call.render(call.shaded_by_depth(gaussians), np.zeros(3, np.float32), False)
@@ -271,7 +261,7 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
-        tensors: tuple[Tensor | None, ...] = ctx.saved_tensors
+        tensors = Inputs._make(ctx.saved_tensors)
         total: list[Tensor | None] = [None] * len(tensors)
         grad_image, grad_depth = from_above[0], from_above[1]
         if grad_image is not None:
@@ -293,27 +283,22 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _gradients(
-    call: _Call, tensors: tuple[Tensor | None, ...], gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
+    call: _Call, given: Inputs, gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
 ) -> list[Tensor | None]:
-    """Return gradients in the order of `Inputs.tensors`; that by colours whenever `gaussians` has colours."""
-    above = grad_image.contiguous().numpy()
-    found = pipeline.gradients(gaussians, call.view, rendering, above, None)
-    means, means2d, opacities, _, _, _, _, covariances = tensors
-    assert means is not None
-    assert means2d is not None
-    assert opacities is not None
+    """Return gradients in the order of `Inputs`; that by colours whenever `gaussians` has colours."""
+    found = pipeline.gradients(gaussians, call.view, rendering, grad_image.contiguous().numpy(), None)
     by_covariances = None
-    if covariances is not None:
+    if given.covariances is not None:
         assert rendering.kept is not None
-        by_covariances = covariance_gradients(means, covariances, call.view, rendering.kept, above)
+        by_covariances = covariance_gradients(given.means, given.covariances, call.view, rendering.kept, found.slots)
     return [
         torch.from_numpy(found.means),
-        _screen_gradient(call.view, found, means2d),
-        torch.from_numpy(found.opacities).reshape(opacities.shape),
+        _screen_gradient(call.view, found, given.means2d),
+        torch.from_numpy(found.opacities)[:, None],
         None if found.sh is None else torch.from_numpy(found.sh),
         None if found.colors is None else torch.from_numpy(found.colors),
-        None if covariances is not None else torch.from_numpy(found.scales),
-        None if covariances is not None else torch.from_numpy(found.quats),
+        None if given.covariances is not None else torch.from_numpy(found.scales),
+        None if given.covariances is not None else torch.from_numpy(found.quats),
         by_covariances,
     ]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -173,7 +173,7 @@ def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
         "rendered_depth": depth.reshape(shape),
         "discriminants": torch.where(leaders >= 0, b * b - 4 * a * c, 0.0).reshape(shape),
         "gidx": at.int().reshape(shape),
-        "accum_alpha": torch.from_numpy(output.blending.remaining()).float().reshape(shape),
+        "accum_alpha": torch.from_numpy(output.blending.rendering.transmittance).reshape(shape),
     }
 
 
@@ -191,12 +191,12 @@ class MipSplatting(WholeSh):
                 "--ray_jitter, or train on a GPU"
             )
         if settings.kernel_size != PIXEL_VARIANCE:
-            _say_once(
+            _warn_once(
                 f"the CPU stand-in of Mip-Splatting's rasterizer takes kernel_size {PIXEL_VARIANCE}, "
                 f"not {settings.kernel_size}"
             )
         four = _Padded.apply(inputs.means2d)  # type: ignore[no-untyped-call]  # torch's
-        return super()._render(replace(inputs, means2d=four))
+        return super()._render(inputs._replace(means2d=four))
 
 
 class _Padded(torch.autograd.Function):
@@ -222,16 +222,12 @@ class PixelGS(WholeSh):
             depths = depths_of(inputs.means.detach(), settings.viewmatrix)
             factors = (depths / settings.depth_threshold).square().clamp(max=1)[:, None]
             points = points * factors + (points * (1 - factors)).detach()
-        return super()._render(replace(inputs, means2d=points))
+        return super()._render(inputs._replace(means2d=points))
 
 
-_SAID: set[str] = set()
-
-
-def _say_once(line: str) -> None:
-    if line not in _SAID:
-        _SAID.add(line)
-        logger.warning("%s", line)
+@lru_cache
+def _warn_once(line: str) -> None:
+    logger.warning("%s", line)
 
 
 class EfficientGS(Rasterizer):
@@ -303,16 +299,16 @@ class Surfels(WholeSh):
         assert inputs.quats is not None
         rotations = rotation_matrices(inputs.quats)
         third = inputs.scales.detach().max(1, keepdim=True).values * THIN
-        inputs = replace(inputs, scales=torch.cat([inputs.scales, third], 1))
+        inputs = inputs._replace(scales=torch.cat([inputs.scales, third], 1))
         output = rasterize(settings, inputs, Options())
         normals = rotations[:, :, 2] @ settings.viewmatrix[:3, :3]
         centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
         depths = centres[:, 2]
         normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
         black = settings._replace(bg=torch.zeros(3))
-        unshaded = replace(inputs, sh=None, means2d=torch.zeros_like(inputs.means2d))
+        unshaded = inputs._replace(sh=None, means2d=torch.zeros_like(inputs.means2d))
         blended = [
-            rasterize(black, replace(unshaded, colors=colors), Options())
+            rasterize(black, unshaded._replace(colors=colors), Options())
             for colors in (torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1), normals)
         ]
         depth, alpha = blended[0].image[:1], blended[0].image[1:2]

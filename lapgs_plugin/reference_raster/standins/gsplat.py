@@ -108,7 +108,7 @@ def rasterization(
         quats,
         scales.log(),
         torch.logit(opacities.clamp_max(HIGHEST_OPACITY)),
-        colors[:, None] / SH_C0 if sh_degree is None else colors,
+        colors.reshape(-1, 1, 3) / SH_C0 if sh_degree is None else colors,
         signed=sh_degree is None,
     )
     k = Ks[0].tolist()

@@ -83,7 +83,7 @@ def _visibility(
     pose = camera.world_to_camera.numpy()
     local = pose[:3, :3] @ points + pose[:3, 3:]  # (3, n)
     pixels = (local[:2] / local[2]).T * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    seen = (local[2] > 0) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    seen = (local[2] > 0) & ((pixels > 0) & (pixels < camera.size)).all(axis=1)
     asked = np.flatnonzero(seen)
     if asked.size:
         origin = camera.position.numpy().astype(np.float32)

@@ -95,7 +95,7 @@ def _write_images(folder: Path, world: World, cameras: Sequence[Camera], progres
 def _write_model(folder: Path, cameras: Sequence[Camera], points: SparsePoints) -> None:
     model = pycolmap.Reconstruction()
     first = cameras[0]
-    size, params = (first.width, first.height), [first.fx, first.fy, first.cx, first.cy]
+    size, params = first.size, [first.fx, first.fy, first.cx, first.cy]
     lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=size[0], height=size[1], params=params)
     model.add_camera_with_trivial_rig(lens)
     tracks = [pycolmap.Track() for _ in points.positions]
